@@ -1,0 +1,29 @@
+"""Kane's equations in JAX: describe a mechanism; simulate, sweep, linearize and identify it by gradients."""
+
+from . import catalog as catalog
+from . import rotations as rotations
+from ._kane import accelerations as accelerations
+from ._kane import constraint_jacobian as constraint_jacobian
+from ._kane import constraint_jacobian_rate as constraint_jacobian_rate
+from ._kane import dependent_accelerations as dependent_accelerations
+from ._kane import dependent_speeds as dependent_speeds
+from ._kane import equations_of_motion as equations_of_motion
+from ._kane import forcing as forcing
+from ._kane import generalized_active_forces as generalized_active_forces
+from ._kane import generalized_inertia_forces as generalized_inertia_forces
+from ._kane import kinetic_energy as kinetic_energy
+from ._kane import mass_matrix as mass_matrix
+from ._kane import partial_velocities as partial_velocities
+from ._system import Body as Body
+from ._system import Force as Force
+from ._system import Motion as Motion
+from ._system import State as State
+from ._system import System as System
+from ._system import Torque as Torque
+from ._system import parameter as parameter
+from ._system import weight as weight
+from ._types import Scalar as Scalar
+from ._vectors import Frame as Frame
+from ._vectors import Point as Point
+from ._vectors import Vector as Vector
+from ._vectors import inertial as inertial

@@ -1,0 +1,395 @@
+"""Kane's dynamical equations in momentum form. Knows bodies, speeds and JAX; knows no mechanism and no integrator.
+
+With p_i = m_i v_i, H_i = I_i . omega_i and d/dt in the inertial frame (Kamman, Unit 5, "Kane's Equations"):
+
+    V_ir = dv_i/du_r,  W_ir = domega_i/du_r                         partial velocities
+    c = C_ind u + C_dep u_dep + c0 = 0,  J = -C_dep^-1 C_ind        dependent speeds
+    M_rs = sum_i V_ir . m_i V_is + W_ir . I_i W_is
+    F_r  = sum F . V_r + T . W_r                                    active loads
+    F*_r = -sum_i V_ir . dp_i/dt + W_ir . dH_i/dt                   inertia, at u_dot = 0
+    M u_dot = f = F_r + F*_r
+
+Partial velocities, C and the time derivatives are read off the description by `jax.jvp`. Only the directions that
+are needed are pushed: the residuals along every speed, the bodies along the n independent columns of [1; J].
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ._components import add, add3, component, cross, dot, is_exact, is_zero, matvec, mul, scale3, sub
+from ._linear import Rows, solve, solve_positive, stack
+from ._system import Body, Load, Motion, System, Values, flatten_loads, kinetic_energy_of
+from ._types import Component
+
+Row = tuple[Component, ...]
+
+
+def jvp(f: Callable[..., Any], primals: Sequence[Component], tangents: Sequence[Component]) -> tuple[Any, Any]:
+    """`jax.jvp` of a function of components: exact inputs and outputs stay exact, and have exact zero derivatives."""
+    moving = [i for i, dx in enumerate(tangents) if not is_zero(dx)]
+    constants: list[Component | None] = []
+    treedef = None
+
+    def arrays_only(*xs):
+        nonlocal treedef
+        arguments = list(primals)
+        for i, x in zip(moving, xs, strict=True):
+            arguments[i] = x
+        leaves, treedef = jax.tree.flatten(f(*arguments))
+        constants[:] = [x if is_exact(x) else None for x in leaves]
+        return [x for x in leaves if not is_exact(x)]
+
+    xs = [jnp.asarray(primals[i]) for i in moving]
+    dxs = [jnp.asarray(tangents[i], dtype=x.dtype) for i, x in zip(moving, xs, strict=True)]
+    if moving:
+        values, derivatives = jax.jvp(arrays_only, xs, dxs)
+    else:
+        values = arrays_only()
+        derivatives = [0.0] * len(values)
+    values, derivatives = iter(values), iter(derivatives)
+    f_x = [next(values) if c is None else c for c in constants]
+    f_dx = [next(derivatives) if c is None else 0.0 for c in constants]
+    return jax.tree.unflatten(treedef, f_x), jax.tree.unflatten(treedef, f_dx)
+
+
+def along_speeds(f: Callable[[Row], Any], direction: Row) -> Any:
+    """The derivative of `f(u)` along a direction of speeds, at u = 0: all of it, since f is affine in the speeds."""
+    return jvp(lambda s: f(tuple(mul(s, x) for x in direction)), (0.0,), (1.0,))[1]
+
+
+def _unit(n: int, r: int) -> Row:
+    return tuple(1.0 if i == r else 0.0 for i in range(n))
+
+
+class Instant:
+    """A system at one time, with its coordinates and independent speeds, and what its description says there.
+
+    `u_dep`, `q_dot` and the columns of `J` are formed at once, since everything else needs them.
+    """
+
+    def __init__(self, system: System, t: Component, q: Any, u: Any, inputs: Mapping[str, Component] | None = None):
+        self.system = system
+        self.name = type(system).__name__
+        self.n, self.k = len(system.speeds), len(system.dependent_speeds)
+        self.t = component(t)
+        self.q = as_row(q, system.coordinates, f"{self.name}: q")
+        self.u = as_row(u, system.speeds, f"{self.name}: u")
+        self.inputs = checked_inputs(system, inputs)
+        self.C_ind, self.C_dep, c0 = self._constraint_rows()
+        known = [add(x, y) for x, y in zip(matvec(self.C_ind, self.u), c0, strict=True)]
+        *columns, u_dep = solve(self.C_dep, *zip(*self.C_ind, strict=True), known) if self.k else [()] * (self.n + 1)
+        self.J = [_negative(column) for column in columns]  # n columns of (k,)
+        self.u_dep = _negative(u_dep)
+        self.u_all = (*self.u, *self.u_dep)
+        self.q_dot = self.rates(self.u_all)
+
+    # The description at this instant, or beside it.
+
+    def motion(self, t: Component, q: Row, u: Row) -> Motion:
+        motion = self.system.motion(t, *self._named(q, u))
+        if not isinstance(motion, Motion):
+            raise TypeError(f"{self.name}.motion must return a jaxkane.Motion, got {motion!r}.")
+        return motion
+
+    def rates(self, u: Row) -> Row:
+        q_dot = self.system.q_dot(self.t, *self._named(self.q, u))
+        return as_row(q_dot, self.system.coordinates, f"{self.name}.q_dot")
+
+    def loads(self, motion: Motion) -> tuple[Load, ...]:
+        return flatten_loads(self.system.loads(self.t, *self._named(self.q, self.u_all), motion, self.inputs))
+
+    def _named(self, q: Row, u: Row) -> tuple[Values, Values]:
+        system = self.system
+        names = (*system.speeds, *system.dependent_speeds, *system.auxiliary_speeds)
+        still = (0.0,) * (len(names) - len(u))  # auxiliary speeds are zero in the motion
+        return Values(q, system.coordinates), Values((*u, *still), names)
+
+    def configuration(self, t: Component, q: Row) -> Row:
+        residuals = self.system.configuration_constraints(t, Values(q, self.system.coordinates))
+        return tuple(component(h) for h in residuals)
+
+    def residuals(self, t: Component, q: Row, u: Row) -> Row:
+        """Velocity residuals c(t, q, u), one for each dependent speed."""
+        rolling = self.motion(t, q, u).constraints
+        if len(rolling) == self.k:
+            return rolling  # the configuration constraints, if there are any, are integrals of these
+        q_dot = as_row(self.system.q_dot(t, *self._named(q, u)), self.system.coordinates, f"{self.name}.q_dot")
+        h, h_dot = jvp(lambda t, *q: self.configuration(t, q), (t, *q), (1.0, *q_dot))
+        if len(rolling) + len(h) != self.k:
+            names = ", ".join(self.system.dependent_speeds) or "none"
+            raise ValueError(
+                f"{self.name}: {self.k} dependent speeds are named ({names}), but there are {len(rolling)} velocity "
+                f"residuals in its motion and {len(h)} configuration constraints. Name as many dependent speeds as "
+                "there are velocity residuals; or as many as both together, and the constraints' rates are added."
+            )
+        return (*rolling, *h_dot)
+
+    def _constraint_rows(self) -> tuple[Rows, Rows, Row]:
+        # c = C_ind u + C_dep u_dep + c0
+        n, k = self.n, self.k
+        c0 = self.residuals(self.t, self.q, (0.0,) * (n + k))
+        along = [along_speeds(lambda u: self.residuals(self.t, self.q, u), _unit(n + k, r)) for r in range(n + k)]
+        rows = tuple(zip(*along, strict=True))
+        return [row[:n] for row in rows], [row[n:] for row in rows], c0
+
+    # What Kane's equations are made of.
+
+    def partials(self) -> list[tuple[list, list]]:
+        """For each independent speed: the partial velocities (V, W) of the bodies, and those of the loads."""
+
+        def velocities(u):
+            motion = self.motion(self.t, self.q, u)
+            bodies = [(b.center.velocity.components, b.angular_velocity.components_in(b.frame)) for b in motion.bodies]
+            return bodies, [load.velocity.components for load in self.loads(motion)]
+
+        return [along_speeds(velocities, (*_unit(self.n, r), *self.J[r])) for r in range(self.n)]
+
+    def bias(self) -> Row:
+        """u_dep_dot at u_dot = 0: the residual is differentiated, never the solution of the solve.
+
+        u_dep_dot = J u_dot - C_dep^-1 (dc/dt at frozen speeds)
+        """
+        if not self.k:
+            return ()
+        _, c_dot = jvp(lambda t, *q: self.residuals(t, q, self.u_all), (self.t, *self.q), (1.0, *self.q_dot))
+        return _negative(solve(self.C_dep, c_dot)[0])
+
+    def momentum_rates(self, motion: Motion) -> list[tuple[Row, Row]]:
+        """dp/dt and dH/dt of every body in the inertial frame, at u_dot = 0; each in the frame where it stands."""
+
+        def momenta(t, *q):
+            return [_momenta(body) for body in self.motion(t, q, self.u_all).bodies]
+
+        def momenta_of(u):
+            return [_momenta(body) for body in self.motion(self.t, self.q, u).bodies]
+
+        now, drift = jvp(momenta, (self.t, *self.q), (1.0, *self.q_dot))
+        turning = along_speeds(momenta_of, (*(0.0,) * self.n, *self.bias())) if self.k else None
+        rates = []
+        for i, body in enumerate(motion.bodies):
+            # dx/dt in N = derivative of the components + omega x
+            rate = []
+            for j, frame in enumerate((body.center.velocity.frame, body.frame)):
+                x_dot = drift[i][j] if turning is None else add3(drift[i][j], turning[i][j])
+                rate.append(add3(x_dot, cross(frame.angular_velocity.components, now[i][j])))
+            rates.append(tuple(rate))
+        return rates
+
+    def active_forces(self, motion: Motion, partials: list) -> Row:
+        # F_r = sum F . V_r + T . W_r
+        vectors = [load.vector.components_in(load.velocity.frame) for load in self.loads(motion)]
+        return tuple(_sum(dot(v, x) for v, x in zip(columns, vectors, strict=True)) for _, columns in partials)
+
+    def inertia_forces(self, motion: Motion, partials: list) -> Row:
+        # F*_r = -sum_i V_ir . dp_i/dt + W_ir . dH_i/dt
+        rates = self.momentum_rates(motion)
+        return tuple(
+            mul(-1.0, _sum(add(dot(V, p), dot(W, H)) for (V, W), (p, H) in zip(bodies, rates, strict=True)))
+            for bodies, _ in partials
+        )
+
+    def mass_matrix(self, motion: Motion, partials: list) -> list[list[Component]]:
+        # M_rs = sum_i V_ir . m_i V_is + W_ir . I_i W_is
+        n = self.n
+        M: list[list[Component]] = [[0.0] * n for _ in range(n)]
+        for i, body in enumerate(motion.bodies):
+            for s in range(n):
+                V, W = partials[s][0][i]
+                mV, IW = scale3(body.mass, V), matvec(body.inertia, W)
+                for r in range(s + 1):
+                    V, W = partials[r][0][i]
+                    M[r][s] = add(M[r][s], add(dot(V, mV), dot(W, IW)))
+        for s in range(n):
+            for r in range(s):
+                M[s][r] = M[r][s]
+        return M
+
+    def equations(self) -> tuple[list[list[Component]], Row]:
+        """M and f of M u_dot = f."""
+        motion = self.motion(self.t, self.q, self.u_all)
+        partials = self.partials()
+        pairs = zip(self.active_forces(motion, partials), self.inertia_forces(motion, partials), strict=True)
+        return self.mass_matrix(motion, partials), tuple(add(a, b) for a, b in pairs)
+
+    def accelerations(self) -> Row:
+        return solve_positive(*self.equations())
+
+
+def _momenta(body: Body) -> tuple[Row, Row]:
+    p = scale3(body.mass, body.center.velocity.components)
+    H = matvec(body.inertia, body.angular_velocity.components_in(body.frame))
+    return p, H
+
+
+def _sum(terms) -> Component:
+    total: Component = 0.0
+    for term in terms:
+        total = add(total, term)
+    return total
+
+
+def _negative(row: Sequence[Component]) -> Row:
+    return tuple(mul(-1.0, x) for x in row)
+
+
+def as_row(values: Any, names: Sequence[str], label: str) -> Row:
+    """A sequence, or an array of shape (len(names),), as a row of components."""
+    if hasattr(values, "shape"):
+        if values.ndim != 1:
+            raise ValueError(
+                f"{label} must have the shape ({len(names)},), got {values.shape}. For a batch use jax.vmap."
+            )
+        values = jnp.asarray(values)
+        if not jnp.issubdtype(values.dtype, jnp.inexact):
+            values = values.astype(float)
+        values = [values[i] for i in range(values.shape[0])]
+    row = tuple(component(x) for x in values)
+    if len(row) != len(names):
+        raise ValueError(f"{label} must have {len(names)} entries ({', '.join(names)}), got {len(row)}.")
+    return row
+
+
+def checked_inputs(system: System, inputs: Mapping[str, Component] | None) -> dict[str, Component]:
+    """All inputs of a system by name; those left out are exactly zero."""
+    inputs = dict(inputs or {})
+    unknown = sorted(set(inputs) - set(system.inputs))
+    if unknown:
+        have = ", ".join(system.inputs) or "none"
+        raise ValueError(f"{type(system).__name__} has no input named {', '.join(unknown)}. It has: {have}.")
+    return {name: component(inputs.get(name, 0.0)) for name in system.inputs}
+
+
+def equations_of_motion(
+    system: System, t: Component, q: Any, u: Any, inputs: Mapping[str, Component] | None = None
+) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
+    """M and f of Kane's equations M u_dot = f.
+
+    **Arguments:**
+
+    - `system`: a `System`.
+    - `t`: time [s].
+    - `q` (n_q,): coordinates, consistent with the configuration constraints (see `assemble`).
+    - `u` (n,): independent speeds.
+    - `inputs`: numbers by name; those left out are zero.
+
+    **Returns:** the generalized mass matrix M (n, n) and the right side f (n,).
+
+    **Raises:** `ValueError` for wrong shapes, unknown inputs, or as many residuals as there are not dependent speeds.
+    """
+    M, f = Instant(system, t, q, u, inputs).equations()
+    return stack(M), stack([f])[0]
+
+
+def accelerations(
+    system: System, t: Component, q: Any, u: Any, inputs: Mapping[str, Component] | None = None
+) -> Float[Array, " n"]:
+    """u_dot (n,): time derivatives of the independent speeds, M^-1 f. Arguments as `equations_of_motion`."""
+    return stack([Instant(system, t, q, u, inputs).accelerations()])[0]
+
+
+def mass_matrix(
+    system: System, t: Component, q: Any, u: Any, inputs: Mapping[str, Component] | None = None
+) -> Float[Array, "n n"]:
+    """M (n, n), the generalized mass matrix of the independent speeds. Arguments as `equations_of_motion`."""
+    return equations_of_motion(system, t, q, u, inputs)[0]
+
+
+def forcing(
+    system: System, t: Component, q: Any, u: Any, inputs: Mapping[str, Component] | None = None
+) -> Float[Array, " n"]:
+    """f (n,), the right side of M u_dot = f. Arguments as `equations_of_motion`."""
+    return equations_of_motion(system, t, q, u, inputs)[1]
+
+
+def partial_velocities(
+    system: System, t: Component, q: Any, u: Any, inputs: Mapping[str, Component] | None = None
+) -> tuple[Float[Array, "b 3 n"], Float[Array, "b 3 n"]]:
+    """V and W, each (b, 3, n): partial velocities of the mass centres and partial angular velocities of the b bodies.
+
+    Components are in N. The dependent speeds are eliminated: the columns belong to the n independent speeds.
+    Arguments as `equations_of_motion`.
+    """
+    now = Instant(system, t, q, u, inputs)
+    motion, partials = now.motion(now.t, now.q, now.u_all), now.partials()
+    V, W = [], []
+    for i, body in enumerate(motion.bodies):
+        for columns, j, frame in ((V, 0, body.center.velocity.frame), (W, 1, body.frame)):
+            vectors = [frame.vector(*bodies[i][j]).components_in(motion.N) for bodies, _ in partials]
+            columns.append(stack(vectors).T)
+    return jnp.stack(V), jnp.stack(W)
+
+
+def generalized_active_forces(
+    system: System, t: Component, q: Any, u: Any, inputs: Mapping[str, Component] | None = None
+) -> Float[Array, " n"]:
+    """F_r (n,) = sum of F . V_r + T . W_r over the loads. Arguments as `equations_of_motion`."""
+    now = Instant(system, t, q, u, inputs)
+    return stack([now.active_forces(now.motion(now.t, now.q, now.u_all), now.partials())])[0]
+
+
+def generalized_inertia_forces(
+    system: System,
+    t: Component,
+    q: Any,
+    u: Any,
+    inputs: Mapping[str, Component] | None = None,
+    *,
+    u_dot: Any = None,
+) -> Float[Array, " n"]:
+    """F*_r (n,) = -sum of V_r . dp/dt + W_r . dH/dt over the bodies, at accelerations `u_dot` (n,), by default zero.
+
+    With `u_dot=accelerations(...)` the sum with `generalized_active_forces` vanishes: Kane's equations.
+    Arguments as `equations_of_motion`.
+    """
+    now = Instant(system, t, q, u, inputs)
+    motion, partials = now.motion(now.t, now.q, now.u_all), now.partials()
+    Fr_star = now.inertia_forces(motion, partials)
+    if u_dot is not None:
+        u_dot = as_row(u_dot, system.speeds, f"{now.name}: u_dot")
+        Fr_star = [sub(x, y) for x, y in zip(Fr_star, matvec(now.mass_matrix(motion, partials), u_dot), strict=True)]
+    return stack([Fr_star])[0]
+
+
+def dependent_speeds(system: System, t: Component, q: Any, u: Any) -> Float[Array, " k"]:
+    """u_dep (k,), from the velocity residuals: C_dep u_dep = -(C_ind u + c0)."""
+    return stack([Instant(system, t, q, u).u_dep])[0]
+
+
+def dependent_accelerations(
+    system: System, t: Component, q: Any, u: Any, inputs: Mapping[str, Component] | None = None
+) -> Float[Array, " k"]:
+    """u_dep_dot (k,) = J u_dot - C_dep^-1 (dc/dt at frozen speeds). Arguments as `equations_of_motion`."""
+    now = Instant(system, t, q, u, inputs)
+    u_dot = now.accelerations()
+    return stack([[add(dot(row, u_dot), b) for row, b in zip(zip(*now.J, strict=True), now.bias(), strict=True)]])[0]
+
+
+def constraint_jacobian(system: System, t: Component, q: Any) -> Float[Array, "k n"]:
+    """J (k, n) = -C_dep^-1 C_ind: u_dep = J u for constraints without a term of their own in time."""
+    now = Instant(system, t, q, (0.0,) * len(system.speeds))
+    return stack(now.J).T
+
+
+def constraint_jacobian_rate(system: System, t: Component, q: Any, u: Any) -> Float[Array, "k n"]:
+    """J_dot (k, n), the time derivative of J along the motion.
+
+        J_dot = -C_dep^-1 (C_ind_dot + C_dep_dot J)
+
+    found by differentiating J(t, q) along (1, q_dot). The textbook prints a minus before C_dep_dot (Example 7).
+    """
+    now = Instant(system, t, q, u)
+    zero = (0.0,) * now.n
+    _, J_dot = jvp(lambda t, *q: Instant(system, t, q, zero).J, (now.t, *now.q), (1.0, *now.q_dot))
+    return stack(J_dot).T
+
+
+def kinetic_energy(system: System, t: Component, q: Any, u: Any) -> Float[Array, ""]:
+    """Kinetic energy [J] of all bodies, dependent speeds included."""
+    now = Instant(system, t, q, u)
+    return jnp.asarray(kinetic_energy_of(now.motion(now.t, now.q, now.u_all)))

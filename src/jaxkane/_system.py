@@ -1,0 +1,358 @@
+"""The description of a mechanism: bodies, loads, motion, parameters. Describes; never differentiates or solves."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ._components import component, dot
+from ._types import Component, Triple
+from ._vectors import Frame, Point, Vector
+
+
+def parameter(default: Any = dataclasses.MISSING, *, positive: bool = False, shape: tuple[int, ...] = ()) -> Any:
+    """A physical parameter of a `System`: a float array from birth, in SI units and radians.
+
+        mass: Scalar = jk.parameter(positive=True)  # [kg]
+
+    **Arguments:**
+
+    - `default`: a number; without one the parameter must be given.
+    - `positive`: refuse zero and negative values, and let a fit move it on a logarithmic scale.
+    - `shape`: of the array, `()` for a number. A value with leading axes more is a batch.
+    """
+    metadata = {"jaxkane": ParameterInfo(positive, shape)}
+    if default is dataclasses.MISSING:
+        return eqx.field(converter=_to_float, metadata=metadata)
+    return eqx.field(converter=_to_float, metadata=metadata, default=default)
+
+
+@dataclasses.dataclass(frozen=True)
+class ParameterInfo:
+    """What `parameter` was told: whether the value must be positive, and the shape of one value."""
+
+    positive: bool
+    shape: tuple[int, ...]
+
+
+def parameter_info(system: System) -> dict[str, ParameterInfo]:
+    """Name and `ParameterInfo` of every parameter of a system, in the order of their declaration."""
+    fields = dataclasses.fields(system)  # type: ignore[arg-type]
+    return {f.name: f.metadata["jaxkane"] for f in fields if "jaxkane" in f.metadata}
+
+
+def _to_float(value: Any) -> Any:
+    # What is no number is left alone here: `System.__check_init__` refuses it by its name.
+    if isinstance(value, (jax.Array, np.ndarray)) and jnp.issubdtype(value.dtype, jnp.inexact):
+        return jnp.asarray(value)
+    try:
+        array = np.asarray(value) if not isinstance(value, jax.Array) else value
+    except (TypeError, ValueError):
+        return value
+    if array.dtype.kind in "iuf":
+        return jnp.asarray(array, dtype=float)
+    return value
+
+
+class Body:
+    """A rigid body: mass, central inertia, mass centre and frame.
+
+    **Arguments:**
+
+    - `mass` [kg].
+    - `inertia` [kg m^2] about the mass centre, resolved in `frame`: three principal moments, or a (3, 3) matrix
+        whose off-diagonal entries are matrix entries (minus the integrals of xy). 0.0 for a particle.
+    - `center`: the mass centre, a Point.
+    - `frame`: a Frame in which the inertia does not change.
+    - `angular_velocity`: a Vector, by default the frame's. An axisymmetric body (a wheel, a rotor) may stand in a
+        frame that does not spin with it, with its own angular velocity: the textbook's Examples 5 and 7.
+    - `name`: for error messages, forces and pictures.
+    """
+
+    __slots__ = ("angular_velocity", "center", "frame", "inertia", "mass", "name")
+
+    def __init__(
+        self,
+        mass: Component,
+        inertia: Any,
+        center: Point,
+        frame: Frame,
+        angular_velocity: Vector | None = None,
+        name: str = "body",
+    ):
+        self.mass = component(mass)
+        self.inertia = _inertia(inertia, name)
+        self.center = center
+        self.frame = frame
+        self.angular_velocity = frame.angular_velocity if angular_velocity is None else angular_velocity
+        self.name = name
+
+    def __repr__(self) -> str:
+        return f"Body({self.name})"
+
+
+def _inertia(inertia: Any, name: str) -> tuple[Triple, Triple, Triple]:
+    if isinstance(inertia, (int, float)) and inertia == 0:
+        inertia = (0.0, 0.0, 0.0)
+    shape = np.shape(inertia) if hasattr(inertia, "shape") else (len(inertia), *_inner(inertia))
+    if shape == (3,):
+        a, b, c = (component(x) for x in inertia)
+        return ((a, 0.0, 0.0), (0.0, b, 0.0), (0.0, 0.0, c))
+    if shape == (3, 3):
+        return tuple(tuple(component(x) for x in row) for row in inertia)  # type: ignore[return-value]
+    raise ValueError(
+        f"{name}: the inertia is three principal moments or a (3, 3) matrix about the mass centre, got shape {shape}."
+    )
+
+
+def _inner(rows: Sequence[Any]) -> tuple[int, ...]:
+    inner = {len(row) for row in rows if isinstance(row, (tuple, list)) or np.ndim(row) == 1}
+    return tuple(inner)
+
+
+class Force:
+    """A force [N] that acts at a point: a Point, or the mass centre of a Body."""
+
+    __slots__ = ("point", "vector")
+
+    def __init__(self, vector: Vector, point: Point | Body):
+        self.vector = _checked(vector, "Force")
+        self.point = point.center if isinstance(point, Body) else point
+        if not isinstance(self.point, Point):
+            raise TypeError(f"Force(vector, point): the second argument is a Point or a Body, got {point!r}.")
+
+    @property
+    def velocity(self) -> Vector:
+        """The velocity whose partial velocities the force is multiplied by."""
+        return self.point.velocity
+
+
+class Torque:
+    """A torque [N m] that acts on a body or on a frame; its reaction, if one is meant, on another.
+
+    Torque(T * C.z, fork, reaction_on=frame)
+    """
+
+    __slots__ = ("vector", "velocity")
+
+    def __init__(self, vector: Vector, on: Frame | Body, reaction_on: Frame | Body | None = None):
+        self.vector = _checked(vector, "Torque")
+        for part in (on, reaction_on):
+            if not isinstance(part, (Frame, Body, type(None))):
+                raise TypeError(f"Torque(vector, on): acts on a Body or a Frame, got {part!r}.")
+        self.velocity = on.angular_velocity
+        if reaction_on is not None:
+            self.velocity = on.angular_velocity - reaction_on.angular_velocity
+
+
+def _checked(vector: Any, what: str) -> Vector:
+    if not isinstance(vector, Vector):
+        raise TypeError(f"{what}(vector, ...): the first argument is a Vector such as 3.0 * N.x, got {vector!r}.")
+    return vector
+
+
+Load = Force | Torque
+
+
+def weight(motion: Motion, gravity: Vector) -> tuple[Force, ...]:
+    """The weight of every body of a motion; `gravity` [m/s^2] is a Vector such as `9.81 * N.z`."""
+    return tuple(Force(body.mass * gravity, body.center) for body in motion.bodies)
+
+
+def flatten_loads(loads: Any) -> tuple[Load, ...]:
+    """Loads out of nested tuples and lists."""
+    if isinstance(loads, (Force, Torque)):
+        return (loads,)
+    if isinstance(loads, Iterable) and not isinstance(loads, (str, Vector)):
+        return tuple(load for item in loads for load in flatten_loads(item))
+    raise TypeError(f"`loads` returns Forces and Torques, got {loads!r}.")
+
+
+class Motion:
+    """What `System.motion` returns: bodies, velocity residuals, and the frames and points that others ask for.
+
+    **Arguments:**
+
+    - `bodies`: every Body.
+    - `constraints`: velocity residuals [m/s or rad/s] that are zero in the motion and affine in the speeds; a Vector
+        counts as its three components.
+    - `points`, `frames`: those that `loads`, pictures or a user need, by name: `motion["P"]`.
+    """
+
+    __slots__ = ("N", "bodies", "constraints", "frames", "points")
+
+    def __init__(
+        self,
+        bodies: Iterable[Body],
+        constraints: Iterable[Component | Vector] = (),
+        *,
+        points: Mapping[str, Point] | None = None,
+        frames: Mapping[str, Frame] | None = None,
+    ):
+        self.bodies = tuple(bodies)
+        if not self.bodies:
+            raise ValueError("A Motion needs at least one Body.")
+        residuals: list[Component] = []
+        for c in constraints:
+            residuals.extend(c.components if isinstance(c, Vector) else [component(c)])
+        self.constraints = tuple(residuals)
+        self.points = dict(points or {})
+        self.frames = dict(frames or {})
+        self.N: Frame = self.bodies[0].center.velocity.frame.root
+        for name, part in (*self.points.items(), *self.frames.items()):
+            part.name = name
+
+    def __getitem__(self, name: str) -> Any:
+        named: dict[str, Any] = {body.name: body for body in self.bodies} | self.points | self.frames
+        if name not in named:
+            raise KeyError(f"{name!r} is no body, point or frame of this motion; it has {', '.join(named)}.")
+        return named[name]
+
+
+class Values(Sequence[Component]):
+    """Numbers by place and by name: `q[0]`, `q["roll"]`, `a, b = q`. JAX takes it for an array of shape (n,).
+
+    Its items may be exact Python floats, which is how a structural zero reaches a description.
+    """
+
+    __slots__ = ("_items", "names")
+
+    def __init__(self, items: Iterable[Component], names: Sequence[str] = ()):
+        self._items = tuple(items)
+        self.names = tuple(names)
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    def __getitem__(self, key: Any) -> Any:
+        if isinstance(key, str):
+            if key not in self.names:
+                raise KeyError(f"There is no {key!r} here; there are {', '.join(self.names)}.")
+            return self._items[self.names.index(key)]
+        if isinstance(key, slice):
+            return Values(self._items[key], self.names[key])
+        return self._items[key]
+
+    def __iter__(self):
+        return iter(self._items)
+
+    def __jax_array__(self) -> Array:
+        return jnp.stack([jnp.asarray(x) for x in self._items]) if self._items else jnp.zeros(0)
+
+    def __repr__(self) -> str:
+        return f"Values({dict(zip(self.names, self._items, strict=True)) if self.names else self._items})"
+
+    def __neg__(self) -> Array:
+        return -self.__jax_array__()
+
+
+def _elementwise(name: str) -> Callable[..., Array]:
+    def operator(self: Values, other: Any) -> Array:
+        return getattr(self.__jax_array__(), name)(jnp.asarray(other))
+
+    return operator
+
+
+for _name in ("add", "sub", "mul", "truediv", "matmul"):
+    setattr(Values, f"__{_name}__", _elementwise(f"__{_name}__"))
+    setattr(Values, f"__r{_name}__", _elementwise(f"__r{_name}__"))
+
+
+class State(eqx.Module):
+    """What is integrated: coordinates and independent speeds.
+
+    Attributes: `q` (n_q,) [rad, m], `u` (n_u,) [rad/s, m/s]; a batch has leading axes.
+    """
+
+    q: Float[Array, "*batch n_q"] = eqx.field(converter=_to_float)
+    u: Float[Array, "*batch n_u"] = eqx.field(converter=_to_float)
+
+
+class System(eqx.Module):
+    """A mechanism: its array leaves are its parameters, its methods describe it.
+
+    A subclass names its coordinates and speeds, and writes `motion`; and, where it needs them, `loads`, `q_dot`,
+    `configuration_constraints` and `events`. The `u` that these receive holds all speeds: first the independent, then
+    the dependent, then the auxiliary ones. `q` and `u` are read by place or by name: `q[0]`, `q["roll"]`.
+    """
+
+    coordinates: ClassVar[tuple[str, ...]] = ()
+    """Names of the generalized coordinates."""
+    speeds: ClassVar[tuple[str, ...]] = ()
+    """Names of the independent generalized speeds: one equation of motion for each."""
+    dependent_speeds: ClassVar[tuple[str, ...]] = ()
+    """Names of the speeds that the velocity residuals determine: as many as there are residuals."""
+    auxiliary_speeds: ClassVar[tuple[str, ...]] = ()
+    """Names of speeds that are zero in the motion, for the forces that do no work."""
+    dependent_coordinates: ClassVar[tuple[str, ...]] = ()
+    """Names of the coordinates that `assemble` finds from the configuration constraints; the others are held."""
+    inputs: ClassVar[tuple[str, ...]] = ()
+    """Names of the inputs that `loads` reads."""
+
+    def __check_init__(self) -> None:
+        for name, info in parameter_info(self).items():
+            check_parameter(f"{type(self).__name__}.{name}", getattr(self, name), info)
+
+    def motion(self, t: Component, q: Values, u: Values) -> Motion:
+        """Bodies and velocity residuals at time `t` [s], coordinates `q` and speeds `u`."""
+        raise NotImplementedError(f"{type(self).__name__} must define motion(self, t, q, u) and return a Motion.")
+
+    def q_dot(self, t: Component, q: Values, u: Values) -> Sequence[Component]:
+        """Rates of the coordinates. By default they are the speeds."""
+        n_q, n = len(self.coordinates), len(self.speeds) + len(self.dependent_speeds)
+        if n_q != n:
+            raise ValueError(
+                f"{type(self).__name__} has {n_q} coordinates and {n} speeds, so its speeds cannot be the rates of its "
+                "coordinates: define q_dot(self, t, q, u), one rate for each coordinate."
+            )
+        return u[:n_q]
+
+    def loads(self, t: Component, q: Values, u: Values, motion: Motion, inputs: Mapping[str, Component]) -> Any:
+        """Active forces and torques: `Force`s and `Torque`s, nested in tuples as is convenient."""
+        return ()
+
+    def configuration_constraints(self, t: Component, q: Values) -> Sequence[Component]:
+        """Residuals that are zero in every possible configuration."""
+        return ()
+
+    def events(self, t: Component, q: Values, u: Values) -> Mapping[str, Component]:
+        """Signed, smooth quantities by name; a simulation stops, with that name as its status, where one vanishes."""
+        return {}
+
+
+def check_parameter(label: str, value: Any, info: ParameterInfo) -> None:
+    """Refuse what is no finite float; a batch is left to the status of its members."""
+    if isinstance(value, jax.core.Tracer):
+        return
+    if not (isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)):
+        raise TypeError(f"{label} must be a real number or a float array, got {value!r}.")
+    n = value.ndim - len(info.shape)
+    if n < 0 or value.shape[n:] != info.shape:
+        raise ValueError(
+            f"{label} must have the shape {info.shape}, or leading axes more for a batch; got {value.shape}."
+        )
+    if n > 0:
+        return
+    array = np.asarray(value)
+    if not np.all(np.isfinite(array)):
+        raise ValueError(f"{label} = {array} is not finite.")
+    if info.positive and not np.all(array > 0):
+        raise ValueError(f"{label} = {array} must be positive.")
+
+
+def kinetic_energy_of(motion: Motion) -> Component:
+    """1/2 sum of m v.v + omega . I . omega over the bodies [J]."""
+    total: Component = 0.0
+    for body in motion.bodies:
+        v = body.center.velocity.components
+        w = body.angular_velocity.components_in(body.frame)
+        H = tuple(dot(row, w) for row in body.inertia)
+        total = total + 0.5 * (body.mass * dot(v, v) + dot(w, H))
+    return total

@@ -1,0 +1,146 @@
+"""Orientation of a rigid body: body-fixed sequences and Euler parameters. Knows angles; knows no frame and no body.
+
+`[R]` is the textbook's transformation matrix: it takes components in the parent frame to components in the rotated
+frame. Every function works on single numbers, and keeps the exact zeros and ones of its entries.
+Source: Kamman, Volume II, Unit 5, Examples 2, 6, 7 and Exercises 5.6, 5.8.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+
+from ._components import add, cross, dot, matvec, mul, sub
+from ._types import Component, Triple
+
+Matrix = tuple[Triple, Triple, Triple]
+
+IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+
+
+def axes_of(sequence: str) -> tuple[int, ...]:
+    """The axes (0, 1, 2) of a body-fixed sequence written "3-1-2" or "312"."""
+    digits = str(sequence).replace("-", "")
+    if not digits or any(d not in "123" for d in digits):
+        raise ValueError(f'A body-fixed sequence is written with the axes 1, 2, 3, such as "3-1-2"; got {sequence!r}.')
+    return tuple(int(d) - 1 for d in digits)
+
+
+def simple_rotation(axis: int, angle: Component) -> Matrix:
+    """[R] of a right-hand rotation by `angle` [rad] about axis 0, 1 or 2."""
+    return _simple(axis, jnp.cos(angle), jnp.sin(angle))
+
+
+def _simple(axis: int, c: Component, s: Component) -> Matrix:
+    i, j = (axis + 1) % 3, (axis + 2) % 3
+    rows: list[list[Component]] = [[0.0] * 3 for _ in range(3)]
+    rows[axis][axis] = 1.0
+    rows[i][i], rows[i][j] = c, s
+    rows[j][i], rows[j][j] = -s, c
+    return _frozen(rows)
+
+
+def _frozen(rows) -> Matrix:
+    return tuple(tuple(row) for row in rows)  # type: ignore[return-value]
+
+
+def transpose(matrix: Matrix) -> Matrix:
+    return _frozen(zip(*matrix, strict=True))
+
+
+def matmul(a: Matrix, b: Matrix) -> Matrix:
+    columns = transpose(b)
+    return _frozen([dot(row, column) for column in columns] for row in a)
+
+
+def sequence_matrix(sequence: str, angles: Sequence[Component]) -> Matrix:
+    """[R] of a body-fixed sequence of rotations, from parent components to rotated components.
+
+    **Arguments:** `sequence`, such as "3-1-2"; `angles` [rad], one for each axis.
+    """
+    rotation = IDENTITY
+    for axis, angle in zip(axes_of(sequence), angles, strict=True):
+        rotation = matmul(simple_rotation(axis, angle), rotation)
+    return rotation
+
+
+def _rate_directions(sequence: str, angles: Sequence[Component]) -> list[Triple]:
+    # The column of each angle's rate in the rotated frame's components of the angular velocity.
+    rest = IDENTITY
+    columns: list[Triple] = []
+    for axis, angle in reversed(list(zip(axes_of(sequence), angles, strict=True))):
+        columns.append((rest[0][axis], rest[1][axis], rest[2][axis]))
+        rest = matmul(rest, simple_rotation(axis, angle))
+    return columns[::-1]
+
+
+def angular_velocity(sequence: str, angles: Sequence[Component], rates: Sequence[Component]) -> Triple:
+    """Components, in the rotated frame, of its angular velocity relative to the parent [rad/s].
+
+    **Arguments:** `sequence`, such as "3-1-3"; `angles` [rad] and their `rates` [rad/s], three each.
+    """
+    columns = _rate_directions(sequence, angles)
+    return matvec(list(zip(*columns, strict=True)), rates)  # type: ignore[return-value]
+
+
+def angle_rates(sequence: str, angles: Sequence[Component], omega: Sequence[Component]) -> Triple:
+    """Rates of the three angles of a body-fixed sequence [rad/s], from body-fixed components of angular velocity.
+
+    The inverse of `angular_velocity`. It does not exist where the sequence locks: a sine (3-1-3) or a cosine
+    (3-2-1, 3-1-2, 1-2-3) of the second angle is zero there, and the rates become infinite.
+
+    **Arguments:** `sequence` of three axes; `angles` [rad], `omega` [rad/s], three each.
+    """
+    a, b, c = _rate_directions(sequence, angles)
+    bc, ca, ab = cross(b, c), cross(c, a), cross(a, b)  # the reciprocal basis of the three directions
+    det = dot(a, bc)
+    return tuple(_divide(dot(x, omega), det) for x in (bc, ca, ab))  # type: ignore[return-value]
+
+
+def _divide(a: Component, b: Component) -> Component:
+    return 0.0 if isinstance(a, float) and a == 0.0 else a / b
+
+
+def euler_parameters_matrix(parameters: Sequence[Component]) -> Matrix:
+    """[R] of Euler parameters (e1, e2, e3, e4) of unit norm, e4 the scalar.
+
+    Scalar last, as in the textbook (Example 2); jaxlie and MuJoCo put it first.
+    """
+    e1, e2, e3, e4 = parameters
+    return (
+        (e1 * e1 - e2 * e2 - e3 * e3 + e4 * e4, 2.0 * (e1 * e2 + e3 * e4), 2.0 * (e1 * e3 - e2 * e4)),
+        (2.0 * (e1 * e2 - e3 * e4), e2 * e2 - e1 * e1 - e3 * e3 + e4 * e4, 2.0 * (e2 * e3 + e1 * e4)),
+        (2.0 * (e1 * e3 + e2 * e4), 2.0 * (e2 * e3 - e1 * e4), e3 * e3 - e1 * e1 - e2 * e2 + e4 * e4),
+    )
+
+
+def euler_parameter_rates(parameters: Sequence[Component], omega: Sequence[Component]) -> tuple[Any, Any, Any, Any]:
+    """Rates of Euler parameters (scalar last) [1/s] from body-fixed components of angular velocity [rad/s].
+
+    {e_dot} = 1/2 [E']^T {w1, w2, w3, 0}        (Example 2)
+    """
+    e1, e2, e3, e4 = parameters
+    half = [mul(0.5, w) for w in omega]
+    rows = ((e4, -e3, e2), (e3, e4, -e1), (-e2, e1, e4), (-e1, -e2, -e3))
+    return tuple(dot(row, half) for row in rows)  # type: ignore[return-value]
+
+
+def rodrigues_matrix(axis: Triple, c: Component, s: Component) -> Matrix:
+    """[R] of a rotation about the unit vector `axis`, from the cosine and sine of its angle (Rodrigues' formula)."""
+    versine = sub(1.0, c)
+    rows: list[list[Component]] = []
+    for i in range(3):
+        row = []
+        for j in range(3):
+            entry = mul(mul(axis[i], axis[j]), versine)
+            if i == j:
+                entry = add(entry, c)
+            else:
+                k = 3 - i - j
+                turn = mul(s, axis[k])
+                entry = add(entry, turn) if (j - i) % 3 == 1 else sub(entry, turn)
+            row.append(entry)
+        rows.append(row)
+    return _frozen(rows)
