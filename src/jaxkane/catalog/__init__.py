@@ -1,0 +1,24 @@
+"""The systems of Kamman, Volume II, Unit 5: Examples 1 to 7 and Exercises 5.1 to 5.8, one file a mechanism.
+
+`CATALOG` lists them all, each with an example instance and a consistent state. A new mechanism is a file here and an
+`Entry` in `_entries.py`; the laws in `tests/catalog/test_laws.py` then hold it to account.
+"""
+
+from ._entries import CATALOG as CATALOG
+from ._entries import Entry as Entry
+from .aircraft import Aircraft as Aircraft
+from .aircraft import AircraftEulerParameters as AircraftEulerParameters
+from .bar_with_piston import BarWithPiston as BarWithPiston
+from .bicycle import WhippleBicycle as WhippleBicycle
+from .bracket import Bracket as Bracket
+from .column_frame_and_disk import ColumnFrameAndDisk as ColumnFrameAndDisk
+from .disk_and_bar import DiskAndBar as DiskAndBar
+from .double_pendulum import DoublePendulum as DoublePendulum
+from .rigid_body import RigidBody as RigidBody
+from .rotating_frame import RotatingFrameAndBar as RotatingFrameAndBar
+from .rotating_frame import RotatingFrameAndBarChosenSpeeds as RotatingFrameAndBarChosenSpeeds
+from .shaft_and_bar import LightShaftAndBar as LightShaftAndBar
+from .shaft_and_bar import ShaftAndBar as ShaftAndBar
+from .slider_with_pinned_bar import SliderWithPinnedBar as SliderWithPinnedBar
+from .spatial_double_pendulum import SpatialDoublePendulum as SpatialDoublePendulum
+from .spinning_top import SpinningTop as SpinningTop

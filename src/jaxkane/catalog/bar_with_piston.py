@@ -1,0 +1,60 @@
+"""Exercise 5.1: a bar between a piston and a slider."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from .._system import Body, Force, Motion, System, parameter, weight
+from .._types import Scalar
+from .._vectors import inertial
+
+
+class BarWithPiston(System):
+    """A bar whose upper end A carries a vertical piston, its lower end B a horizontal light slider on a spring and
+    a damper (Kamman, Unit 5, Exercise 5.1).
+
+    | parameter | book | meaning |
+    |---|---|---|
+    | `mass` | m | of the bar [kg] |
+    | `length` | l | of the bar [m] |
+    | `piston_mass` | m_p | [kg] |
+    | `stiffness`, `damping` | k, c | of the spring [N/m] and the damper [N s/m] on B; unstretched at x_B = 0 |
+    | `gravity` | g | along -N.y [m/s^2] |
+
+    - Coordinate `theta`: of the bar from the vertical: x_B = l sin(theta), y_A = l cos(theta) [rad].
+    - Speed: its rate [rad/s].
+    - Input `force` (F): downward on the piston [N].
+    """
+
+    mass: Scalar = parameter(1.0, positive=True)  # [kg]
+    length: Scalar = parameter(0.5, positive=True)  # [m]
+    piston_mass: Scalar = parameter(2.0, positive=True)  # [kg]
+    stiffness: Scalar = parameter(200.0)  # [N/m]
+    damping: Scalar = parameter(5.0)  # [N s/m]
+    gravity: Scalar = parameter(9.81)  # [m/s^2]
+
+    coordinates = ("theta",)
+    speeds = ("theta_dot",)
+    inputs = ("force",)
+
+    def motion(self, t, q, u):
+        m, l = self.mass, self.length
+        theta, theta_dot = q["theta"], u["theta_dot"]
+        N, O = inertial()
+        L = N.rotate(3, theta, theta_dot, "L")
+        A = O.moving(l * jnp.cos(theta) * N.y, -l * jnp.sin(theta) * theta_dot * N.y, name="A")
+        B = A.fixed(-l * L.y)  # from A the bar runs along -L.y
+        G = A.fixed(-0.5 * l * L.y)
+        I = m * l**2 / 12
+        bar = Body(m, (I, 0.0, I), G, L, name="bar")
+        piston = Body(self.piston_mass, 0.0, A, N, name="piston")
+        return Motion((bar, piston), points={"B": B})
+
+    def loads(self, t, q, u, motion, inputs):
+        N, B = motion.N, motion["B"]
+        x, x_dot = B.position.dot(N.x), B.velocity.dot(N.x)
+        return (
+            weight(motion, -self.gravity * N.y),
+            Force(-inputs["force"] * N.y, motion["piston"]),
+            Force(-(self.stiffness * x + self.damping * x_dot) * N.x, B),
+        )

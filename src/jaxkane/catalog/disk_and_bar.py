@@ -1,0 +1,61 @@
+"""Exercise 5.5: a bar pinned to a turning disk, with a torsional spring and damper."""
+
+from __future__ import annotations
+
+from .._system import Body, Motion, System, Torque, parameter, weight
+from .._types import Scalar
+from .._vectors import inertial
+
+
+class DiskAndBar(System):
+    """A horizontal disk that turns about the vertical, and a slender bar that hangs from a pin on it
+    (Kamman, Unit 5, Exercise 5.5).
+
+    | parameter | book | meaning |
+    |---|---|---|
+    | `disk_mass`, `disk_radius` | m_d, R | [kg, m] |
+    | `mass`, `length` | m, l | of the bar [kg, m] |
+    | `pin_radius` | b | from the vertical axis to the pin P [m] |
+    | `stiffness`, `damping` | k, c | of the torsional spring [N m/rad] and damper [N m s/rad] at P |
+    | `gravity` | g | along -N.z [m/s^2] |
+
+    - Coordinates `phi`: the disk about N.z; `theta`: the bar about the disk's x axis, from the downward vertical,
+      where the spring is unstretched [rad].
+    - Speeds: their rates [rad/s].
+    - Inputs `disk_torque` (M_phi, ground on disk), `bar_torque` (M_theta, disk on bar) [N m].
+    """
+
+    disk_mass: Scalar = parameter(4.0, positive=True)  # [kg]
+    disk_radius: Scalar = parameter(0.5, positive=True)  # [m]
+    mass: Scalar = parameter(1.0, positive=True)  # [kg]
+    length: Scalar = parameter(0.6, positive=True)  # [m]
+    pin_radius: Scalar = parameter(0.4)  # [m]
+    stiffness: Scalar = parameter(2.0)  # [N m/rad]
+    damping: Scalar = parameter(0.1)  # [N m s/rad]
+    gravity: Scalar = parameter(9.81)  # [m/s^2]
+
+    coordinates = ("phi", "theta")
+    speeds = ("phi_dot", "theta_dot")
+    inputs = ("disk_torque", "bar_torque")
+
+    def motion(self, t, q, u):
+        m, l = self.mass, self.length
+        N, O = inertial()
+        D = N.rotate(3, q["phi"], u["phi_dot"], "D")
+        B = D.rotate(1, q["theta"], u["theta_dot"], "B")
+        P = O.fixed(self.pin_radius * D.y)
+        G = P.fixed(-0.5 * l * B.z)  # the bar hangs along -B.z
+        I_D = self.disk_mass * self.disk_radius**2 / 4
+        I_B = m * l**2 / 12
+        disk = Body(self.disk_mass, (I_D, I_D, 2.0 * I_D), O, D, name="disk")
+        bar = Body(m, (I_B, I_B, 0.0), G, B, name="bar")
+        return Motion((disk, bar), points={"P": P})
+
+    def loads(self, t, q, u, motion, inputs):
+        disk, bar = motion.bodies
+        joint_torque = inputs["bar_torque"] - self.stiffness * q["theta"] - self.damping * u["theta_dot"]
+        return (
+            weight(motion, -self.gravity * motion.N.z),
+            Torque(inputs["disk_torque"] * motion.N.z, disk),
+            Torque(joint_torque * disk.frame.x, bar, reaction_on=disk),
+        )

@@ -1,0 +1,65 @@
+"""Examples 3 and 4: one rotating frame and bar, with two sets of speeds."""
+
+from __future__ import annotations
+
+from .._system import Body, Motion, System, Torque, parameter
+from .._types import Scalar
+from .._vectors import inertial
+
+
+class _FrameAndBar(System):
+    # The mechanism of both examples; what the speeds are is said by `q_dot` alone.
+    mass: Scalar = parameter(2.0, positive=True)  # [kg]
+    length: Scalar = parameter(0.8, positive=True)  # [m]
+    distance: Scalar = parameter(0.5, positive=True)  # [m]
+
+    coordinates = ("phi", "theta")
+    inputs = ("frame_torque", "bar_torque")
+
+    def motion(self, t, q, u):
+        m, l, d = self.mass, self.length, self.distance
+        phi_dot, theta_dot = self.q_dot(t, q, u)
+        N, O = inertial()
+        F = N.rotate(3, q["phi"], phi_dot, "F")
+        B = F.rotate(2, q["theta"], theta_dot, "B")
+        G = O.fixed(d * F.y)
+        I = m * l**2 / 12
+        bar = Body(m, (0.0, I, I), G, B, name="bar")  # the bar lies along B.x; the frame is light
+        return Motion([bar], points={"G": G}, frames={"F": F, "B": B})
+
+    def loads(self, t, q, u, motion, inputs):
+        F = motion["F"]
+        return (
+            Torque(inputs["frame_torque"] * F.z, F),
+            Torque(inputs["bar_torque"] * F.y, motion["bar"], reaction_on=F),
+        )
+
+
+class RotatingFrameAndBar(_FrameAndBar):
+    """A light frame that turns about the vertical, a slender bar that turns on it (Kamman, Unit 5, Example 3).
+
+    | parameter | book | meaning |
+    |---|---|---|
+    | `mass` | m | mass of the bar [kg] |
+    | `length` | l | length of the bar [m] |
+    | `distance` | d | from the vertical axis to the bar's mass centre [m] |
+
+    - Coordinates `phi`: the frame about the vertical N.z; `theta`: the bar about the frame's arm, from the
+      horizontal [rad].
+    - Speeds: their rates [rad/s].
+    - Inputs `frame_torque` (M_phi, ground on frame), `bar_torque` (M_theta, frame on bar) [N m].
+    """
+
+    speeds = ("phi_dot", "theta_dot")
+
+
+class RotatingFrameAndBarChosenSpeeds(_FrameAndBar):
+    """`RotatingFrameAndBar` with the speeds of Example 4; all else is the same mechanism (Kamman, Unit 5).
+
+    - Speeds `center_speed` (v_G = d phi_dot): of the bar's mass centre [m/s]; `omega2` = theta_dot [rad/s].
+    """
+
+    speeds = ("center_speed", "omega2")
+
+    def q_dot(self, t, q, u):
+        return u["center_speed"] / self.distance, u["omega2"]

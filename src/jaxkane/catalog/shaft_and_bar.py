@@ -1,0 +1,92 @@
+"""Exercises 5.3 and 5.4: a bar pinned through a vertical shaft; with rates, and with body-fixed speeds."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from .._system import Body, Motion, System, Torque, parameter
+from .._types import Scalar
+from .._vectors import inertial
+
+
+def _shaft_and_bar(mass, length, q, q_dot):
+    # The frame of the shaft and the bar on it: what both exercises have in common.
+    N, O = inertial()
+    S = N.rotate(3, q["phi"], q_dot[0], "S")
+    B = S.rotate(2, q["theta"], q_dot[1], "B")
+    I = mass * length**2 / 12
+    return O, S, Body(mass, (I, I, 0.0), O, B, name="bar")  # the bar lies along B.z
+
+
+def _motor_torques(motion, inputs):
+    S = motion["S"]
+    return (
+        Torque(inputs["shaft_torque"] * S.z, S),
+        Torque(inputs["bar_torque"] * S.y, motion["bar"], reaction_on=S),
+    )
+
+
+class ShaftAndBar(System):
+    """A shaft that turns about the vertical, a slender bar pinned through its centre (Kamman, Unit 5, Exercise 5.3).
+
+    | parameter | book | meaning |
+    |---|---|---|
+    | `mass`, `length` | m, l | of the bar [kg, m] |
+    | `shaft_mass`, `shaft_radius` | m_s, r | of the shaft [kg, m] |
+
+    - Coordinates `phi`: the shaft about N.z; `theta`: the bar about the shaft's y axis, from the vertical [rad].
+    - Speeds: their rates [rad/s].
+    - Inputs `shaft_torque` (M_phi, ground on shaft), `bar_torque` (M_theta, shaft on bar) [N m].
+    """
+
+    mass: Scalar = parameter(1.0, positive=True)  # [kg]
+    length: Scalar = parameter(1.0, positive=True)  # [m]
+    shaft_mass: Scalar = parameter(2.0, positive=True)  # [kg]
+    shaft_radius: Scalar = parameter(0.1, positive=True)  # [m]
+
+    coordinates = ("phi", "theta")
+    speeds = ("phi_dot", "theta_dot")
+    inputs = ("shaft_torque", "bar_torque")
+
+    def motion(self, t, q, u):
+        O, S, bar = _shaft_and_bar(self.mass, self.length, q, u)
+        I = 0.25 * self.shaft_mass * self.shaft_radius**2
+        shaft = Body(self.shaft_mass, (I, I, 2.0 * I), O, S, name="shaft")  # only the last matters: it turns about S.z
+        return Motion((shaft, bar), frames={"S": S})
+
+    def loads(self, t, q, u, motion, inputs):
+        return _motor_torques(motion, inputs)
+
+
+class LightShaftAndBar(System):
+    """`ShaftAndBar` with a light shaft and body-fixed speeds (Kamman, Unit 5, Exercise 5.4).
+
+    | parameter | book | meaning |
+    |---|---|---|
+    | `mass`, `length` | m, l | of the bar [kg, m] |
+
+    - Coordinates `phi`: the shaft about N.z; `theta`: the bar about the shaft's y axis, from the vertical [rad].
+    - Speeds `omega1`, `omega2`: angular velocity of the bar along its own axes 1 and 2 [rad/s]. They do not give
+      phi_dot = -omega1 / sin(theta) where the bar stands along the shaft.
+    - Inputs `shaft_torque` (M_phi, ground on shaft), `bar_torque` (M_theta, shaft on bar) [N m].
+    """
+
+    mass: Scalar = parameter(1.0, positive=True)  # [kg]
+    length: Scalar = parameter(1.0, positive=True)  # [m]
+
+    coordinates = ("phi", "theta")
+    speeds = ("omega1", "omega2")
+    inputs = ("shaft_torque", "bar_torque")
+
+    def q_dot(self, t, q, u):
+        return -u["omega1"] / jnp.sin(q["theta"]), u["omega2"]
+
+    def motion(self, t, q, u):
+        _, S, bar = _shaft_and_bar(self.mass, self.length, q, self.q_dot(t, q, u))
+        return Motion([bar], frames={"S": S})
+
+    def loads(self, t, q, u, motion, inputs):
+        return _motor_torques(motion, inputs)
+
+    def events(self, t, q, u):
+        return {"bar_along_shaft": jnp.sin(q["theta"])}

@@ -1,0 +1,65 @@
+"""Example 6: the three-dimensional double pendulum with body-fixed speeds."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+
+from .. import rotations
+from .._system import Body, Motion, System, parameter, weight
+from .._types import Scalar
+from .._vectors import inertial
+
+
+class SpatialDoublePendulum(System):
+    """Two links on ball joints, oriented by 3-1-3 angles, with body-fixed speeds (Kamman, Unit 5, Example 6).
+
+    | parameter | book | meaning |
+    |---|---|---|
+    | `mass1`, `mass2` | m1, m2 | of the links [kg] |
+    | `length1`, `length2` | l1, l2 | of the links; mass centres at their midpoints [m] |
+    | `I11_1`, `I22_1`, `I33_1` | I^1 | first link, about its mass centre; axis 2 is the link [kg m^2] |
+    | `I11_2`, `I22_2`, `I33_2` | I^2 | second link, likewise [kg m^2] |
+    | `gravity` | g | along -N.y [m/s^2] |
+
+    With I22 = 0 (a line) the speeds omega12, omega22 have no mass and the equations no solution (note 2).
+
+    - Coordinates `theta11`, `theta12`, `theta13` and `theta21`, `theta22`, `theta23`: 3-1-3 angles of the links, both
+      relative to the ground [rad]. At zero a link hangs along -N.y, and its angles lock.
+    - Speeds `omega11` ... `omega13`, `omega21` ... `omega23`: angular velocities along the links' own axes [rad/s].
+    """
+
+    mass1: Scalar = parameter(1.2, positive=True)  # [kg]
+    mass2: Scalar = parameter(0.8, positive=True)  # [kg]
+    length1: Scalar = parameter(1.0, positive=True)  # [m]
+    length2: Scalar = parameter(0.75, positive=True)  # [m]
+    I11_1: Scalar = parameter(0.1, positive=True)  # [kg m^2]
+    I22_1: Scalar = parameter(0.002)  # [kg m^2]
+    I33_1: Scalar = parameter(0.1, positive=True)  # [kg m^2]
+    I11_2: Scalar = parameter(0.0375, positive=True)  # [kg m^2]
+    I22_2: Scalar = parameter(0.001)  # [kg m^2]
+    I33_2: Scalar = parameter(0.0375, positive=True)  # [kg m^2]
+    gravity: Scalar = parameter(9.81)  # [m/s^2]
+
+    coordinates = ("theta11", "theta12", "theta13", "theta21", "theta22", "theta23")
+    speeds = ("omega11", "omega12", "omega13", "omega21", "omega22", "omega23")
+
+    def q_dot(self, t, q, u):
+        return (*rotations.angle_rates("3-1-3", q[:3], u[:3]), *rotations.angle_rates("3-1-3", q[3:], u[3:]))
+
+    def motion(self, t, q, u):
+        l1, l2 = self.length1, self.length2
+        N, O = inertial()
+        L1 = N.rotate_sequence("3-1-3", q[:3], angular_velocity=u[:3], name="L1")
+        L2 = N.rotate_sequence("3-1-3", q[3:], angular_velocity=u[3:], name="L2")
+        G1 = O.fixed(-0.5 * l1 * L1.y)
+        A = O.fixed(-l1 * L1.y)
+        G2 = A.fixed(-0.5 * l2 * L2.y)
+        link1 = Body(self.mass1, (self.I11_1, self.I22_1, self.I33_1), G1, L1, name="link1")
+        link2 = Body(self.mass2, (self.I11_2, self.I22_2, self.I33_2), G2, L2, name="link2")
+        return Motion((link1, link2), points={"O": O, "A": A})
+
+    def loads(self, t, q, u, motion, inputs):
+        return weight(motion, -self.gravity * motion.N.y)
+
+    def events(self, t, q, u):
+        return {"gimbal_lock_1": jnp.sin(q["theta12"]), "gimbal_lock_2": jnp.sin(q["theta22"])}
