@@ -1,0 +1,207 @@
+"""Laws that every entry of `CATALOG` obeys. A new entry is tested here without a line being written."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+import jaxkane as jk
+from jaxkane._kane import Instant
+from jaxkane.catalog import CATALOG
+
+T = 0.3  # [s]: by then the engines of Example 5 have changed their speed
+INPUTS = np.random.default_rng(5).uniform(0.5, 2.0, 12)
+
+
+class Example:
+    """An entry at its state, moving, with all its inputs at work."""
+
+    def __init__(self, name):
+        self.entry = CATALOG[name]
+        self.system = self.entry.example()
+        self.q, self.u = jnp.array(self.entry.q), jnp.array(self.entry.u)
+        self.inputs = {name: float(x) for name, x in zip(self.system.inputs, INPUTS, strict=False)}
+        self.at = (self.system, T, self.q, self.u)
+        self.u_dot = jk.accelerations(*self.at, self.inputs)
+        self.q_dot = jnp.stack(Instant(*self.at).q_dot)
+
+    def along_motion(self, f):
+        """f(t, q, u) and its time derivative."""
+        return jax.jvp(f, (jnp.array(T), self.q, self.u), (jnp.array(1.0), self.q_dot, self.u_dot))
+
+    def motion(self, t, q, u):
+        now = Instant(self.system, t, q, u)
+        return now.motion(now.t, now.q, now.u_all)
+
+    def velocities(self, t, q, u):
+        """(b, 2, 3) in N: of the mass centres, and angular."""
+        motion = self.motion(t, q, u)
+        pairs = [(body.center.velocity, body.angular_velocity) for body in motion.bodies]
+        return jnp.stack([jnp.stack([x.to(motion.N) for x in pair]) for pair in pairs])
+
+    def momenta(self, t, q, u):
+        """(b, 2, 3) in N: linear, and angular about the mass centres."""
+        motion = self.motion(t, q, u)
+        pairs = []
+        for body in motion.bodies:
+            H = jnp.array(body.inertia) @ body.angular_velocity.to(body.frame)
+            pairs.append((body.mass * body.center.velocity.to(motion.N), motion.N.matrix(body.frame) @ H))
+        return jnp.stack([jnp.stack(pair) for pair in pairs])
+
+    def loads(self, u, inputs):
+        """Forces and torques (l, 3), and the velocities they work on (l, 3), in N."""
+        now = Instant(self.system, T, self.q, u, inputs)
+        loads = now.loads(now.motion(now.t, now.q, now.u_all))
+        if not loads:
+            return jnp.zeros((0, 3)), jnp.zeros((0, 3))
+        in_N = lambda x: x.to(x.frame.root)  # noqa: E731
+        return jnp.stack([in_N(x.vector) for x in loads]), jnp.stack([in_N(x.velocity) for x in loads])
+
+    def power(self, u, inputs):
+        forces, velocities = self.loads(u, inputs)
+        return jnp.sum(forces * velocities)
+
+
+_example = functools.cache(Example)
+
+
+@pytest.fixture(params=list(CATALOG))
+def example(request):
+    return _example(request.param)
+
+
+def assert_close(a, b, rtol, scale=None):
+    """Largest difference relative to the largest entry of `b`, or to `scale`."""
+    scale = np.abs(b).max(initial=0.0) if scale is None else scale
+    np.testing.assert_allclose(a, b, rtol=0, atol=max(rtol * float(scale), 1e-300))
+
+
+def test_the_state_of_an_entry_is_consistent(example):
+    system, q = example.system, Instant(*example.at)
+    assert len(example.entry.q) == len(system.coordinates)
+    assert len(example.entry.u) == len(system.speeds)
+    assert_close(np.array([float(x) for x in q.configuration(T, q.q)]), 0.0, 1e-14, scale=1.0)
+
+
+def test_rates_keep_the_configuration_constraints(example):
+    now = Instant(*example.at)
+    if not now.configuration(now.t, now.q):
+        return
+    _, h_dot = example.along_motion(lambda t, q, u: jnp.stack(now.configuration(t, tuple(q))))
+    assert_close(h_dot, 0.0, 1e-13, scale=np.abs(example.q_dot).max())
+
+
+def test_mass_matrix_is_symmetric_and_positive_definite(example):
+    M = jk.mass_matrix(*example.at)
+    assert_close(M, M.T, 1e-14)
+    assert np.linalg.eigvalsh(M).min() > 0
+
+
+def test_mass_matrix_is_that_of_the_kinetic_energy(example):
+    # T is a quadratic form of the speeds, drift apart, and M its matrix: d2T/du2 = M
+    M = jk.mass_matrix(*example.at)
+    system, t, q, u = example.at
+    assert_close(M, jax.hessian(lambda u: jk.kinetic_energy(system, t, q, u))(u), 1e-12)
+
+
+def test_forces_balance_at_the_accelerations(example):
+    Fr = jk.generalized_active_forces(*example.at, example.inputs)
+    Fr_star = jk.generalized_inertia_forces(*example.at, example.inputs, u_dot=example.u_dot)
+    M, f = jk.equations_of_motion(*example.at, example.inputs)
+    scale = np.abs(M @ example.u_dot).max() + np.abs(Fr).max()
+    assert_close(Fr + Fr_star, 0.0, 1e-11, scale)
+    assert_close(M @ example.u_dot, f, 1e-11, scale)
+
+
+def test_partial_velocities_and_drift_give_the_velocities(example):
+    # v = V u + v_t,  omega = W u + omega_t
+    V, W = jk.partial_velocities(*example.at)
+    _, t, q, u = example.at
+    drift = example.velocities(t, q, jnp.zeros_like(u))
+    partial = jnp.stack([V @ u, W @ u], axis=1)
+    assert_close(partial + drift, example.velocities(t, q, u), 1e-13)
+
+
+def test_power_of_the_loads_is_the_rate_of_kinetic_energy(example):
+    # dT/dt = F . v + [dp/dt . v_t + dH/dt . omega_t - F . v_t]; the bracket is the power of prescribed motions, where
+    # the index t marks velocities that are left when the speeds are zero
+    system, t, q, u = example.at
+    _, T_dot = example.along_motion(lambda t, q, u: jk.kinetic_energy(system, t, q, u))
+    _, momentum_rates = example.along_motion(example.momenta)
+    drift = example.velocities(t, q, jnp.zeros_like(u))
+    forces, velocities = example.loads(u, example.inputs)
+    _, load_drift = example.loads(jnp.zeros_like(u), example.inputs)
+    prescribed = jnp.sum(momentum_rates * drift) - jnp.sum(forces * load_drift)
+    scale = np.abs(np.array(momentum_rates * example.velocities(t, q, u))).sum() + np.abs(forces * velocities).sum()
+    assert_close(T_dot, jnp.sum(forces * velocities) + prescribed, 1e-12, scale)
+
+
+def test_conservative_says_whether_energy_is_kept(example):
+    # The power of conservative loads changes its sign with the speeds; a damper's does not.
+    u, none = example.u, {}
+    odd = abs(example.power(u, none) + example.power(-u, none)) <= 1e-12 * abs(example.power(u, none))
+    scleronomic = not np.any(example.velocities(T, example.q, jnp.zeros_like(u)))
+    assert example.entry.conservative == bool(odd and scleronomic)
+
+
+def test_frames_turn_as_their_angular_velocities_say(example):
+    # dR/dt R^T = [omega x], R from the frame's components to those in N
+    def frames(motion):
+        return [body.frame for body in motion.bodies] + list(motion.frames.values())
+
+    def rotations(t, q, u):
+        motion = example.motion(t, q, u)
+        return jnp.stack([motion.N.matrix(frame) for frame in frames(motion)])
+
+    R, R_dot = example.along_motion(rotations)
+    motion = example.motion(T, example.q, example.u)
+    for A, A_dot, frame in zip(R, R_dot, frames(motion), strict=True):
+        x, y, z = frame.angular_velocity.to(motion.N)
+        assert_close(A @ A.T, np.eye(3), 1e-14)
+        assert_close(A_dot @ A.T, np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]), 1e-13, 1 + abs(x + y + z))
+
+
+def test_mass_centres_move_as_their_velocities_say(example):
+    # Of the mass centres only: a contact point may be named, whose velocity is that of the wheel's matter.
+    def positions(t, q, u):
+        motion = example.motion(t, q, u)
+        return jnp.stack([body.center.position.to(motion.N) for body in motion.bodies])
+
+    _, rates = example.along_motion(positions)
+    velocities = example.velocities(T, example.q, example.u)[:, 0]
+    assert_close(rates, velocities, 1e-12, scale=np.abs(velocities).max() + 1e-3)
+
+
+def test_derivatives_equal_central_differences(example):
+    rtol = 1e-6
+    x, unravel = ravel_pytree((example.system, example.q, example.u))
+
+    def f(x):
+        system, q, u = unravel(x)
+        return jk.accelerations(system, T, q, u, example.inputs)
+
+    # Directions are repeated up to a number that all entries share, so that operations are compiled once for all.
+    directions = jnp.eye(x.size)[jnp.arange(64) % x.size]
+    h = 1e-5 * jnp.maximum(jnp.abs(x), 0.1)
+    steps = directions @ jnp.diag(h)
+    differences = jax.vmap(lambda dx: f(x + dx) - f(x - dx))(steps) / (2 * jnp.sum(steps, 1, keepdims=True))
+    forward = jax.vmap(lambda dx: jax.jvp(f, (x,), (dx,))[1])(directions)
+    sizes = jnp.abs(directions @ x)[:, None]  # a derivative by a small parameter is judged by what the parameter does
+    for derivative, difference in zip(forward * sizes, differences * sizes, strict=True):
+        assert_close(derivative, difference, rtol, scale=np.abs(difference).max() + 1e-3 * np.abs(example.u_dot).max())
+
+    weights = jnp.array(INPUTS[: example.u.size])
+    reverse = jax.grad(lambda x: weights @ f(x))(x)
+    assert_close(directions @ reverse, forward @ weights, 1e-11)
+
+
+def test_jit_and_vmap_change_nothing(example):
+    def f(u):
+        return jk.accelerations(example.system, T, example.q, u, example.inputs)
+
+    batch = jnp.outer(jnp.array([1.0, 0.5, -1.2]), example.u)
+    one_by_one = np.stack([f(u) for u in batch])
+    assert_close(jax.jit(jax.vmap(f))(batch), one_by_one, 1e-11)

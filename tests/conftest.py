@@ -1,0 +1,7 @@
+"""Settings of all tests: float64, and no silent promotion of dtypes or shapes."""
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+jax.config.update("jax_numpy_rank_promotion", "raise")
