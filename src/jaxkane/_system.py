@@ -42,7 +42,7 @@ class ParameterInfo:
     shape: tuple[int, ...]
 
 
-def parameter_info(system: System) -> dict[str, ParameterInfo]:
+def parameter_info(system: System | type[System]) -> dict[str, ParameterInfo]:
     """Name and `ParameterInfo` of every parameter of a system, in the order of their declaration."""
     fields = dataclasses.fields(system)  # type: ignore[arg-type]
     return {f.name: f.metadata["jaxkane"] for f in fields if "jaxkane" in f.metadata}

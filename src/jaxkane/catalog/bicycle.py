@@ -1,40 +1,81 @@
+"""The Whipple bicycle of Example 7, after Meijaard, Papadopoulos, Ruina and Schwab (2007)."""
+
 from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any
 
 import jax.numpy as jnp
 
-from .. import _system as jk
+from .._system import Body, Motion, Point, System, Torque, parameter, parameter_info, weight
 from .._types import Scalar
 from .._vectors import inertial
+from ._bicycle_file import read_bicycle_file
+
+# Meijaard et al. (2007), Table 1: the benchmark bicycle.
+_BENCHMARK = {
+    "w": 1.02, "c": 0.08, "lam": 0.3141592653589793, "g": 9.81,
+    "rR": 0.3, "mR": 2.0, "IRxx": 0.0603, "IRyy": 0.12,
+    "xB": 0.3, "zB": -0.9, "mB": 85.0, "IBxx": 9.2, "IByy": 11.0, "IBzz": 2.8, "IBxz": 2.4,
+    "xH": 0.9, "zH": -0.7, "mH": 4.0, "IHxx": 0.05892, "IHyy": 0.06, "IHzz": 0.00708, "IHxz": -0.00756,
+    "rF": 0.35, "mF": 3.0, "IFxx": 0.1405, "IFyy": 0.28,
+}  # fmt: skip
+
+# What other sources write out although the model implies it: the name, and what it must be equal to.
+_IMPLIED = {"IRzz": "IRxx", "IFzz": "IFxx", "yB": None, "yH": None}
 
 
-class WhippleBicycle(jk.System):
-    w: Scalar = jk.parameter(positive=True)
-    c: Scalar = jk.parameter()
-    lam: Scalar = jk.parameter()
-    g: Scalar = jk.parameter()
-    rR: Scalar = jk.parameter(positive=True)
-    mR: Scalar = jk.parameter(positive=True)
-    IRxx: Scalar = jk.parameter(positive=True)
-    IRyy: Scalar = jk.parameter(positive=True)
-    xB: Scalar = jk.parameter()
-    zB: Scalar = jk.parameter()
-    mB: Scalar = jk.parameter(positive=True)
-    IBxx: Scalar = jk.parameter(positive=True)
-    IByy: Scalar = jk.parameter(positive=True)
-    IBzz: Scalar = jk.parameter(positive=True)
-    IBxz: Scalar = jk.parameter()
-    xH: Scalar = jk.parameter()
-    zH: Scalar = jk.parameter()
-    mH: Scalar = jk.parameter(positive=True)
-    IHxx: Scalar = jk.parameter(positive=True)
-    IHyy: Scalar = jk.parameter(positive=True)
-    IHzz: Scalar = jk.parameter(positive=True)
-    IHxz: Scalar = jk.parameter()
-    rF: Scalar = jk.parameter(positive=True)
-    mF: Scalar = jk.parameter(positive=True)
-    IFxx: Scalar = jk.parameter(positive=True)
-    IFyy: Scalar = jk.parameter(positive=True)
-    steer_damping: Scalar = jk.parameter(0.0)
+class WhippleBicycle(System):
+    """A bicycle with four rigid bodies, knife-edge wheels and ideal rolling on level ground (Example 7).
+
+    Parameters carry Meijaard's names. Positions are measured from the rear contact P of the upright bicycle, x forward
+    and z down; inertias are about the mass centres, in the same directions, products as matrix entries.
+
+    | name | meaning | unit |
+    |---|---|---|
+    | w, c | wheelbase, trail | m |
+    | lam | tilt of the steer axis from the vertical | rad |
+    | g | gravity | m/s^2 |
+    | rR, mR, IRxx, IRyy | rear wheel: radius, mass, inertia about a diameter and about its axle | m, kg, kg m^2 |
+    | xB, zB, mB, IBxx, IByy, IBzz, IBxz | rear frame and rider: mass centre, mass, inertia | m, kg, kg m^2 |
+    | xH, zH, mH, IHxx, IHyy, IHzz, IHxz | handlebar and fork: the same | m, kg, kg m^2 |
+    | rF, mF, IFxx, IFyy | front wheel: as the rear wheel | m, kg, kg m^2 |
+    | steer_damping | viscous torque between fork and frame | N m s/rad |
+
+    Coordinates: yaw, roll and pitch of the rear frame (3-1-2), steer about the tilted axis, the wheels' angles (both
+    fall when riding forward: the speed is -rR * rear_wheel_rate), and the rear contact's place x, y. Pitch follows from
+    roll and steer (`assemble`). Inputs: `roll_torque` on the frame about the heading, `drive_torque` on the rear wheel
+    and `steer_torque` on the fork, the last two with their reactions on the frame.
+    """
+
+    w: Scalar = parameter(positive=True)  # [m]
+    c: Scalar = parameter()  # [m]
+    lam: Scalar = parameter()  # [rad]
+    rR: Scalar = parameter(positive=True)  # [m]
+    mR: Scalar = parameter(positive=True)  # [kg]
+    IRxx: Scalar = parameter(positive=True)  # [kg m^2]
+    IRyy: Scalar = parameter(positive=True)  # [kg m^2]
+    xB: Scalar = parameter()  # [m]
+    zB: Scalar = parameter()  # [m]
+    mB: Scalar = parameter(positive=True)  # [kg]
+    IBxx: Scalar = parameter(positive=True)  # [kg m^2]
+    IByy: Scalar = parameter(positive=True)  # [kg m^2]
+    IBzz: Scalar = parameter(positive=True)  # [kg m^2]
+    IBxz: Scalar = parameter()  # [kg m^2]
+    xH: Scalar = parameter()  # [m]
+    zH: Scalar = parameter()  # [m]
+    mH: Scalar = parameter(positive=True)  # [kg]
+    IHxx: Scalar = parameter(positive=True)  # [kg m^2]
+    IHyy: Scalar = parameter(positive=True)  # [kg m^2]
+    IHzz: Scalar = parameter(positive=True)  # [kg m^2]
+    IHxz: Scalar = parameter()  # [kg m^2]
+    rF: Scalar = parameter(positive=True)  # [m]
+    mF: Scalar = parameter(positive=True)  # [kg]
+    IFxx: Scalar = parameter(positive=True)  # [kg m^2]
+    IFyy: Scalar = parameter(positive=True)  # [kg m^2]
+    g: Scalar = parameter(9.81)  # [m/s^2]
+    steer_damping: Scalar = parameter(0.0)  # [N m s/rad]
 
     coordinates = ("roll", "rear_wheel_angle", "steer", "yaw", "pitch", "front_wheel_angle", "x", "y")
     speeds = ("roll_rate", "rear_wheel_rate", "steer_rate")
@@ -42,73 +83,110 @@ class WhippleBicycle(jk.System):
     dependent_coordinates = ("pitch",)
     inputs = ("roll_torque", "drive_torque", "steer_torque")
 
-    def _frames(self, q, u):
-        roll, _, steer, yaw, pitch = q[:5]
-        roll_rate, _, steer_rate, yaw_rate, pitch_rate, _ = u[:6]
+    @classmethod
+    def benchmark(cls) -> WhippleBicycle:
+        """The benchmark bicycle of Meijaard et al. (2007), Table 1."""
+        return cls(**_BENCHMARK)
+
+    @classmethod
+    def from_parameters(cls, parameters: Mapping[str, Any]) -> WhippleBicycle:
+        """A bicycle from a dict with Meijaard's names.
+
+        `g` and `steer_damping` may be left out. `IRzz`, `IFzz`, `yB` and `yH`, which the model implies, may be given.
+
+        **Raises:** `ValueError` that names what is missing, unknown, or contradicts the model's symmetry.
+        """
+        values = dict(parameters)
+        for name, twin in _IMPLIED.items():
+            if name in values:
+                given, implied = float(values.pop(name)), 0.0 if twin is None else float(values.get(twin, jnp.nan))
+                if abs(given - implied) > 1e-9 * max(1.0, abs(implied)):
+                    raise ValueError(f"WhippleBicycle: {name} = {given:.6g}, but the model has {name} = {twin or 0.0}.")
+        known = parameter_info(cls)
+        unknown = sorted(set(values) - set(known))
+        missing = [name for name in known if name not in values and name not in ("g", "steer_damping")]
+        if unknown or missing:
+            parts = [f"missing: {', '.join(missing)}"] * bool(missing) + [f"unknown: {', '.join(unknown)}"] * bool(
+                unknown
+            )
+            raise ValueError(f"WhippleBicycle takes Meijaard's parameters; {'; '.join(parts)}.")
+        return cls(**values)
+
+    @classmethod
+    def from_file(cls, path: str | os.PathLike[str]) -> WhippleBicycle:
+        """A bicycle from a text file of BicycleParameters (`NAME = value+/-deviation`).
+
+        The deviations are read by `jaxkane.catalog.read_bicycle_file`.
+
+        **Raises:** `ValueError` that names the file's lines that are unknown, repeated or malformed, and what is missing.
+        """
+        values, _ = read_bicycle_file(path, known=(*parameter_info(cls), *_IMPLIED))
+        try:
+            return cls.from_parameters(values)
+        except ValueError as error:
+            raise ValueError(f"{os.fspath(path)}: {error}") from None
+
+    def q_dot(self, t, q, u):
+        # P follows the wheel: v_P = v_A - omega_R x r_P_A, R the frame that rolls but does not pitch.
+        forward = -self.rR * (u["rear_wheel_rate"] + u["pitch_rate"])
+        return (*u[:6], forward * jnp.cos(q["yaw"]), forward * jnp.sin(q["yaw"]))
+
+    def motion(self, t, q, u):
+        roll, _, steer, yaw, pitch, _, x, y = q
+        roll_rate, rear_wheel_rate, steer_rate, yaw_rate, pitch_rate, front_wheel_rate = u
         N, O = inertial()
         Y = N.rotate(3, yaw, yaw_rate, "Y")
         R = Y.rotate(1, roll, roll_rate, "R")
-        B = R.rotate(2, pitch, pitch_rate, "B")
-        C = B.rotate(2, self.lam, 0.0, "T").rotate(3, steer, steer_rate, "C")
-        return N, O, Y, R, B, C
+        B = R.rotate(2, pitch, pitch_rate, "B")  # rear frame
+        C = B.rotate(2, self.lam, 0.0, "tilt").rotate(3, steer, steer_rate, "C")  # fork, 3 along the steer axis
+        H = C.rotate(2, -self.lam, 0.0, "H")  # fork, aligned with B at zero steer
+        omega_A = B.angular_velocity + rear_wheel_rate * B.y
+        omega_D = C.angular_velocity + front_wheel_rate * C.y
 
-    def _fork(self):
-        # the steer axis passes S, at xS b1 - zS b3 from the rear wheel's centre
-        s, c = jnp.sin(self.lam), jnp.cos(self.lam)
-        xS = (self.w + self.c) * c**2 - self.rR * s * c
-        zS = xS * s / c
-        dx, dz = self.w - xS, -self.rF + self.rR + zS  # G_D from S, aligned, resolved along x and z
-        hx, hz = self.xH - xS, self.zH + self.rR + zS
-        xD, zD = c * dx - s * dz, s * dx + c * dz
-        xC, zC = c * hx - s * hz, s * hx + c * hz
-        return xS, zS, xC, zC, xD, zD
+        # S on the steer axis, and everything else, from the rear wheel's centre G_A (Example 7).
+        cos, sin = jnp.cos(self.lam), jnp.sin(self.lam)
+        xS = (self.w + self.c) * cos * cos - self.rR * sin * cos
+        zS = xS * sin / cos
 
-    def q_dot(self, t, q, u):
-        forward = -self.rR * (u[1] + u[4] + u[3] * jnp.sin(q[0]))
-        return (*u[:6], forward * jnp.cos(q[3]), forward * jnp.sin(q[3]))
+        def from_S(x, z):  # a place measured from P, upright, as a vector fixed in the fork
+            return ((x - xS) * H.x + (z + self.rR + zS) * H.z).express(C)
 
-    def motion(self, t, q, u):
-        N, O, Y, R, B, C = self._frames(q, u)
-        rear_wheel_rate, front_wheel_rate = u[1], u[5]
-        w_A = B.angular_velocity + rear_wheel_rate * B.y
-        w_D = C.angular_velocity + front_wheel_rate * C.y
-        xS, zS, xC, zC, xD, zD = self._fork()
-        P = jk.Point.at(0.0 * N.x, q[6] * N.x + q[7] * N.y, "P")
+        P = O.fixed(x * N.x + y * N.y, N)  # the ground under the rear wheel, at rest
         r_P_A = -self.rR * R.z
-        A = jk.Point(w_A.cross(r_P_A), P, r_P_A, "G_A")
-        G_B = A.fixed(self.xB * B.x + (self.zB + self.rR) * B.z, B)
-        S = A.fixed(xS * B.x - zS * B.z, B)
-        G_C = S.fixed(xC * C.x + zC * C.z, C)
-        G_D = S.fixed(xD * C.x + zD * C.z, C)
-        n1, n2, n3 = N.z.components_in(C)
-        length = jnp.sqrt(n1 * n1 + n3 * n3)
-        r_D_Q = C.vector(self.rF * n1 / length, 0.0, self.rF * n3 / length)
-        Q = jk.Point(G_D.velocity + w_D.cross(r_D_Q), G_D, r_D_Q, "Q")
-        bodies = (
-            jk.Body(self.mR, (self.IRxx, self.IRyy, self.IRxx), A, R, w_A, "rear wheel"),
-            jk.Body(
-                self.mB, ((self.IBxx, 0, self.IBxz), (0, self.IByy, 0), (self.IBxz, 0, self.IBzz)), G_B, B, name="frame"
-            ),
-            jk.Body(self.mH, self._fork_inertia(), G_C, C, name="fork"),
-            jk.Body(self.mF, (self.IFxx, self.IFyy, self.IFxx), G_D, C, w_D, "front wheel"),
-        )
-        return jk.Motion(bodies, [Q.velocity], points=dict(P=P, Q=Q, S=S), frames=dict(Y=Y, B=B, C=C))
+        G_A = Point(omega_A.cross(r_P_A), P, r_P_A)
+        G_B = G_A.fixed(self.xB * B.x + (self.zB + self.rR) * B.z)
+        S = G_A.fixed(xS * B.x - zS * B.z)
+        G_C = S.fixed(from_S(self.xH, self.zH))
+        G_D = S.fixed(from_S(self.w, -self.rF))
+        n1, _, n3 = N.z.components_in(C)  # downwards in the plane of the front wheel
+        r_D_Q = self.rF * C.vector(n1, 0.0, n3).normalize()
+        Q = Point(G_D.velocity + omega_D.cross(r_D_Q), G_D, r_D_Q)
 
-    def _fork_inertia(self):
-        s, c = jnp.sin(self.lam), jnp.cos(self.lam)
-        xx, zz, xz = self.IHxx, self.IHzz, self.IHxz
-        Cxx = c * c * xx - 2 * s * c * xz + s * s * zz
-        Czz = s * s * xx + 2 * s * c * xz + c * c * zz
-        Cxz = s * c * (xx - zz) + (c * c - s * s) * xz
-        return ((Cxx, 0, Cxz), (0, self.IHyy, 0), (Cxz, 0, Czz))
+        A_inertia = (self.IRxx, self.IRyy, self.IRxx)
+        B_inertia = ((self.IBxx, 0.0, self.IBxz), (0.0, self.IByy, 0.0), (self.IBxz, 0.0, self.IBzz))
+        H_inertia = ((self.IHxx, 0.0, self.IHxz), (0.0, self.IHyy, 0.0), (self.IHxz, 0.0, self.IHzz))
+        D_inertia = (self.IFxx, self.IFyy, self.IFxx)
+        bodies = (
+            Body(self.mR, A_inertia, G_A, R, omega_A, name="rear wheel"),
+            Body(self.mB, B_inertia, G_B, B, name="rear frame"),
+            Body(self.mH, H_inertia, G_C, H, name="fork"),
+            Body(self.mF, D_inertia, G_D, C, omega_D, name="front wheel"),
+        )
+        return Motion(bodies, [Q.velocity], points={"P": P, "Q": Q, "S": S}, frames={"Y": Y, "B": B, "C": C})
 
     def loads(self, t, q, u, motion, inputs):
-        A, B, C, D = motion.bodies
+        wheel, frame, fork, _ = motion.bodies
+        steer_torque = inputs["steer_torque"] - self.steer_damping * u["steer_rate"]
         return (
-            jk.weight(motion, self.g * motion.N.z),
-            jk.Torque(inputs["roll_torque"] * motion["Y"].x, B),
-            jk.Torque(inputs["drive_torque"] * motion["B"].y, A, reaction_on=B),
-            jk.Torque(
-                (inputs["steer_torque"] - self.steer_damping * u["steer_rate"]) * motion["C"].z, C, reaction_on=B
-            ),
+            weight(motion, self.g * motion.N.z),
+            Torque(inputs["roll_torque"] * motion["Y"].x, frame),
+            Torque(inputs["drive_torque"] * motion["B"].y, wheel, reaction_on=frame),
+            Torque(steer_torque * motion["C"].z, fork, reaction_on=frame),
         )
+
+    def configuration_constraints(self, t, q):
+        motion = self.motion(t, q, (0.0,) * 6)
+        return [motion["Q"].position.dot(motion.N.z)]  # height of the front contact, downwards
+
+    def events(self, t, q, u):
+        return {"fell_over": jnp.cos(q["roll"]) - 0.2}  # beyond 78 degrees

@@ -1,0 +1,353 @@
+"""Integration in time. The only file that sees diffrax; knows the method and no mechanism."""
+
+from __future__ import annotations
+
+import enum
+from typing import Any, Literal
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ._check import check_state, check_system
+from ._fuse import fused
+from ._kane import Instant, checked_inputs
+from ._linear import determinant, stack
+from ._signals import as_signals, evaluate
+from ._system import State, System, Values, parameter_info
+from ._types import Component, Inputs
+
+ADJOINTS = {
+    "reverse": diffrax.RecursiveCheckpointAdjoint,
+    "forward": diffrax.ForwardMode,
+    "both": diffrax.DirectAdjoint,
+}
+
+
+class Status(enum.IntEnum):
+    """How a simulation ended. Codes from `EVENT` on are events of the system, in the order of `System.events`."""
+
+    COMPLETED = 0
+    """Reached the last time."""
+    SINGULAR_SPEEDS = 1
+    """The dependent speeds are no longer determined by the independent ones: det C_dep passed zero."""
+    STEP_TOO_SMALL = 2
+    """The solver could not go on: the step fell below its minimum, as it does when something becomes infinite."""
+    MAX_STEPS = 3
+    """The solver took `max_steps` steps before the last time."""
+    INVALID = 4
+    """A parameter or an initial value was not finite, or a positive parameter was not positive: nothing was solved."""
+    EVENT = 10
+
+
+class Trajectory(eqx.Module):
+    """Motion over time, by name: `ride["roll"]`, `ride["yaw_rate"]`, `ride["steer_torque"]`.
+
+    Values after the end of a simulation that stopped early are NaN. A batch has leading axes.
+
+    Attributes:
+
+    - `t` (n_t,) [s]; `q` (n_t, n_q); `u` (n_t, n_u) independent speeds; `u_dep` (n_t, k) dependent speeds.
+    - `inputs`: values (n_t,) of every input by name.
+    - `status`: a `Status` code; `reason` says it in words. `t_end` [s]: where the simulation ended.
+    - `stats`: numbers of steps taken, accepted and rejected. `adjoint`: how it is differentiated.
+    """
+
+    t: Float[Array, "*batch n_t"]
+    q: Float[Array, "*batch n_t n_q"]
+    u: Float[Array, "*batch n_t n_u"]
+    u_dep: Float[Array, "*batch n_t k"]
+    inputs: dict[str, Float[Array, "*batch n_t"]]
+    status: Int[Array, "*batch"]
+    t_end: Float[Array, "*batch"]
+    stats: dict[str, Int[Array, "*batch"]]
+    names: tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]] = eqx.field(static=True)
+    events: tuple[str, ...] = eqx.field(static=True)
+    adjoint: str = eqx.field(static=True)
+
+    def __getitem__(self, name: str) -> Float[Array, "*batch n_t"]:
+        for names, values in zip(self.names, (self.q, self.u, self.u_dep), strict=True):
+            if name in names:
+                return values[..., names.index(name)]
+        if name in self.inputs:
+            return self.inputs[name]
+        known = [*(n for names in self.names for n in names), *self.inputs]
+        raise KeyError(f"There is no {name!r} in this trajectory; there are {', '.join(known)}.")
+
+    @property
+    def ok(self) -> Any:
+        """Whether the last time was reached; an array for a batch."""
+        return self.status == Status.COMPLETED
+
+    @property
+    def reason(self) -> Any:
+        """The status in words; a list for a batch."""
+        codes = np.asarray(self.status)
+        words = [reason(int(code), self.events) for code in codes.ravel()]
+        return words[0] if codes.ndim == 0 else words
+
+    def state(self, i: int = -1) -> State:
+        """The state at the i-th time, to go on from."""
+        return State(self.q[..., i, :], self.u[..., i, :])
+
+    def __repr__(self) -> str:
+        if isinstance(self.status, jax.core.Tracer) or np.ndim(self.status) > 0:
+            return f"Trajectory(shape={self.t.shape})"
+        steps = int(self.stats["steps"])
+        return f"Trajectory({self.t.shape[-1]} times to {float(self.t_end):.6g} s in {steps} steps: {self.reason})"
+
+
+def reason(code: int, events: tuple[str, ...]) -> str:
+    """A status code in words."""
+    if code >= Status.EVENT:
+        return events[code - Status.EVENT].replace("_", " ")
+    return Status(code).name.lower().replace("_", " ")
+
+
+class Now(eqx.Module):
+    """What an input function receives: `state.q`, `state.u`, and any coordinate or speed by name."""
+
+    q: Array
+    u: Array
+    t: Any
+    system: System
+
+    def __getitem__(self, name: str) -> Component:
+        system = self.system
+        for names, values in ((system.coordinates, self.q), (system.speeds, self.u)):
+            if name in names:
+                return values[names.index(name)]
+        if name in system.dependent_speeds:
+            now = Instant(system, self.t, self.q, self.u)
+            return jnp.asarray(now.u_dep[system.dependent_speeds.index(name)])
+        known = ", ".join((*system.coordinates, *system.speeds, *system.dependent_speeds))
+        raise KeyError(f"There is no {name!r} in the state; there are {known}.")
+
+
+def simulate(
+    system: System,
+    state: State,
+    ts: Any,
+    inputs: Inputs = None,
+    *,
+    rtol: float | None = None,
+    atol: float | None = None,
+    solver: diffrax.AbstractSolver | None = None,
+    step: float | None = None,
+    adjoint: Literal["reverse", "forward", "both"] | diffrax.AbstractAdjoint = "reverse",
+    max_steps: int = 16384,
+    progress: bool = False,
+) -> Trajectory:
+    """The motion from a state, at given times.
+
+        M u_dot = f,  q_dot = q_dot(t, q, u)
+
+    **Arguments:**
+
+    - `system`; `state`: coordinates and independent speeds at `ts[0]`, as `assemble` gives them.
+    - `ts` (n_t,): increasing times [s] at which the motion is kept; it starts at `ts[0]`.
+    - `inputs`: by name a number, samples (n_t,) at `ts`, or a function (t, state) -> number in which `state["roll"]`
+        is any coordinate or speed; or one function (t, state) -> dict, a controller. Those left out are zero.
+    - `rtol`, `atol`: error tolerances of a step; by default 1e-8 in float64 and 1e-5 in float32.
+    - `solver`: any diffrax solver, by default `Tsit5`. `step`: a fixed step [s] instead of error control.
+    - `adjoint`: how the motion will be differentiated. "reverse" (default): `jax.grad`, `jax.vjp`; "forward":
+        `jax.jvp`, `jax.jacfwd`, and nested for Hessians, cheaper for fewer than about fifty parameters; "both" is
+        slower; or a diffrax adjoint.
+    - `max_steps`: of the solver. `progress`: show a progress bar.
+
+    **Returns:** a `Trajectory`. A motion that cannot go on ends early, with its reason in `status`.
+
+    **Raises:** `ValueError` for wrong shapes or times, an unknown input, coordinates that violate a constraint, or a
+    description that contradicts itself.
+    """
+    state = checked_state(system, state)
+    ts = checked_times(ts, state.q.dtype)
+    signals = as_signals(inputs, system.inputs, ts, type(system).__name__)
+    check_state(system, ts[0], state.q)
+    check_system(system, ts[0], state.q, state.u)
+    tolerance = 1e-8 if ts.dtype == jnp.float64 else 1e-5
+    settings = Settings(
+        rtol=tolerance if rtol is None else rtol,
+        atol=tolerance if atol is None else atol,
+        solver=diffrax.Tsit5() if solver is None else solver,
+        step=step,
+        adjoint=ADJOINTS[adjoint]() if isinstance(adjoint, str) else adjoint,
+        max_steps=max_steps,
+        progress=progress,
+    )
+    return solve(system, state, ts, signals, settings)
+
+
+class Settings(eqx.Module):
+    """How to integrate: what `simulate` was told, with its defaults filled in."""
+
+    rtol: float = eqx.field(static=True)
+    atol: float = eqx.field(static=True)
+    solver: diffrax.AbstractSolver
+    step: float | None = eqx.field(static=True)
+    adjoint: diffrax.AbstractAdjoint
+    max_steps: int = eqx.field(static=True)
+    progress: bool = eqx.field(static=True)
+
+
+@eqx.filter_jit
+def solve(system: System, state: State, ts: Array, signals: Any, settings: Settings) -> Trajectory:
+    """`simulate` without its checks: one compiled program."""
+    valid = _is_valid(system, state)
+    # What is not finite must not enter the solver, where it would spoil the gradient of what is shared.
+    system, state = jax.tree.map(
+        lambda x: jnp.where(valid, x, jnp.ones_like(x)) if eqx.is_inexact_array(x) else x, (system, state)
+    )
+
+    def vector_field(t, y, args):
+        system, signals = args
+        inputs = _inputs(system, signals, t, *y)
+        return tuple(jnp.where(valid, rate, jnp.zeros_like(rate)) for rate in _rates(system, t, *y, inputs))
+
+    # A first step, right or wrong by a factor of ten, spares the two more copies of the right-hand side that diffrax
+    # would compile to choose one.
+    step = jnp.minimum((ts[-1] - ts[0]) / 1000, ts[1] - ts[0]) if settings.step is None else settings.step
+    if settings.step is None:
+        smallest = 1e3 * jnp.finfo(ts.dtype).eps * (ts[-1] - ts[0])
+        controller = diffrax.PIDController(rtol=settings.rtol, atol=settings.atol, dtmin=smallest, force_dtmin=False)
+    else:
+        controller = diffrax.ConstantStepSize()
+    at_times = diffrax.SubSaveAt(ts=ts)
+    at_end = diffrax.SubSaveAt(t1=True)
+    stops = _stops(system, ts[0], state)
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(vector_field),
+        settings.solver,
+        ts[0],
+        ts[-1],
+        step,
+        (state.q, state.u),
+        (system, signals),
+        saveat=diffrax.SaveAt(subs=(at_times, at_end)),
+        stepsize_controller=controller,
+        adjoint=settings.adjoint,
+        event=diffrax.Event(stops) if stops else None,
+        max_steps=settings.max_steps,
+        progress_meter=diffrax.TqdmProgressMeter() if settings.progress else diffrax.NoProgressMeter(),
+        throw=False,
+    )
+    (_, t_end), ((q, u), _) = solution.ts, solution.ys
+    reached = (jnp.isfinite(solution.ts[0]) & valid)[:, None]
+    q, u = (jnp.where(reached, y, jnp.nan) for y in (q, u))
+    return Trajectory(
+        t=ts,
+        q=q,
+        u=u,
+        u_dep=jax.vmap(lambda t, q, u: _dependent_speeds(system, t, q, u))(ts, q, u),
+        inputs=jax.vmap(lambda t, q, u: _inputs(system, signals, t, q, u, all_of_them=True))(ts, q, u),
+        status=jnp.where(valid, _status(solution, stops), Status.INVALID).astype(jnp.int32),
+        t_end=jnp.where(valid, t_end[0], ts[0]),
+        stats={
+            "steps": solution.stats["num_steps"],
+            "accepted": solution.stats["num_accepted_steps"],
+            "rejected": solution.stats["num_rejected_steps"],
+        },
+        names=(tuple(system.coordinates), tuple(system.speeds), tuple(system.dependent_speeds)),
+        events=tuple(name for name in stops if name != _SINGULAR),
+        adjoint=type(settings.adjoint).__name__,
+    )
+
+
+@fused
+def _rates(system: System, t: Component, q: Array, u: Array, inputs: dict[str, Component]) -> tuple[Array, Array]:
+    """q_dot and u_dot."""
+    now = Instant(system, t, q, u, inputs)
+    return _array(now.q_dot, q), _array(now.accelerations(), u)
+
+
+@fused
+def _dependent_speeds(system: System, t: Component, q: Array, u: Array) -> Array:
+    return _array(Instant(system, t, q, u).u_dep, q)
+
+
+@fused
+def _determinant(system: System, t: Component, q: Array, u: Array) -> Array:
+    """det C_dep: where it vanishes, the dependent speeds no longer follow from the independent ones."""
+    return _array([determinant(Instant(system, t, q, u).C_dep)], q)[0]
+
+
+def _array(row, like: Array) -> Array:
+    return stack([row])[0].astype(like.dtype)
+
+
+def _inputs(system: System, signals: Any, t: Component, q: Array, u: Array, all_of_them: bool = False):
+    values = evaluate(signals, t, Now(q, u, t, system))
+    names = checked_inputs(system, values) if all_of_them else values
+    return {name: jnp.asarray(values.get(name, 0.0), dtype=q.dtype) for name in names}
+
+
+def _is_valid(system: System, state: State) -> Array:
+    finite = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((system, state)) if eqx.is_inexact_array(x)]
+    positive = [jnp.all(getattr(system, name) > 0) for name, info in parameter_info(system).items() if info.positive]
+    return jnp.all(jnp.stack([*finite, *positive]))
+
+
+_SINGULAR = "dependent speeds singular"
+
+
+def _stops(system: System, t0: Array, state: State) -> dict[str, Any]:
+    """Signed, smooth quantities (t, y, args) whose change of sign ends the simulation."""
+
+    def event(name):
+        def value(t, y, args, **_):
+            now = Instant(args[0], t, *y)
+            return jnp.asarray(args[0].events(t, *now._named(now.q, now.u_all))[name])
+
+        return value
+
+    now = Instant(system, t0, state.q, state.u)
+    stops = {name: event(name) for name in system.events(t0, *now._named(now.q, now.u_all))}
+    if system.dependent_speeds:
+        stops[_SINGULAR] = lambda t, y, args, **_: _determinant(args[0], t, *y)
+    return stops
+
+
+def _status(solution: diffrax.Solution, stops: dict[str, Any]) -> Array:
+    result = solution.result
+    status = jnp.where(result == diffrax.RESULTS.successful, Status.COMPLETED, Status.STEP_TOO_SMALL)
+    status = jnp.where(result == diffrax.RESULTS.max_steps_reached, Status.MAX_STEPS, status)
+    if stops:
+        names = [name for name in stops if name != _SINGULAR]
+        for name, happened in (solution.event_mask or {}).items():
+            code = Status.SINGULAR_SPEEDS if name == _SINGULAR else Status.EVENT + names.index(name)
+            status = jnp.where((result == diffrax.RESULTS.event_occurred) & happened, code, status)
+    return status
+
+
+def checked_times(ts: Any, dtype: Any) -> Array:
+    """Times as an array of a state's type. **Raises:** `ValueError` unless finite, increasing, and two at least."""
+    ts = jnp.asarray(ts, dtype=dtype)
+    if ts.ndim != 1 or ts.shape[0] < 2:
+        raise ValueError(f"`ts` must be at least two times in an array of shape (n_t,), got the shape {ts.shape}.")
+    if not isinstance(ts, jax.core.Tracer):
+        steps = np.diff(np.asarray(ts))
+        if not np.all(np.isfinite(steps)):
+            raise ValueError("`ts` holds times that are not finite.")
+        if not np.all(steps > 0):
+            i = int(np.argmax(steps <= 0))
+            raise ValueError(f"`ts` must increase: ts[{i}] = {float(ts[i]):.6g} is followed by {float(ts[i + 1]):.6g}.")
+    return ts
+
+
+def checked_state(system: System, state: Any) -> State:
+    """A state of the right shape for a system."""
+    name = type(system).__name__
+    if not isinstance(state, State):
+        raise TypeError(
+            f"{name}: the state must be a jaxkane.State(q, u), as assemble gives it; got {type(state).__name__}."
+        )
+    for label, value, names in (("q", state.q, system.coordinates), ("u", state.u, system.speeds)):
+        if value.shape != (len(names),):
+            raise ValueError(
+                f"{name}: state.{label} must have the shape ({len(names)},) for {', '.join(names)}; got {value.shape}."
+                + (" For a batch use jaxkane.sweep or jax.vmap." if value.ndim > 1 else "")
+            )
+    return state

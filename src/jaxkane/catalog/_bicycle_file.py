@@ -1,0 +1,45 @@
+"""Text files of the package BicycleParameters: `NAME = value+/-deviation`, one a line."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+
+def read_bicycle_file(
+    path: str | os.PathLike[str], known: Sequence[str] | None = None
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Values and standard deviations by name, from a text file of BicycleParameters.
+
+    **Arguments:** `path`; `known`: names to accept, by default all.
+
+    **Raises:** `ValueError` with one line for every entry that is malformed, unknown or repeated.
+    """
+    values: dict[str, float] = {}
+    deviations: dict[str, float] = {}
+    lines: dict[str, int] = {}
+    faults: list[str] = []
+    for number, line in enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1):
+        line = line.strip()
+        if not line or line.startswith("#"):
+            continue
+        name, equals, entry = (part.strip() for part in line.partition("="))
+        value, _, deviation = entry.partition("+/-")
+        try:
+            pair = float(value), float(deviation or 0.0)
+        except ValueError:
+            pair = (math.nan, math.nan)
+        if not equals or not name or not all(map(math.isfinite, pair)) or pair[1] < 0:
+            faults.append(f"line {number}: {line!r} is not of the form NAME = value+/-deviation")
+        elif name in lines:
+            faults.append(f"line {number}: {name} was given before, on line {lines[name]}")
+        elif known is not None and name not in known:
+            faults.append(f"line {number}: {name} is no parameter of this model")
+        else:
+            lines[name] = number
+            values[name], deviations[name] = pair
+    if faults:
+        raise ValueError(f"{os.fspath(path)}: " + "; ".join(faults) + ".")
+    return values, deviations
