@@ -2,6 +2,7 @@
 
 from . import catalog as catalog
 from . import rotations as rotations
+from . import sweep as sweep
 from ._assembly import assemble as assemble
 from ._equations import accelerations as accelerations
 from ._equations import constraint_jacobian as constraint_jacobian

@@ -116,8 +116,8 @@ def _solve_configuration(system: System, q0, t, free: tuple[str, ...]):
         )
         raise ValueError(
             f"{name}: no {moved} satisfies the configuration constraints with {held}: after "
-            f"{int(solution.stats['num_steps'])} Newton steps the residual is {float(remainder):.3g}. Start from another "
-            "guess, or change what is held."
+            f"{int(solution.stats['num_steps'])} Newton steps the residual is {float(remainder):.3g}. Start from "
+            "another guess, or change what is held."
         )
     return jnp.where(good, q, jnp.nan)
 

@@ -196,13 +196,17 @@ def check_state(system: System, t: Any, q: Any) -> None:
     if not is_concrete(system, t, q):
         return
     residual = configuration_residual(system, t, q)
-    tolerance = 1e-6 if residual.dtype == jnp.float64 else 1e-3
-    if residual.size and not np.max(np.abs(residual)) <= tolerance:
+    if residual.size and not np.max(np.abs(residual)) <= configuration_tolerance(residual.dtype):
         adjust = ", ".join(system.dependent_coordinates) or "the coordinates"
         raise ValueError(
             f"{type(system).__name__}: the coordinates violate the configuration constraints by "
             f"{np.array2string(np.asarray(residual), precision=3)}. Find {adjust} with jaxkane.assemble(system, q, u)."
         )
+
+
+def configuration_tolerance(dtype: Any) -> float:
+    """How far coordinates may be from the configuration constraints and still be taken as given."""
+    return 1e-6 if dtype == jnp.float64 else 1e-3
 
 
 @eqx.filter_jit

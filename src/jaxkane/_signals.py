@@ -56,9 +56,9 @@ def _as_signal(name: str, value: Any, ts: Array) -> Any:
         return array
     if array.shape != ts.shape:
         raise ValueError(
-            f"The samples of {name!r} have the shape {array.shape}, the times `ts` {ts.shape}: an array is taken at the "
-            "times `ts`, linear between them. For other times pass a function (t, state) -> number, such as "
-            f"jaxkane.Samples(times, values)."
+            f"The samples of {name!r} have the shape {array.shape}, the times `ts` {ts.shape}: an array is taken at "
+            "the times `ts`, linear between them. For other times pass a function (t, state) -> number, such as "
+            "jaxkane.Samples(times, values)."
         )
     if isinstance(value, np.ndarray) and not np.all(np.isfinite(value)):
         raise ValueError(f"The samples of {name!r} are not all finite: fill the gaps, or leave that stretch out.")

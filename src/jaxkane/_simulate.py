@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ._check import check_state, check_system
+from ._check import check_state, check_system, configuration_residual, configuration_tolerance
 from ._fuse import fused
 from ._kane import Instant, checked_inputs
 from ._linear import determinant, stack
 from ._signals import as_signals, evaluate
-from ._system import State, System, Values, parameter_info
+from ._system import State, System, parameter_info
 from ._types import Component, Inputs
 
 ADJOINTS = {
@@ -39,7 +39,10 @@ class Status(enum.IntEnum):
     MAX_STEPS = 3
     """The solver took `max_steps` steps before the last time."""
     INVALID = 4
-    """A parameter or an initial value was not finite, or a positive parameter was not positive: nothing was solved."""
+    """A parameter or an initial value was not finite, a positive parameter was not positive, or the coordinates
+    violated a configuration constraint: nothing was solved."""
+    INTERRUPTED = 5
+    """A sweep was stopped before it came to this member."""
     EVENT = 10
 
 
@@ -168,15 +171,8 @@ def simulate(
     signals = as_signals(inputs, system.inputs, ts, type(system).__name__)
     check_state(system, ts[0], state.q)
     check_system(system, ts[0], state.q, state.u)
-    tolerance = 1e-8 if ts.dtype == jnp.float64 else 1e-5
-    settings = Settings(
-        rtol=tolerance if rtol is None else rtol,
-        atol=tolerance if atol is None else atol,
-        solver=diffrax.Tsit5() if solver is None else solver,
-        step=step,
-        adjoint=ADJOINTS[adjoint]() if isinstance(adjoint, str) else adjoint,
-        max_steps=max_steps,
-        progress=progress,
+    settings = settings_for(
+        ts, rtol=rtol, atol=atol, solver=solver, step=step, adjoint=adjoint, max_steps=max_steps, progress=progress
     )
     return solve(system, state, ts, signals, settings)
 
@@ -193,10 +189,38 @@ class Settings(eqx.Module):
     progress: bool = eqx.field(static=True)
 
 
+def settings_for(
+    ts: Array,
+    *,
+    rtol: float | None = None,
+    atol: float | None = None,
+    solver: diffrax.AbstractSolver | None = None,
+    step: float | None = None,
+    adjoint: str | diffrax.AbstractAdjoint = "reverse",
+    max_steps: int = 16384,
+    progress: bool = False,
+) -> Settings:
+    """The options of `simulate`, with defaults that follow the type of the times."""
+    default = 1e-8 if ts.dtype == jnp.float64 else 1e-5
+    if isinstance(adjoint, str):
+        if adjoint not in ADJOINTS:
+            raise ValueError(f"adjoint is one of {', '.join(ADJOINTS)}, or a diffrax adjoint; got {adjoint!r}.")
+        adjoint = ADJOINTS[adjoint]()
+    return Settings(
+        rtol=default if rtol is None else rtol,
+        atol=default if atol is None else atol,
+        solver=diffrax.Tsit5() if solver is None else solver,
+        step=step,
+        adjoint=adjoint,
+        max_steps=max_steps,
+        progress=progress,
+    )
+
+
 @eqx.filter_jit
 def solve(system: System, state: State, ts: Array, signals: Any, settings: Settings) -> Trajectory:
     """`simulate` without its checks: one compiled program."""
-    valid = _is_valid(system, state)
+    valid = _is_valid(system, state, ts[0])
     # What is not finite must not enter the solver, where it would spoil the gradient of what is shared.
     system, state = jax.tree.map(
         lambda x: jnp.where(valid, x, jnp.ones_like(x)) if eqx.is_inexact_array(x) else x, (system, state)
@@ -284,10 +308,12 @@ def _inputs(system: System, signals: Any, t: Component, q: Array, u: Array, all_
     return {name: jnp.asarray(values.get(name, 0.0), dtype=q.dtype) for name in names}
 
 
-def _is_valid(system: System, state: State) -> Array:
+def _is_valid(system: System, state: State, t0: Array) -> Array:
     finite = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((system, state)) if eqx.is_inexact_array(x)]
     positive = [jnp.all(getattr(system, name) > 0) for name, info in parameter_info(system).items() if info.positive]
-    return jnp.all(jnp.stack([*finite, *positive]))
+    residual = configuration_residual(system, t0, state.q)
+    consistent = jnp.all(jnp.abs(residual) <= configuration_tolerance(residual.dtype))
+    return jnp.all(jnp.stack([*finite, *positive, consistent]))
 
 
 _SINGULAR = "dependent speeds singular"

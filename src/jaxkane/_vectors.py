@@ -301,8 +301,8 @@ def _resolve(components: Triple, source: Frame, target: Frame) -> Triple:
         if source.depth >= target.depth:
             if source.parent is None:
                 raise ValueError(
-                    f"The frames {source.name} and {target.name} have no common inertial frame. Call jaxkane.inertial() "
-                    "once in `motion`, and in `loads` take the frames from the motion that it receives."
+                    f"The frames {source.name} and {target.name} have no common inertial frame. Call "
+                    "jaxkane.inertial() once in `motion`, and in `loads` take the frames from the motion that it receives."
                 )
             components = matvec(tuple(zip(*source._to_child, strict=True)), components)  # type: ignore[assignment]
             source = source.parent
@@ -403,8 +403,8 @@ class Point:
 def _own_frame(r: Vector, verb: str) -> Frame:
     if r.mixed:
         raise ValueError(
-            f"Point.{verb}: the vector adds parts written in different frames, so the frame it belongs to is not clear. "
-            f"Say which: point.{verb}(r, ..., frame=B); or go there in two steps, one for each frame."
+            f"Point.{verb}: the vector adds parts written in different frames, so the frame it belongs to is not "
+            f"clear. Say which: point.{verb}(r, ..., frame=B); or go there in two steps, one for each frame."
         )
     return r.frame
 

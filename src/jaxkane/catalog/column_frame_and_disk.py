@@ -31,9 +31,9 @@ class ColumnFrameAndDisk(System):
     frame_mass: Scalar = parameter(3.0, positive=True)  # [kg]
     disk_mass: Scalar = parameter(2.0, positive=True)  # [kg]
     distance: Scalar = parameter(0.4, positive=True)  # [m]
-    frame_I11: Scalar = parameter(0.20, positive=True)  # [kg m^2]
+    frame_I11: Scalar = parameter(0.22, positive=True)  # [kg m^2]
     frame_I22: Scalar = parameter(0.05, positive=True)  # [kg m^2]
-    frame_I33: Scalar = parameter(0.22, positive=True)  # [kg m^2]
+    frame_I33: Scalar = parameter(0.20, positive=True)  # [kg m^2]
     disk_transverse_inertia: Scalar = parameter(0.02, positive=True)  # [kg m^2]
     disk_axial_inertia: Scalar = parameter(0.04, positive=True)  # [kg m^2]
 
