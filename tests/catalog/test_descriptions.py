@@ -1,0 +1,33 @@
+"""A system describes, it never derives: what the files of the catalogue may import and call."""
+
+import ast
+import pathlib
+
+import pytest
+
+from jaxkane import catalog
+
+FILES = sorted(pathlib.Path(catalog.__file__).parent.glob("*.py"))
+FLOORS_BELOW = {"_types", "_components", "_vectors", "_system", "rotations", ""}
+METHOD = {"jvp", "vjp", "grad", "jacfwd", "jacrev", "linearize", "solve", "inv"}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_a_description_uses_the_floors_below_and_derives_nothing(path):
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.level == 2:
+            assert (node.module or "") in FLOORS_BELOW
+            assert node.module or {name.name for name in node.names} <= FLOORS_BELOW
+        if isinstance(node, ast.Attribute):
+            assert node.attr not in METHOD
+
+
+def test_every_system_is_exported_and_listed():
+    systems = {name for name in vars(catalog) if isinstance(vars(catalog)[name], type) and name != "Entry"}
+    assert systems == set(catalog.CATALOG)
+    assert len({entry.book for entry in catalog.CATALOG.values()}) == 15  # seven examples and eight exercises
+
+
+@pytest.mark.parametrize("name", catalog.CATALOG)
+def test_every_system_says_where_it_stands_in_the_book(name):
+    assert catalog.CATALOG[name].book in getattr(catalog, name).__doc__
