@@ -114,6 +114,10 @@ def test_forces_balance_at_the_accelerations(example):
     scale = np.abs(M @ example.u_dot).max() + np.abs(Fr).max()
     assert_close(Fr + Fr_star, 0.0, 1e-11, scale)
     assert_close(M @ example.u_dot, f, 1e-11, scale)
+    # F_r = sum V_r . dp/dt + W_r . dH/dt, with momenta resolved in N before they are differentiated: no omega x there
+    _, momentum_rates = example.along_motion(example.momenta)
+    partials = jnp.stack(jk.partial_velocities(*example.at), axis=1)  # (b,2,3,n)
+    assert_close(Fr, jnp.einsum("bvxn,bvx->n", partials, momentum_rates), 1e-11, scale)
 
 
 def test_partial_velocities_and_drift_give_the_velocities(example):
