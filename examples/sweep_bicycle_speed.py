@@ -10,10 +10,10 @@ weave speed (4.292 m/s: below, it swings ever wider) and the capsize speed (6.02
     roll_rate   its rate, 0.5 at the start: the push                                 rad/s
 
 Run:      python examples/sweep_bicycle_speed.py [--out FOLDER]
-Appears:  the rides per second; a table of how the rides ended ("singular speeds": the fork has turned by 90 degrees,
-          where rolling no longer determines yaw, pitch and the front wheel's turning); and sweep_bicycle_speed.png: roll
-          over time, coloured by speed, and how far each bicycle rolls in the last second. The bars in the colour scale
-          and the green band are the speeds of linear theory.
+Appears:  rides per second; a table of how the rides ended ("singular speeds": the fork has turned by 90 degrees, where
+          rolling no longer determines yaw, pitch and the front wheel's turning); and sweep_bicycle_speed.png: roll over
+          time, coloured by speed, and how far each bicycle rolls in the last second. The bars in the colour scale and
+          the green band are the speeds of linear theory.
 Takes:    under half a minute, most of it compilation.
 """
 
