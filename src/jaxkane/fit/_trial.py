@@ -1,0 +1,136 @@
+"""One measured ride: times, channels, inputs, what is known of the start. Knows numbers and names; knows no system."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+
+class Trial:
+    """Measurements of one motion, to be fitted.
+
+        Trial(t, {"roll": roll, "steer": steer}, {"steer_torque": torque}, sigma={"roll": 0.01, "steer": 0.02})
+
+    **Arguments:**
+
+    - `t` (n_t,) [s]: increasing times.
+    - `measured`: by channel, samples (n_t,) in the channel's unit; NaN where there is a gap. A channel is the name of a
+        coordinate, speed or dependent speed, or of one of the `outputs` that the fit is told.
+    - `inputs`: by name, a number or samples (n_t,) without gaps, taken as linear between the times. Those left out are
+        zero.
+    - `sigma`: by channel, the standard deviation of the measurement, a positive number or (n_t,): residuals are divided
+        by it. One number serves all channels.
+    - `initial`: by name, what is known of coordinates and speeds: a number, or samples (n_t,) from which every window
+        takes its start. What is neither known nor measured starts at zero.
+    - `name`: for messages, tables and pictures.
+
+    **Raises:** `ValueError` that names the trial and the channel, for wrong shapes, text, times that do not increase,
+    a channel without `sigma`, or a trial without a single finite measurement.
+    """
+
+    __slots__ = ("initial", "inputs", "measured", "name", "sigma", "t")
+
+    def __init__(
+        self,
+        t: Any,
+        measured: Mapping[str, Any],
+        inputs: Mapping[str, Any] | None = None,
+        *,
+        sigma: Mapping[str, Any] | float,
+        initial: Mapping[str, Any] | None = None,
+        name: str = "trial",
+    ):
+        self.name = str(name)
+        self.t = self._times(t)
+        if not isinstance(measured, Mapping) or not measured:
+            raise ValueError(f"{self.name}: `measured` is a dict of channels, {{'roll': samples, ...}}, and not empty.")
+        self.measured = {key: self._samples("measured", key, value) for key, value in measured.items()}
+        self.inputs = {
+            key: self._samples("inputs", key, value, number=True, gaps=False) for key, value in (inputs or {}).items()
+        }
+        self.initial = {
+            key: self._samples("initial", key, value, number=True, gaps=False) for key, value in (initial or {}).items()
+        }
+        self.sigma = self._sigmas(sigma)
+        if not any(np.isfinite(x).any() for x in self.measured.values()):
+            raise ValueError(
+                f"{self.name}: every measurement is NaN ({', '.join(self.measured)}): there is nothing to fit. Leave this "
+                "trial out."
+            )
+
+    def _times(self, t: Any) -> np.ndarray:
+        t = self._numbers("t", t)
+        if t.ndim != 1 or t.shape[0] < 2:
+            raise ValueError(f"{self.name}: `t` must be at least two times (n_t,), got the shape {t.shape}.")
+        if not np.all(np.isfinite(t)):
+            raise ValueError(f"{self.name}: t[{int(np.argmin(np.isfinite(t)))}] is not finite.")
+        steps = np.diff(t)
+        if not np.all(steps > 0):
+            i = int(np.argmax(steps <= 0))
+            what = "repeated" if steps[i] == 0 else "unsorted"
+            raise ValueError(
+                f"{self.name}: the times are {what}: t[{i}] = {t[i]:.6g} is followed by {t[i + 1]:.6g}. Sort the samples, "
+                "and keep one of each time."
+            )
+        return t
+
+    def _numbers(self, label: str, value: Any) -> np.ndarray:
+        try:
+            array = np.asarray(value)
+            if array.dtype.kind not in "iuf":
+                raise ValueError(f"it holds {array.dtype}")
+            return array.astype(float)
+        except (TypeError, ValueError) as error:
+            raise ValueError(f"{self.name}: {label} must be real numbers: {error}.") from None
+
+    def _samples(self, group: str, key: str, value: Any, number: bool = False, gaps: bool = True) -> np.ndarray:
+        label = f"{group}[{key!r}]"
+        array = self._numbers(label, value)
+        if array.ndim == 0 and number:
+            array = np.full(self.t.shape, float(array))
+        if array.shape != self.t.shape:
+            raise ValueError(f"{self.name}: {label} has the shape {array.shape}, `t` has {self.t.shape}.")
+        if np.isinf(array).any():
+            raise ValueError(f"{self.name}: {label}[{int(np.argmax(np.isinf(array)))}] is infinite.")
+        if not gaps and np.isnan(array).any():
+            raise ValueError(
+                f"{self.name}: {label}[{int(np.argmax(np.isnan(array)))}] is NaN; only measured channels may have gaps. "
+                "Fill it, or cut that stretch out with `between`."
+            )
+        return array
+
+    def _sigmas(self, sigma: Any) -> dict[str, np.ndarray]:
+        given = sigma if isinstance(sigma, Mapping) else dict.fromkeys(self.measured, sigma)
+        missing = [key for key in self.measured if key not in given]
+        if missing:
+            raise ValueError(
+                f"{self.name}: `sigma` lacks {', '.join(missing)}: give the standard deviation of the measurement."
+            )
+        found = {key: self._samples("sigma", key, given[key], number=True, gaps=False) for key in self.measured}
+        for key, value in found.items():
+            if not np.all(value > 0):
+                raise ValueError(f"{self.name}: sigma[{key!r}] must be positive.")
+        return found
+
+    def between(self, start: float, stop: float) -> Trial:
+        """The stretch with start <= t <= stop [s]."""
+        inside = (self.t >= start) & (self.t <= stop)
+        if inside.sum() < 2:
+            raise ValueError(
+                f"{self.name}: fewer than two samples between {start:g} and {stop:g} s; it lasts from {self.t[0]:g} to "
+                f"{self.t[-1]:g} s."
+            )
+        cut = lambda group: {key: value[inside] for key, value in group.items()}  # noqa: E731
+        return Trial(
+            self.t[inside],
+            cut(self.measured),
+            cut(self.inputs),
+            sigma=cut(self.sigma),
+            initial=cut(self.initial),
+            name=self.name,
+        )
+
+    def __repr__(self) -> str:
+        return f"Trial({self.name!r}, {len(self.t)} times from {self.t[0]:g} to {self.t[-1]:g} s: {', '.join(self.measured)})"
