@@ -7,6 +7,7 @@ from ._assembly import assemble as assemble
 from ._equations import accelerations as accelerations
 from ._equations import constraint_jacobian as constraint_jacobian
 from ._equations import constraint_jacobian_rate as constraint_jacobian_rate
+from ._equations import coordinate_rates as coordinate_rates
 from ._equations import dependent_accelerations as dependent_accelerations
 from ._equations import dependent_speeds as dependent_speeds
 from ._equations import equations_of_motion as equations_of_motion

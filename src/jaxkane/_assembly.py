@@ -11,8 +11,7 @@ import numpy as np
 import optimistix as optx
 
 from ._check import check_system, configuration_residual, is_concrete
-from ._kane import Instant
-from ._linear import stack
+from ._kane import Instant, as_array
 from ._system import State, System
 from ._types import Component
 
@@ -45,36 +44,19 @@ def assemble(
     Under a trace the coordinates become NaN instead.
     """
     name = type(system).__name__
-    q0 = _by_name(q, system.coordinates, f"{name}: coordinate")
-    speeds = (*system.speeds, *system.dependent_speeds)
-    n = len(system.speeds)
-    u_all = jnp.zeros(n, q0.dtype) if u is None else _by_name(u, system.speeds, f"{name}: speed", speeds)
-    q_found = _solve_configuration(system, q0, t, tuple(free if free is not None else system.dependent_coordinates))
-    state = State(q_found, u_all[:n])
-    if is_concrete(system, state, t):
-        check_system(system, t, state.q, state.u)
-        if isinstance(u, Mapping) and set(u) & set(system.dependent_speeds):
-            now = Instant(system, t, state.q, state.u)
-            given = {s: u[s] for s in system.dependent_speeds if s in u}
-            _check_dependent_speeds(name, given, dict(zip(system.dependent_speeds, now.u_dep, strict=True)))
-    return state
-
-
-def _by_name(values: Any, required: Sequence[str], label: str, allowed: Sequence[str] | None = None):
-    """Values by name or in order, as a float array of those required."""
-    if isinstance(values, Mapping):
-        unknown = sorted(set(values) - set(allowed or required))
-        if unknown:
-            raise ValueError(f"{label} {', '.join(unknown)} is unknown; there are {', '.join(allowed or required)}.")
-        return stack([[jnp.asarray(values.get(name, 0.0), dtype=float) for name in required]])[0]
-    array = jnp.asarray(values)
-    if not jnp.issubdtype(array.dtype, jnp.inexact):
-        array = array.astype(float)
-    if array.shape != (len(required),):
-        raise ValueError(
-            f"{label}s: expected {len(required)} numbers ({', '.join(required)}), got the shape {array.shape}."
-        )
-    return array
+    q0 = as_array(q, system.coordinates, f"{name}: q")
+    given: dict[str, Any] = {}
+    if isinstance(u, Mapping):
+        given = {speed: u[speed] for speed in system.dependent_speeds if speed in u}
+        u = {speed: value for speed, value in u.items() if speed not in given}
+    u0 = as_array({} if u is None else u, system.speeds, f"{name}: u").astype(q0.dtype)
+    q0 = _solve_configuration(system, q0, t, tuple(free if free is not None else system.dependent_coordinates))
+    if is_concrete(system, q0, u0, t):
+        check_system(system, t, q0, u0, strict=True)
+        if given:
+            u_dep = dict(zip(system.dependent_speeds, Instant(system, t, q0, u0).u_dep, strict=True))
+            _check_dependent_speeds(name, given, u_dep)
+    return State(q0, u0)
 
 
 def _solve_configuration(system: System, q0, t, free: tuple[str, ...]):
@@ -82,8 +64,8 @@ def _solve_configuration(system: System, q0, t, free: tuple[str, ...]):
     unknown = sorted(set(free) - set(system.coordinates))
     if unknown:
         raise ValueError(f"{name} has no coordinate {', '.join(unknown)}; it has {', '.join(system.coordinates)}.")
-    h = lambda q: configuration_residual(system, t, q)  # noqa: E731
-    n_h = jax.eval_shape(h, q0).shape[0]
+    t = jnp.asarray(t, dtype=q0.dtype)
+    n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q0).shape[0]
     if n_h == 0:
         return q0
     places = [system.coordinates.index(c) for c in free] or list(range(len(system.coordinates)))
@@ -93,20 +75,11 @@ def _solve_configuration(system: System, q0, t, free: tuple[str, ...]):
             f"({', '.join(free)})."
         )
     places = np.array(places)
-    # (h, free): along the constraints' gradients where there is a choice
-    directions = jnp.eye(n_h, dtype=q0.dtype) if len(places) == n_h else jax.jacfwd(h)(q0)[:, places]
-
-    def residual(amount, args):
-        h_args, q0, directions = args
-        return configuration_residual(h_args[0], h_args[1], q0.at[places].add(amount @ directions))
-
-    args = ((system, jnp.asarray(t, dtype=q0.dtype)), q0, directions)
-    eps = float(jnp.finfo(q0.dtype).eps)
-    newton = optx.Newton(rtol=8 * eps, atol=8 * eps)
-    solution = optx.root_find(residual, newton, jnp.zeros(n_h, q0.dtype), args, max_steps=64, throw=False)
-    q = q0.at[places].add(solution.value @ directions)
-    remainder = jnp.max(jnp.abs(h(q)))
-    good = remainder <= eps**0.6
+    q, good, remainder, steps = _newton(system, q0, t, places)
+    if is_concrete(system, q, t) and not bool(good):
+        # The guess may be where the residual has no slope, as an Euler parameter of zero: look from beside it.
+        again = _newton(system, q0.at[places].add(1.0), t, places)
+        q, good, remainder, steps = again if bool(again[1]) else (q, good, remainder, steps)
     if is_concrete(system, q, t) and not bool(good):
         moved = ", ".join(system.coordinates[i] for i in places)
         held = ", ".join(
@@ -116,10 +89,31 @@ def _solve_configuration(system: System, q0, t, free: tuple[str, ...]):
         )
         raise ValueError(
             f"{name}: no {moved} satisfies the configuration constraints with {held}: after "
-            f"{int(solution.stats['num_steps'])} Newton steps the residual is {float(remainder):.3g}. Start from "
+            f"{int(steps)} Newton steps the residual is {float(remainder):.3g}. Start from "
             "another guess, or change what is held."
         )
     return jnp.where(good, q, jnp.nan)
+
+
+def _newton(system: System, q0, t, places):
+    """Coordinates, whether they meet the constraints, the residual, and the number of steps."""
+    n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q0).shape[0]
+    if len(places) == n_h:
+        directions = jnp.eye(n_h, dtype=q0.dtype)
+    else:  # (h, free): along the constraints' gradients only
+        directions = jax.jacfwd(lambda q: configuration_residual(system, t, q))(q0)[:, places]
+
+    def residual(amount, args):
+        system, t, q0, directions = args
+        return configuration_residual(system, t, q0.at[places].add(amount @ directions))
+
+    eps = float(jnp.finfo(q0.dtype).eps)
+    newton = optx.Newton(rtol=8 * eps, atol=8 * eps)
+    args = (system, t, q0, directions)
+    solution = optx.root_find(residual, newton, jnp.zeros(n_h, q0.dtype), args, max_steps=64, throw=False)
+    q = q0.at[places].add(solution.value @ directions)
+    remainder = jnp.max(jnp.abs(configuration_residual(system, t, q)))
+    return q, remainder <= eps**0.6, remainder, solution.stats["num_steps"]
 
 
 def _check_dependent_speeds(name: str, given: Mapping[str, Any], found: Mapping[str, Any]) -> None:

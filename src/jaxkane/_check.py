@@ -5,18 +5,19 @@ Numbers are checked only where they are numbers: under a trace, and in a batch, 
 
 from __future__ import annotations
 
+import warnings
 import weakref
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ._components import cross
+from ._fuse import fused
 from ._kane import Instant
 from ._linear import stack
-from ._system import Motion, System, Values, parameter_info
+from ._system import Motion, System, parameter_info
 from ._vectors import Frame
 
 _CHECKED: weakref.WeakSet[type] = weakref.WeakSet()
@@ -32,8 +33,11 @@ def is_batch(system: System) -> bool:
     return any(np.ndim(getattr(system, name)) > len(info.shape) for name, info in parameter_info(system).items())
 
 
-def check_system(system: System, t: Any, q: Any, u: Any) -> None:
+def check_system(system: System, t: Any, q: Any, u: Any, *, strict: bool = False) -> None:
     """Refuse bodies that cannot be, and, once for each class of systems, a description that contradicts itself.
+
+    Moments of inertia that no body can have are refused where motions begin (`strict`), and elsewhere warned about:
+    equations may be compared at any numbers.
 
     **Raises:** `ValueError` for velocities or residuals that are not affine in the speeds, frames and points that do
     not move as their coordinates' rates say, a body whose inertia is not constant in its frame, a negative mass, an
@@ -41,7 +45,7 @@ def check_system(system: System, t: Any, q: Any, u: Any) -> None:
     """
     if not is_concrete(system, t, q, u) or is_batch(system):
         return
-    with jax.ensure_compile_time_eval():
+    with jax.ensure_compile_time_eval(), np.errstate(invalid="ignore"):
         if type(system) not in _CHECKED:
             now = Instant(system, t, q, u)
             if not np.all(np.isfinite([float(x) for x in (*now.q, *now.u_all)])):
@@ -49,36 +53,54 @@ def check_system(system: System, t: Any, q: Any, u: Any) -> None:
             _check_affine(now)
             _check_rates(now)
             _CHECKED.add(type(system))
-        _check_bodies(system, t, q, u)
+        _check_bodies(system, t, q, u, strict)
 
 
-@jax.jit
+@fused
 def _masses_and_inertias(system: System, t: Any, q: Any, u: Any):
     now = Instant(system, t, q, u)
     bodies = now.motion(now.t, now.q, now.u_all).bodies
     return [(jnp.asarray(body.mass), stack(body.inertia)) for body in bodies]
 
 
-def _check_bodies(system: System, t: Any, q: Any, u: Any) -> None:
-    numbers = _masses_and_inertias(system, t, q, u)
-    for i, (mass, I) in enumerate(numbers):
+def _check_bodies(system: System, t: Any, q: Any, u: Any, strict: bool) -> None:
+    for i, (mass, I) in enumerate(_masses_and_inertias(system, t, q, u)):
         mass, I = float(mass), np.asarray(I)  # [kg], (3,3) [kg m^2]
-        slack = 1e-6 * max(np.abs(I).max(), 1e-300)
-        moments = np.linalg.eigvalsh(I) if np.all(np.isfinite(I)) else np.full(3, np.nan)
-        fault = ""
-        if not mass >= 0:
-            fault = f"the mass is {mass:.6g} kg; it must not be negative."
-        elif np.abs(I - I.T).max() > slack:
-            fault = f"the inertia matrix is not symmetric: {I.tolist()}."
-        elif not (moments[0] >= -slack and moments[0] + moments[1] >= moments[2] - slack):
-            fault = (
-                f"no body has the principal moments of inertia {', '.join(f'{x:.6g}' for x in moments)} kg m^2. They "
-                "must be positive, and none may exceed the sum of the other two (triangle inequality)."
-            )
+        fault, is_grave = _fault(mass, I)
         if fault:
             now = Instant(system, t, q, u)
-            names = [body.name for body in now.motion(now.t, now.q, now.u_all).bodies]
-            raise ValueError(f"{type(system).__name__}, body {names[i]!r}: {fault}")
+            body = now.motion(now.t, now.q, now.u_all).bodies[i]
+            message = f"{type(system).__name__}, body {body.name!r}: {fault}"
+            if is_grave or (strict and _excess(I) > 0.05):
+                raise ValueError(message)
+            warnings.warn(message, UserWarning, stacklevel=4)
+
+
+def _fault(mass: float, I: np.ndarray) -> tuple[str, bool]:
+    """What is wrong with a body, and whether there is no arguing about it."""
+    slack = 1e-6 * max(np.abs(I).max(), 1e-300)
+    if not mass >= 0:
+        return f"the mass is {mass:.6g} kg; it must not be negative.", True
+    if not np.all(np.isfinite(I)):
+        return f"the inertia is not finite: {I.tolist()}.", True
+    if np.abs(I - I.T).max() > slack:
+        return f"the inertia matrix is not symmetric: {I.tolist()}.", True
+    moments = np.linalg.eigvalsh(I)
+    listed = ", ".join(f"{x:.6g}" for x in moments)
+    if moments[0] < -slack:
+        return f"the principal moments of inertia are {listed} kg m^2; none may be negative.", True
+    if _excess(I) > 1e-6:
+        return (
+            f"no body has the principal moments of inertia {listed} kg m^2: the largest exceeds the sum of the other "
+            "two (triangle inequality). Measured values may do so by a few per cent; more is a mistake."
+        ), False
+    return "", False
+
+
+def _excess(I: np.ndarray) -> float:
+    """By how much of itself the largest principal moment exceeds the sum of the other two."""
+    a, b, c = np.linalg.eigvalsh(I)
+    return float((c - a - b) / max(c, 1e-300))
 
 
 def _velocities(now: Instant, u) -> dict[str, Any]:
@@ -209,10 +231,8 @@ def configuration_tolerance(dtype: Any) -> float:
     return 1e-6 if dtype == jnp.float64 else 1e-3
 
 
-@eqx.filter_jit
+@fused
 def configuration_residual(system: System, t: Any, q: Any):
     """Residuals (h,) of the configuration constraints."""
-    residuals = system.configuration_constraints(
-        t, Values([q[i] for i in range(len(system.coordinates))], system.coordinates)
-    )
-    return stack([tuple(residuals)])[0]
+    residuals = system.configuration_constraints(t, [q[i] for i in range(len(system.coordinates))])
+    return stack([tuple(residuals)])[0].astype(q.dtype)

@@ -1,4 +1,7 @@
-"""The public functions of Kane's method, as arrays. Knows `Instant`, which holds the method itself."""
+"""The public functions of Kane's method, as arrays. Knows `Instant`, which holds the method itself.
+
+Each is one compiled function (`_fuse`), alone, under `jax.jit` and in a derivative of any order.
+"""
 
 from __future__ import annotations
 
@@ -10,19 +13,32 @@ from jaxtyping import Array, Float
 
 from ._check import check_system
 from ._components import add, dot, matvec, sub
-from ._kane import Instant, as_row, jvp
+from ._fuse import fused
+from ._kane import Instant, as_array, checked_inputs, jvp
 from ._linear import stack
 from ._system import System, kinetic_energy_of
 from ._types import Component
 
+InputValues = Mapping[str, Component] | None
 
-def _instant(system: System, t: Component, q: Any, u: Any, inputs: Mapping[str, Component] | None = None) -> Instant:
+
+def _arrays(system: System, t: Component, q: Any, u: Any, inputs: InputValues = None):
+    """The arguments of a public function as arrays of one type, checked."""
+    name = type(system).__name__
+    q = as_array(q, system.coordinates, f"{name}: q")
+    u = as_array(u, system.speeds, f"{name}: u")
+    t = jnp.asarray(t, dtype=q.dtype)
+    checked_inputs(system, inputs)
     check_system(system, t, q, u)
-    return Instant(system, t, q, u, inputs)
+    return system, t, q, u, {name: jnp.asarray(x, dtype=q.dtype) for name, x in (inputs or {}).items()}
+
+
+def _array(row: Any, like: Array) -> Array:
+    return stack([row])[0].astype(like.dtype)
 
 
 def equations_of_motion(
-    system: System, t: Component, q: Any, u: Any, inputs: Mapping[str, Component] | None = None
+    system: System, t: Component, q: Any, u: Any, inputs: InputValues = None
 ) -> tuple[Float[Array, "n n"], Float[Array, " n"]]:
     """M and f of Kane's equations M u_dot = f.
 
@@ -36,100 +52,141 @@ def equations_of_motion(
 
     **Returns:** the generalized mass matrix M (n, n) and the right side f (n,).
 
-    **Raises:** `ValueError` for wrong shapes, unknown inputs, or as many residuals as there are not dependent speeds.
+    **Raises:** `ValueError` for wrong shapes, an unknown input, as many velocity residuals as there are not dependent
+    speeds, or a description that contradicts itself.
     """
-    M, f = _instant(system, t, q, u, inputs).equations()
-    return stack(M), stack([f])[0]
+    return _equations(*_arrays(system, t, q, u, inputs))
 
 
-def accelerations(
-    system: System, t: Component, q: Any, u: Any, inputs: Mapping[str, Component] | None = None
-) -> Float[Array, " n"]:
+@fused
+def _equations(system, t, q, u, inputs):
+    M, f = Instant(system, t, q, u, inputs).equations()
+    return stack(M).astype(q.dtype), _array(f, q)
+
+
+def accelerations(system: System, t: Component, q: Any, u: Any, inputs: InputValues = None) -> Float[Array, " n"]:
     """u_dot (n,): time derivatives of the independent speeds, M^-1 f. Arguments as `equations_of_motion`."""
-    return stack([_instant(system, t, q, u, inputs).accelerations()])[0]
+    return _accelerations(*_arrays(system, t, q, u, inputs))
 
 
-def mass_matrix(
-    system: System, t: Component, q: Any, u: Any, inputs: Mapping[str, Component] | None = None
-) -> Float[Array, "n n"]:
+@fused
+def _accelerations(system, t, q, u, inputs):
+    return _array(Instant(system, t, q, u, inputs).accelerations(), q)
+
+
+def mass_matrix(system: System, t: Component, q: Any, u: Any, inputs: InputValues = None) -> Float[Array, "n n"]:
     """M (n, n), the generalized mass matrix of the independent speeds. Arguments as `equations_of_motion`."""
     return equations_of_motion(system, t, q, u, inputs)[0]
 
 
-def forcing(
-    system: System, t: Component, q: Any, u: Any, inputs: Mapping[str, Component] | None = None
-) -> Float[Array, " n"]:
+def forcing(system: System, t: Component, q: Any, u: Any, inputs: InputValues = None) -> Float[Array, " n"]:
     """f (n,), the right side of M u_dot = f. Arguments as `equations_of_motion`."""
     return equations_of_motion(system, t, q, u, inputs)[1]
 
 
 def partial_velocities(
-    system: System, t: Component, q: Any, u: Any, inputs: Mapping[str, Component] | None = None
+    system: System, t: Component, q: Any, u: Any, inputs: InputValues = None
 ) -> tuple[Float[Array, "b 3 n"], Float[Array, "b 3 n"]]:
     """V and W, each (b, 3, n): partial velocities of the mass centres and partial angular velocities of the b bodies.
 
     Components are in N. The dependent speeds are eliminated: the columns belong to the n independent speeds.
     Arguments as `equations_of_motion`.
     """
-    now = _instant(system, t, q, u, inputs)
+    return _partial_velocities(*_arrays(system, t, q, u, inputs))
+
+
+@fused
+def _partial_velocities(system, t, q, u, inputs):
+    now = Instant(system, t, q, u, inputs)
     motion, partials = now.motion(now.t, now.q, now.u_all), now.partials()
     V, W = [], []
     for i, body in enumerate(motion.bodies):
         for columns, j, frame in ((V, 0, body.center.velocity.frame), (W, 1, body.frame)):
             vectors = [frame.vector(*bodies[i][j]).components_in(motion.N) for bodies, _ in partials]
-            columns.append(stack(vectors).T)
+            columns.append(stack(vectors).astype(q.dtype).T)
     return jnp.stack(V), jnp.stack(W)
 
 
 def generalized_active_forces(
-    system: System, t: Component, q: Any, u: Any, inputs: Mapping[str, Component] | None = None
+    system: System, t: Component, q: Any, u: Any, inputs: InputValues = None
 ) -> Float[Array, " n"]:
     """F_r (n,) = sum of F . V_r + T . W_r over the loads. Arguments as `equations_of_motion`."""
-    now = _instant(system, t, q, u, inputs)
-    return stack([now.active_forces(now.motion(now.t, now.q, now.u_all), now.partials())])[0]
+    return _generalized_active_forces(*_arrays(system, t, q, u, inputs))
+
+
+@fused
+def _generalized_active_forces(system, t, q, u, inputs):
+    now = Instant(system, t, q, u, inputs)
+    return _array(now.active_forces(now.motion(now.t, now.q, now.u_all), now.partials()), q)
 
 
 def generalized_inertia_forces(
-    system: System,
-    t: Component,
-    q: Any,
-    u: Any,
-    inputs: Mapping[str, Component] | None = None,
-    *,
-    u_dot: Any = None,
+    system: System, t: Component, q: Any, u: Any, inputs: InputValues = None, *, u_dot: Any = None
 ) -> Float[Array, " n"]:
     """F*_r (n,) = -sum of V_r . dp/dt + W_r . dH/dt over the bodies, at accelerations `u_dot` (n,), by default zero.
 
     With `u_dot=accelerations(...)` the sum with `generalized_active_forces` vanishes: Kane's equations.
     Arguments as `equations_of_motion`.
     """
-    now = _instant(system, t, q, u, inputs)
+    arrays = _arrays(system, t, q, u, inputs)
+    if u_dot is not None:
+        u_dot = as_array(u_dot, system.speeds, f"{type(system).__name__}: u_dot")
+    return _generalized_inertia_forces(*arrays, u_dot)
+
+
+@fused
+def _generalized_inertia_forces(system, t, q, u, inputs, u_dot):
+    now = Instant(system, t, q, u, inputs)
     motion, partials = now.motion(now.t, now.q, now.u_all), now.partials()
     Fr_star = now.inertia_forces(motion, partials)
     if u_dot is not None:
-        u_dot = as_row(u_dot, system.speeds, f"{now.name}: u_dot")
-        Fr_star = [sub(x, y) for x, y in zip(Fr_star, matvec(now.mass_matrix(motion, partials), u_dot), strict=True)]
-    return stack([Fr_star])[0]
+        M_u_dot = matvec(now.mass_matrix(motion, partials), [u_dot[r] for r in range(now.n)])
+        Fr_star = [sub(x, y) for x, y in zip(Fr_star, M_u_dot, strict=True)]
+    return _array(Fr_star, q)
+
+
+def coordinate_rates(system: System, t: Component, q: Any, u: Any) -> Float[Array, " n_q"]:
+    """q_dot (n_q,): rates of all coordinates, for integrators and controllers of one's own."""
+    return _coordinate_rates(*_arrays(system, t, q, u))
+
+
+@fused
+def _coordinate_rates(system, t, q, u, inputs):
+    return _array(Instant(system, t, q, u).q_dot, q)
 
 
 def dependent_speeds(system: System, t: Component, q: Any, u: Any) -> Float[Array, " k"]:
     """u_dep (k,), from the velocity residuals: C_dep u_dep = -(C_ind u + c0)."""
-    return stack([_instant(system, t, q, u).u_dep])[0]
+    return _dependent_speeds(*_arrays(system, t, q, u))
+
+
+@fused
+def _dependent_speeds(system, t, q, u, inputs):
+    return _array(Instant(system, t, q, u).u_dep, q)
 
 
 def dependent_accelerations(
-    system: System, t: Component, q: Any, u: Any, inputs: Mapping[str, Component] | None = None
+    system: System, t: Component, q: Any, u: Any, inputs: InputValues = None
 ) -> Float[Array, " k"]:
     """u_dep_dot (k,) = J u_dot - C_dep^-1 (dc/dt at frozen speeds). Arguments as `equations_of_motion`."""
-    now = _instant(system, t, q, u, inputs)
+    return _dependent_accelerations(*_arrays(system, t, q, u, inputs))
+
+
+@fused
+def _dependent_accelerations(system, t, q, u, inputs):
+    now = Instant(system, t, q, u, inputs)
     u_dot = now.accelerations()
-    return stack([[add(dot(row, u_dot), b) for row, b in zip(zip(*now.J, strict=True), now.bias(), strict=True)]])[0]
+    return _array([add(dot(row, u_dot), b) for row, b in zip(zip(*now.J, strict=True), now.bias(), strict=True)], q)
 
 
 def constraint_jacobian(system: System, t: Component, q: Any) -> Float[Array, "k n"]:
     """J (k, n) = -C_dep^-1 C_ind: u_dep = J u for constraints without a term of their own in time."""
-    now = _instant(system, t, q, (0.0,) * len(system.speeds))
-    return stack(now.J).T
+    return _constraint_jacobian(*_arrays(system, t, q, (0.0,) * len(system.speeds)))
+
+
+@fused
+def _constraint_jacobian(system, t, q, u, inputs):
+    return stack(Instant(system, t, q, u).J).astype(q.dtype).T
 
 
 def constraint_jacobian_rate(system: System, t: Component, q: Any, u: Any) -> Float[Array, "k n"]:
@@ -139,13 +196,23 @@ def constraint_jacobian_rate(system: System, t: Component, q: Any, u: Any) -> Fl
 
     found by differentiating J(t, q) along (1, q_dot). The textbook prints a minus before C_dep_dot (Example 7).
     """
-    now = _instant(system, t, q, u)
-    zero = (0.0,) * now.n
-    _, J_dot = jvp(lambda t, *q: Instant(system, t, q, zero).J, (now.t, *now.q), (1.0, *now.q_dot))
-    return stack(J_dot).T
+    return _constraint_jacobian_rate(*_arrays(system, t, q, u))
+
+
+@fused
+def _constraint_jacobian_rate(system, t, q, u, inputs):
+    now = Instant(system, t, q, u)
+    still = (0.0,) * now.n
+    _, J_dot = jvp(lambda t, *q: Instant(system, t, q, still).J, (now.t, *now.q), (1.0, *now.q_dot))
+    return stack(J_dot).astype(q.dtype).T
 
 
 def kinetic_energy(system: System, t: Component, q: Any, u: Any) -> Float[Array, ""]:
     """Kinetic energy [J] of all bodies, dependent speeds included."""
-    now = _instant(system, t, q, u)
-    return jnp.asarray(kinetic_energy_of(now.motion(now.t, now.q, now.u_all)))
+    return _kinetic_energy(*_arrays(system, t, q, u))
+
+
+@fused
+def _kinetic_energy(system, t, q, u, inputs):
+    now = Instant(system, t, q, u)
+    return _array([kinetic_energy_of(now.motion(now.t, now.q, now.u_all))], q)[0]

@@ -20,10 +20,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array
 
 from ._components import add, add3, component, cross, dot, is_exact, is_zero, matvec, mul, scale3
 from ._linear import Rows, solve, solve_positive
-from ._system import Body, Load, Motion, System, Values, flatten_loads
+from ._system import Body, Load, Motion, System, flatten_loads
 from ._types import Component
 
 Row = tuple[Component, ...]
@@ -91,26 +92,20 @@ class Instant:
     # The description at this instant, or beside it.
 
     def motion(self, t: Component, q: Row, u: Row) -> Motion:
-        motion = self.system.motion(t, *self._named(q, u))
+        motion = self.system.motion(t, q, u)
         if not isinstance(motion, Motion):
             raise TypeError(f"{self.name}.motion must return a jaxkane.Motion, got {motion!r}.")
         return motion
 
     def rates(self, u: Row) -> Row:
-        q_dot = self.system.q_dot(self.t, *self._named(self.q, u))
+        q_dot = self.system.q_dot(self.t, self.q, u)
         return as_row(q_dot, self.system.coordinates, f"{self.name}.q_dot")
 
     def loads(self, motion: Motion) -> tuple[Load, ...]:
-        return flatten_loads(self.system.loads(self.t, *self._named(self.q, self.u_all), motion, self.inputs))
-
-    def _named(self, q: Row, u: Row) -> tuple[Values, Values]:
-        system = self.system
-        names = (*system.speeds, *system.dependent_speeds, *system.auxiliary_speeds)
-        still = (0.0,) * (len(names) - len(u))  # auxiliary speeds are zero in the motion
-        return Values(q, system.coordinates), Values((*u, *still), names)
+        return flatten_loads(self.system.loads(self.t, self.q, self.u_all, motion, self.inputs))
 
     def configuration(self, t: Component, q: Row) -> Row:
-        residuals = self.system.configuration_constraints(t, Values(q, self.system.coordinates))
+        residuals = self.system.configuration_constraints(t, q)
         return tuple(component(h) for h in residuals)
 
     def residuals(self, t: Component, q: Row, u: Row) -> Row:
@@ -118,7 +113,7 @@ class Instant:
         rolling = self.motion(t, q, u).constraints
         if len(rolling) == self.k:
             return rolling  # the configuration constraints, if there are any, are integrals of these
-        q_dot = as_row(self.system.q_dot(t, *self._named(q, u)), self.system.coordinates, f"{self.name}.q_dot")
+        q_dot = as_row(self.system.q_dot(t, q, u), self.system.coordinates, f"{self.name}.q_dot")
         h, h_dot = jvp(lambda t, *q: self.configuration(t, q), (t, *q), (1.0, *q_dot))
         if len(rolling) + len(h) != self.k:
             names = ", ".join(self.system.dependent_speeds) or "none"
@@ -240,18 +235,28 @@ def _negative(row: Sequence[Component]) -> Row:
 def as_row(values: Any, names: Sequence[str], label: str) -> Row:
     """A sequence, or an array of shape (len(names),), as a row of components."""
     if hasattr(values, "shape"):
-        if values.ndim != 1:
-            raise ValueError(
-                f"{label} must have the shape ({len(names)},), got {values.shape}. For a batch use jax.vmap."
-            )
-        values = jnp.asarray(values)
-        if not jnp.issubdtype(values.dtype, jnp.inexact):
-            values = values.astype(float)
-        values = [values[i] for i in range(values.shape[0])]
+        array = as_array(values, names, label)
+        return tuple(array[i] for i in range(len(names)))
     row = tuple(component(x) for x in values)
     if len(row) != len(names):
         raise ValueError(f"{label} must have {len(names)} entries ({', '.join(names)}), got {len(row)}.")
     return row
+
+
+def as_array(values: Any, names: Sequence[str], label: str) -> Array:
+    """Numbers, in their order or by name, as a float array of shape (len(names),). Those not named are zero."""
+    if isinstance(values, Mapping):
+        unknown = sorted(set(values) - set(names))
+        if unknown:
+            raise ValueError(f"{label} has no {', '.join(unknown)}; it has {', '.join(names)}.")
+        values = jnp.stack([jnp.asarray(values.get(name, 0.0), dtype=float) for name in names])
+    array = jnp.asarray(values)
+    if not jnp.issubdtype(array.dtype, jnp.inexact):
+        array = array.astype(float)
+    if array.shape != (len(names),):
+        hint = " For a batch use jax.vmap." if array.ndim > 1 else ""
+        raise ValueError(f"{label} must have the shape ({len(names)},): {', '.join(names)}. Got {array.shape}.{hint}")
+    return array
 
 
 def checked_inputs(system: System, inputs: Mapping[str, Component] | None) -> dict[str, Component]:

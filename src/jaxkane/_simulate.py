@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ._check import check_state, check_system, configuration_residual, configuration_tolerance
+from ._equations import dependent_speeds
 from ._fuse import fused
 from ._kane import Instant, checked_inputs
 from ._linear import determinant, stack
@@ -170,7 +171,7 @@ def simulate(
     ts = checked_times(ts, state.q.dtype)
     signals = as_signals(inputs, system.inputs, ts, type(system).__name__)
     check_state(system, ts[0], state.q)
-    check_system(system, ts[0], state.q, state.u)
+    check_system(system, ts[0], state.q, state.u, strict=True)
     settings = settings_for(
         ts, rtol=rtol, atol=atol, solver=solver, step=step, adjoint=adjoint, max_steps=max_steps, progress=progress
     )
@@ -265,7 +266,7 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
         t=ts,
         q=q,
         u=u,
-        u_dep=jax.vmap(lambda t, q, u: _dependent_speeds(system, t, q, u))(ts, q, u),
+        u_dep=jax.vmap(lambda t, q, u: dependent_speeds(system, t, q, u))(ts, q, u),
         inputs=jax.vmap(lambda t, q, u: _inputs(system, signals, t, q, u, all_of_them=True))(ts, q, u),
         status=jnp.where(valid, _status(solution, stops), Status.INVALID).astype(jnp.int32),
         t_end=jnp.where(valid, t_end[0], ts[0]),
@@ -285,11 +286,6 @@ def _rates(system: System, t: Component, q: Array, u: Array, inputs: dict[str, C
     """q_dot and u_dot."""
     now = Instant(system, t, q, u, inputs)
     return _array(now.q_dot, q), _array(now.accelerations(), u)
-
-
-@fused
-def _dependent_speeds(system: System, t: Component, q: Array, u: Array) -> Array:
-    return _array(Instant(system, t, q, u).u_dep, q)
 
 
 @fused
@@ -325,12 +321,12 @@ def _stops(system: System, t0: Array, state: State) -> dict[str, Any]:
     def event(name):
         def value(t, y, args, **_):
             now = Instant(args[0], t, *y)
-            return jnp.asarray(args[0].events(t, *now._named(now.q, now.u_all))[name])
+            return jnp.asarray(args[0].events(t, now.q, now.u_all)[name])
 
         return value
 
     now = Instant(system, t0, state.q, state.u)
-    stops = {name: event(name) for name in system.events(t0, *now._named(now.q, now.u_all))}
+    stops = {name: event(name) for name in system.events(t0, now.q, now.u_all)}
     if system.dependent_speeds:
         stops[_SINGULAR] = lambda t, y, args, **_: _determinant(args[0], t, *y)
     return stops

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -70,7 +71,7 @@ class Body:
     - `inertia` [kg m^2] about the mass centre, resolved in `frame`: three principal moments, or a (3, 3) matrix
         whose off-diagonal entries are matrix entries (minus the integrals of xy). 0.0 for a particle.
     - `center`: the mass centre, a Point.
-    - `frame`: a Frame in which the inertia does not change.
+    - `frame`: a Frame in which the inertia does not change. A particle needs none.
     - `angular_velocity`: a Vector, by default the frame's. An axisymmetric body (a wheel, a rotor) may stand in a
         frame that does not spin with it, with its own angular velocity: the textbook's Examples 5 and 7.
     - `name`: for error messages, forces and pictures.
@@ -83,15 +84,15 @@ class Body:
         mass: Component,
         inertia: Any,
         center: Point,
-        frame: Frame,
+        frame: Frame | None = None,
         angular_velocity: Vector | None = None,
         name: str = "body",
     ):
         self.mass = component(mass)
         self.inertia = _inertia(inertia, name)
         self.center = center
-        self.frame = frame
-        self.angular_velocity = frame.angular_velocity if angular_velocity is None else angular_velocity
+        self.frame = center.velocity.frame.root if frame is None else frame
+        self.angular_velocity = self.frame.angular_velocity if angular_velocity is None else angular_velocity
         self.name = name
 
     def __repr__(self) -> str:
@@ -283,6 +284,12 @@ class System(eqx.Module):
     the dependent, then the auxiliary ones. `q` and `u` are read by place or by name: `q[0]`, `q["roll"]`.
     """
 
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        for method in ("motion", "q_dot", "loads", "configuration_constraints", "events"):
+            if method in cls.__dict__:
+                setattr(cls, method, _named(cls.__dict__[method]))
+
     coordinates: ClassVar[tuple[str, ...]] = ()
     """Names of the generalized coordinates."""
     speeds: ClassVar[tuple[str, ...]] = ()
@@ -325,6 +332,31 @@ class System(eqx.Module):
     def events(self, t: Component, q: Values, u: Values) -> Mapping[str, Component]:
         """Signed, smooth quantities by name; a simulation stops, with that name as its status, where one vanishes."""
         return {}
+
+
+def _named(method: Callable[..., Any]) -> Callable[..., Any]:
+    """A method of a description whose `q` and `u` may be any sequence, and are read by place and by name."""
+
+    @functools.wraps(method)
+    def call(self: System, t: Component, q: Any, *rest: Any, **more: Any) -> Any:
+        q = _values(q, self.coordinates, f"{type(self).__name__}: q")
+        if rest:
+            names = (*self.speeds, *self.dependent_speeds, *self.auxiliary_speeds)
+            rest = (_values(rest[0], names, f"{type(self).__name__}: u", len(self.auxiliary_speeds)), *rest[1:])
+        return method(self, t, q, *rest, **more)
+
+    return call
+
+
+def _values(values: Any, names: Sequence[str], label: str, n_optional: int = 0) -> Values:
+    if isinstance(values, Values) and values.names == tuple(names):
+        return values
+    items = list(values)
+    if len(items) == len(names) - n_optional:
+        items += [0.0] * n_optional  # auxiliary speeds are zero in the motion
+    if len(items) != len(names):
+        raise ValueError(f"{label} must have {len(names)} entries ({', '.join(names)}), got {len(items)}.")
+    return Values(items, names)
 
 
 def check_parameter(label: str, value: Any, info: ParameterInfo) -> None:

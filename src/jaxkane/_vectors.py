@@ -302,7 +302,7 @@ def _resolve(components: Triple, source: Frame, target: Frame) -> Triple:
             if source.parent is None:
                 raise ValueError(
                     f"The frames {source.name} and {target.name} have no common inertial frame. Call "
-                    "jaxkane.inertial() once in `motion`, and in `loads` take the frames from the motion that it receives."
+                    "jaxkane.inertial() once in `motion`, and in `loads` take the frames from the motion it receives."
                 )
             components = matvec(tuple(zip(*source._to_child, strict=True)), components)  # type: ignore[assignment]
             source = source.parent
@@ -392,7 +392,11 @@ class Point:
 
     @staticmethod
     def at(velocity: Vector, position: Vector | None = None, name: str = "point") -> Point:
-        """A point with a given velocity [m/s] and, where it is known, a given position from the origin [m]."""
+        """A point with a given velocity [m/s] and, where it is known, a given position from the origin [m].
+
+        The contact point of a wheel that rolls is `Point.at(0.0 * N.x)`: a point of the wheel that is at rest now. It
+        has no position, since the ground under the wheel is another point at every instant.
+        """
         return Point(velocity, None, position, name)
 
     def position_from(self, other: Point) -> Vector:

@@ -127,6 +127,11 @@ def euler_parameter_rates(parameters: Sequence[Component], omega: Sequence[Compo
     return tuple(dot(row, half) for row in rows)  # type: ignore[return-value]
 
 
+def euler_parameter_norm(parameters: Sequence[Component]) -> Component:
+    """e1^2 + e2^2 + e3^2 + e4^2 - 1: zero, the configuration constraint of Euler parameters."""
+    return sub(dot(parameters, parameters), 1.0)
+
+
 def rodrigues_matrix(axis: Triple, c: Component, s: Component) -> Matrix:
     """[R] of a rotation about the unit vector `axis`, from the cosine and sine of its angle (Rodrigues' formula)."""
     versine = sub(1.0, c)

@@ -1,7 +1,8 @@
 """Many simulations at once. Knows batches, chunks and `simulate`; knows no mechanism.
 
-On the CPU the members of a chunk are solved one after the other by one compiled program: each takes its own steps, so
-one that falls, or that is nonsense, neither slows nor touches the others. On other devices they go in step (`vmap`).
+On the CPU the members of a chunk are solved in small groups, one group after the other: as many as the vector units
+can use, and few enough that one that needs many steps keeps few others waiting. One that falls or is nonsense stops
+where it is. On other devices a chunk goes in step (`vmap`).
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from ._signals import Samples, as_signals
 from ._simulate import Settings, Status, Trajectory, checked_times, settings_for, solve
 from ._system import State, System, parameter_info
 from ._types import Inputs
+
+_GROUP = 32
 
 
 def sweep(
@@ -51,15 +54,16 @@ def sweep(
     ts = checked_times(ts, state.q.dtype)
     settings = settings_for(ts, progress=False, **options)
     members, shared, n = _split(system, state, _signals(inputs, system, ts), ts)
-    starts = range(0, n, chunk)
+    # The last chunk is filled up with copies of its last member, so that one program serves all.
+    size = _GROUP * -(-min(chunk, n) // _GROUP) if n > _GROUP else n
+    starts = range(0, n, size)
     done: list[Trajectory] = []
     try:
         for start in tqdm(starts, disable=not progress, unit="chunk", file=sys.stderr):
-            # The last chunk is filled up with copies of its last member, so that one program serves all.
-            places = np.minimum(np.arange(start, start + min(chunk, n)), n - 1)
+            places = np.minimum(np.arange(start, start + size), n - 1)
             part = _solve_chunk(jax.tree.map(lambda x: x[places], members), shared, ts, settings)  # noqa: B023
             part = jax.block_until_ready(part)
-            done.append(jax.tree.map(lambda x: x[: min(n - start, chunk)], part))  # noqa: B023
+            done.append(jax.tree.map(lambda x: x[: min(n - start, size)], part))  # noqa: B023
     except KeyboardInterrupt:
         if not done:
             raise
@@ -74,7 +78,7 @@ def _solve_chunk(members: Any, shared: Any, ts: Any, settings: Settings) -> Traj
         return solve(system, state, ts, signals, settings)
 
     if jax.default_backend() == "cpu":
-        return jax.lax.map(one, members)
+        return jax.lax.map(one, members, batch_size=_GROUP)
     return jax.vmap(one)(members)
 
 

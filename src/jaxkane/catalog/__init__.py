@@ -4,6 +4,7 @@
 `Entry` in `_entries.py`; the laws in `tests/catalog/test_laws.py` then hold it to account.
 """
 
+from ._bicycle_file import read_bicycle_file as read_bicycle_file
 from ._entries import CATALOG as CATALOG
 from ._entries import Entry as Entry
 from .aircraft import Aircraft as Aircraft

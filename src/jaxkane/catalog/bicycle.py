@@ -118,7 +118,7 @@ class WhippleBicycle(System):
 
         The deviations are read by `jaxkane.catalog.read_bicycle_file`.
 
-        **Raises:** `ValueError` that names the file's lines that are unknown, repeated or malformed, and what is missing.
+        **Raises:** `ValueError` that names the lines that are unknown, repeated or malformed, and what is missing.
         """
         values, _ = read_bicycle_file(path, known=(*parameter_info(cls), *_IMPLIED))
         try:

@@ -1,0 +1,115 @@
+"""Vectors, frames and points: the algebra, the theorems, and the exact zeros."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+
+N, O = jk.inertial()
+
+
+def test_components_that_are_known_stay_exact():
+    B = N.rotate(3, jnp.array(0.3), jnp.array(2.0))
+    assert B.z.components_in(N) == (0.0, 0.0, 1.0)
+    assert B.x.dot(N.z) == 0.0
+    assert B.z.cross(N.z).components == (0.0, 0.0, 0.0)
+    assert B.angular_velocity.components[:2] == (0.0, 0.0)
+
+
+def test_algebra_across_frames():
+    B = N.rotate(1, 0.4, 0.0)
+    C = B.rotate(2, -0.7, 0.0)
+    a, b = 2.0 * B.x - 0.5 * B.z, N.y / 4.0 + C.z
+    A, D = np.asarray(a.to(N)), np.asarray(b.to(N))
+    np.testing.assert_allclose((a + b).to(N), A + D, atol=1e-15)
+    np.testing.assert_allclose((a - b).to(C), np.asarray(C.matrix(N)) @ (A - D), atol=1e-15)
+    np.testing.assert_allclose(a.dot(b), A @ D, atol=1e-15)
+    np.testing.assert_allclose(a.cross(b).to(N), np.cross(A, D), atol=1e-15)
+    np.testing.assert_allclose((-a).norm(), np.linalg.norm(A))
+    np.testing.assert_allclose(b.normalize().norm(), 1.0)
+    np.testing.assert_allclose(sum([a, b]).to(N), A + D, atol=1e-15)
+    np.testing.assert_allclose(b.express(B).to(N), D, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "factor", [3, 3.0, np.float64(3.0), np.array(3.0), jnp.array(3.0)], ids=lambda x: type(x).__name__
+)
+def test_numbers_of_any_kind_multiply_from_both_sides(factor):
+    for product in (factor * N.x, N.x * factor):
+        assert isinstance(product, jk.Vector)
+        np.testing.assert_allclose(product.to(N), [3.0, 0.0, 0.0])
+
+
+def test_what_is_no_vector_algebra_is_refused():
+    with pytest.raises(TypeError, match="a.dot"):
+        N.x * N.y
+    with pytest.raises(TypeError):
+        N.x + 1.0
+    with pytest.raises(TypeError, match="one number"):
+        jnp.ones(3) * N.x
+
+
+def test_two_inertial_frames_do_not_meet():
+    M, _ = jk.inertial()
+    with pytest.raises(ValueError, match="no common inertial frame"):
+        N.x.dot(M.y + M.x)
+
+
+def test_a_hinge_in_any_direction():
+    for axis, unit in enumerate((N.x, N.y, N.z), start=1):
+        by_number, by_vector = N.rotate(axis, 0.6, 1.5), N.rotate(1.0 * unit, 0.6, 1.5)
+        np.testing.assert_allclose(by_vector.matrix(N), by_number.matrix(N), atol=1e-15)
+    axis = (N.x + 2.0 * N.y - N.z).normalize()
+    matrix = lambda angle: N.rotate(axis, angle, 0.0).matrix(N)  # noqa: E731
+    R, R_dot = jax.jvp(matrix, (jnp.array(0.6),), (jnp.array(1.5),))
+    skew = R_dot.T @ R
+    np.testing.assert_allclose(
+        N.rotate(axis, 0.6, 1.5).angular_velocity.to(N), [skew[2, 1], skew[0, 2], skew[1, 0]], atol=1e-14
+    )
+    with pytest.raises(ValueError, match="axis is 1, 2, 3"):
+        N.rotate(0, 0.1, 0.0)
+
+
+def test_two_point_one_point_and_differentiation_agree():
+    # A slider on a turning arm, said in three ways.
+    angle, rate, s, s_dot = 0.8, 1.7, 0.4, -0.3
+    B = N.rotate(3, angle, rate)
+    arm = O.fixed(2.0 * B.x)
+    slider = arm.moving(s * B.y, s_dot * B.y)
+
+    def place(t, q):
+        c, sn = jnp.cos(q[0]), jnp.sin(q[0])
+        return (2.0 * c - q[1] * sn, 2.0 * sn + q[1] * c, 0.0)
+
+    located = O.located(place, 0.0, [angle, s], [rate, s_dot])
+    np.testing.assert_allclose(slider.velocity.to(N), located.velocity.to(N), atol=1e-15)
+    np.testing.assert_allclose(slider.position.to(N), located.position.to(N), atol=1e-15)
+    np.testing.assert_allclose(slider.position_from(arm).to(B), [0.0, s, 0.0], atol=1e-15)
+
+
+def test_orientation_given_as_a_function():
+    direct = N.rotate(2, 0.5, 1.2)
+
+    def orientation(t, q):
+        c, s = jnp.cos(q), jnp.sin(q)
+        return jnp.array([[c, 0.0, -s], [0.0, 1.0, 0.0], [s, 0.0, c]])
+
+    given = N.rotate_by(orientation, 0.0, 0.5, 1.2)
+    np.testing.assert_allclose(given.matrix(N), direct.matrix(N), atol=1e-15)
+    np.testing.assert_allclose(given.angular_velocity.to(N), direct.angular_velocity.to(N), atol=1e-15)
+
+
+def test_a_point_fixed_by_a_vector_of_two_frames_needs_to_be_told_where():
+    B = N.rotate(1, 0.4, 1.0)
+    with pytest.raises(ValueError, match="Say which"):
+        O.fixed(N.x + B.y)
+    assert O.fixed(N.x + B.y, B).velocity.frame is B
+
+
+def test_a_point_known_by_its_velocity_alone_has_no_position():
+    P = jk.Point.at(2.0 * N.x)
+    assert not P.fixed(N.y, N).has_position
+    with pytest.raises(ValueError, match="not known"):
+        _ = P.position
