@@ -116,7 +116,7 @@ def test_J_dot_against_differences_and_the_books_wrong_sign():
 
 
 def test_partial_velocities_are_the_books():
-    """[WA] of Example 7 at a state: the rear wheel's partial angular velocities, with the dependent speeds eliminated."""
+    """[WA] of Example 7: the rear wheel's partial angular velocities, with the dependent speeds eliminated."""
     q, u = moving_state()
     _, W = jk.partial_velocities(BIKE, 0.0, q, u)
     J = np.asarray(jk.constraint_jacobian(BIKE, 0.0, q))
@@ -219,4 +219,7 @@ def test_measured_bicycles_can_be_read():
             continue
         bicycle = WhippleBicycle.from_file(path)
         assert float(bicycle.mB) > 0
-        assert np.isfinite(jk.accelerations(bicycle, 0.0, np.zeros(8), np.array([0.1, -10.0, 0.2]))).all()
+        accelerations = jax.jit(
+            jk.accelerations
+        )  # one frame's measured inertia warns: it breaks the triangle inequality
+        assert np.isfinite(accelerations(bicycle, 0.0, np.zeros(8), np.array([0.1, -10.0, 0.2]))).all()

@@ -43,7 +43,7 @@ def test_numbers_of_any_kind_multiply_from_both_sides(factor):
 
 
 def test_what_is_no_vector_algebra_is_refused():
-    with pytest.raises(TypeError, match="a.dot"):
+    with pytest.raises(TypeError, match=r"a\.dot"):
         N.x * N.y
     with pytest.raises(TypeError):
         N.x + 1.0

@@ -156,7 +156,9 @@ def _check_rates(now: Instant) -> None:
     def geometry(t, *q):
         motion = now.motion(t, q, now.u_all)
         frames = [_rotation(f) for f in _frames(motion)]
-        points = [b.center.position.to(motion.N) if b.center.has_position else jnp.zeros(3) for b in motion.bodies]
+        points = [
+            b.center.position.to(motion.N) if b.center.has_position else jnp.zeros(3, q[0].dtype) for b in motion.bodies
+        ]
         return frames, points
 
     tangents = (1.0, *now.q_dot)

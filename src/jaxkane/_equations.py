@@ -15,7 +15,7 @@ from ._check import check_system
 from ._components import add, dot, matvec, sub
 from ._fuse import fused
 from ._kane import Instant, as_array, checked_inputs, jvp
-from ._linear import stack
+from ._linear import is_written_out, solve_positive_array, stack
 from ._system import System, kinetic_energy_of
 from ._types import Component
 
@@ -66,12 +66,30 @@ def _equations(system, t, q, u, inputs):
 
 def accelerations(system: System, t: Component, q: Any, u: Any, inputs: InputValues = None) -> Float[Array, " n"]:
     """u_dot (n,): time derivatives of the independent speeds, M^-1 f. Arguments as `equations_of_motion`."""
-    return _accelerations(*_arrays(system, t, q, u, inputs))
+    return state_rates(*_arrays(system, t, q, u, inputs))[1]
+
+
+def state_rates(
+    system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]
+) -> tuple[Float[Array, " n_q"], Float[Array, " n"]]:
+    """q_dot and u_dot: the right-hand side, from arrays that are known to fit."""
+    if is_written_out(len(system.speeds)):
+        return _state_rates(system, t, q, u, inputs)
+    q_dot, M, f = _state_rates_unsolved(system, t, q, u, inputs)
+    return q_dot, solve_positive_array(M, f)
 
 
 @fused
-def _accelerations(system, t, q, u, inputs):
-    return _array(Instant(system, t, q, u, inputs).accelerations(), q)
+def _state_rates(system, t, q, u, inputs):
+    now = Instant(system, t, q, u, inputs)
+    return _array(now.q_dot, q), _array(now.accelerations(), q)
+
+
+@fused
+def _state_rates_unsolved(system, t, q, u, inputs):
+    now = Instant(system, t, q, u, inputs)
+    M, f = now.equations()
+    return _array(now.q_dot, q), stack(M).astype(q.dtype), _array(f, q)
 
 
 def mass_matrix(system: System, t: Component, q: Any, u: Any, inputs: InputValues = None) -> Float[Array, "n n"]:

@@ -50,13 +50,19 @@ def _adjugate(A: Rows) -> tuple[Rows, Component]:
     return tuple(zip(*columns, strict=True)), dot(r1, columns[0])
 
 
+def is_written_out(n: int) -> bool:
+    """Whether positive definite systems of n unknowns are solved among the scalars."""
+    return n <= _UNROLL_UP_TO
+
+
+def solve_positive_array(M, b):
+    """The solution x (n,) of M x = b for a symmetric positive definite array M (n, n), by LAPACK."""
+    return jsl.cho_solve(jsl.cho_factor(M), b)
+
+
 def solve_positive(M: Rows, b: Sequence[Component]) -> tuple[Component, ...]:
     """The solution x of M x = b for a symmetric positive definite M, of which the upper triangle is read."""
     n = len(M)
-    if n > _UNROLL_UP_TO:
-        factor = jsl.cho_factor(stack(M), lower=False)
-        x = jsl.cho_solve(factor, stack([b])[0])
-        return tuple(x[i] for i in range(n))
     # M = L D L^T, column by column; d holds the pivots, L the rows below the diagonal.
     L: list[list[Component]] = [[0.0] * n for _ in range(n)]
     d: list[Component] = []

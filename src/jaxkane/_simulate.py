@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ._check import check_state, check_system, configuration_residual, configuration_tolerance
-from ._equations import dependent_speeds
+from ._equations import dependent_speeds, state_rates
 from ._fuse import fused
 from ._kane import Instant, checked_inputs
 from ._linear import determinant, stack
@@ -230,7 +230,7 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
     def vector_field(t, y, args):
         system, signals = args
         inputs = _inputs(system, signals, t, *y)
-        return tuple(jnp.where(valid, rate, jnp.zeros_like(rate)) for rate in _rates(system, t, *y, inputs))
+        return tuple(jnp.where(valid, rate, jnp.zeros_like(rate)) for rate in state_rates(system, t, *y, inputs))
 
     # A first step, right or wrong by a factor of ten, spares the two more copies of the right-hand side that diffrax
     # would compile to choose one.
@@ -279,13 +279,6 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
         events=tuple(name for name in stops if name != _SINGULAR),
         adjoint=type(settings.adjoint).__name__,
     )
-
-
-@fused
-def _rates(system: System, t: Component, q: Array, u: Array, inputs: dict[str, Component]) -> tuple[Array, Array]:
-    """q_dot and u_dot."""
-    now = Instant(system, t, q, u, inputs)
-    return _array(now.q_dot, q), _array(now.accelerations(), u)
 
 
 @fused

@@ -7,15 +7,18 @@ knows its velocity, and its position as a chain of vectors that is summed only w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any
+import contextlib
+import contextvars
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from . import rotations
-from ._components import ZERO3, add3, component, cross, dot, is_exact, is_zero, matvec, mul, scale3
+from ._components import ZERO3, add3, component, cross, dot, is_zero, matvec, mul, scale3
+from ._linear import stack
 from ._types import Component, Triple
 from .rotations import Matrix
 
@@ -27,19 +30,36 @@ class Frame:
     vectors (the textbook's 1, 2 and 3), `frame.vector(a, b, c)` any other vector that is simple in it.
     """
 
-    __slots__ = ("_omega", "_spin", "_to_child", "_units", "depth", "name", "parent")
+    __slots__ = ("_made", "_omega", "_spin", "_to_child", "_units", "_virtual", "depth", "name", "number", "parent")
 
     def __init__(self, name: str, parent: Frame | None, to_child: Matrix, spin: Triple):
         self.name = name
         self.parent = parent
         self.depth: int = 0 if parent is None else parent.depth + 1
-        self._to_child = to_child  # components in the parent -> components here
         self._spin = spin  # angular velocity relative to the parent, in this frame's components
         self._omega: Vector | None = None
         self._units: tuple[Vector, Vector, Vector] | None = None
+        self._made: int = 0
+        self._virtual: Virtual | None = None
+        self.number = 0 if parent is None else self.root._next_number()
+        self._to_child = self._turned(to_child)  # components in the parent -> components here
+
+    def _turned(self, to_child: Matrix) -> Matrix:
+        virtual = self.root._virtual
+        if self.parent is None or virtual is None or virtual.number != self.number:
+            return to_child
+        # R (1 - [delta x]) for a small rotation delta, row by row: r - r x delta
+        delta = self.root.vector(*virtual.displacement).components_in(self.parent)
+        return tuple(add3(row, cross(delta, row)) for row in to_child)  # type: ignore[return-value]
 
     def __repr__(self) -> str:
         return f"Frame({self.name})"
+
+    def _next_number(self) -> int:
+        """Frames and points are numbered as they are made: a description that is read again makes them in the same
+        order."""
+        self._made += 1
+        return self._made
 
     @property
     def x(self) -> Vector:
@@ -78,6 +98,9 @@ class Frame:
             else:
                 inherited = matvec(self._to_child, self.parent.angular_velocity.components)
                 self._omega = Vector(self, add3(inherited, self._spin))  # type: ignore[arg-type]
+                virtual = self.root._virtual
+                if virtual is not None and virtual.number == self.number:
+                    self._omega = self._omega + self.root.vector(*virtual.velocity)
         return self._omega
 
     def rotate(self, axis: int | Vector, angle: Component, rate: Component, name: str | None = None) -> Frame:
@@ -180,8 +203,7 @@ class Frame:
 
     def matrix(self, other: Frame) -> Float[Array, "3 3"]:
         """The rotation matrix (3, 3) that takes components in `other` to components in this frame."""
-        columns = [Vector(other, unit).to(self) for unit in rotations.IDENTITY]
-        return jnp.stack(columns, axis=-1)
+        return stack([Vector(other, unit).components_in(self) for unit in rotations.IDENTITY]).T
 
 
 def _along(function, t, q, q_dot):
@@ -229,9 +251,7 @@ class Vector:
 
     def to(self, frame: Frame) -> Float[Array, 3]:
         """Components in `frame`, an array of shape (3,)."""
-        components = self.components_in(frame)
-        dtype = jnp.result_type(*([a for a in components if not is_exact(a)] or [float]))
-        return jnp.stack([jnp.asarray(a, dtype=dtype) for a in components])
+        return stack([self.components_in(frame)])[0]
 
     def express(self, frame: Frame) -> Vector:
         """The same vector, its components kept in `frame` from here on."""
@@ -321,9 +341,14 @@ class Point:
     the one-point theorem, `located` differentiates a position function.
     """
 
-    __slots__ = ("_base", "_offset", "name", "velocity")
+    __slots__ = ("_base", "_offset", "name", "number", "velocity")
 
     def __init__(self, velocity: Vector, base: Point | None = None, offset: Vector | None = None, name: str = "point"):
+        N = velocity.frame.root
+        self.number = N._next_number()
+        if N._virtual is not None and N._virtual.number == self.number:
+            velocity = velocity + N.vector(*N._virtual.velocity)
+            offset = None if offset is None else offset + N.vector(*N._virtual.displacement)
         self.velocity = velocity
         self.name = name
         self._base = base
@@ -416,4 +441,32 @@ def _own_frame(r: Vector, verb: str) -> Frame:
 def inertial() -> tuple[Frame, Point]:
     """The inertial frame N and its origin O, the root of a description. Call it once, at the top of `motion`."""
     N = Frame("N", None, rotations.IDENTITY, ZERO3)
+    N._virtual = _VIRTUAL.get()
     return N, Point(Vector(N, ZERO3), None, Vector(N, ZERO3), "O")
+
+
+class Virtual(NamedTuple):
+    """A velocity and a displacement that one point or frame does not have: the textbook's auxiliary speed.
+
+    For a frame, an angular velocity and a small rotation. Components are in N.
+    """
+
+    number: int
+    velocity: Triple = ZERO3
+    displacement: Triple = ZERO3
+
+
+_VIRTUAL: contextvars.ContextVar[Virtual | None] = contextvars.ContextVar("jaxkane_virtual", default=None)
+
+
+@contextlib.contextmanager
+def virtual(part: Point | Frame, *, velocity: Triple = ZERO3, displacement: Triple = ZERO3) -> Iterator[None]:
+    """Descriptions read in this context give that point or frame a virtual motion; what is built from it follows.
+
+    `part` comes from a reading without one, and is found again by its number.
+    """
+    token = _VIRTUAL.set(Virtual(part.number, velocity, displacement))
+    try:
+        yield
+    finally:
+        _VIRTUAL.reset(token)

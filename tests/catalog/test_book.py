@@ -431,9 +431,7 @@ def test_events_vanish_and_change_sign_where_the_angles_lock(name, q):
     system = getattr(catalog, name)()
 
     def events(q):
-        return np.array(
-            [float(x) for x in system.events(0.0, dict(zip(system.coordinates, q, strict=True)), {}).values()]
-        )
+        return np.array([float(x) for x in system.events(0.0, q, [0.0] * len(system.speeds)).values()])
 
     second = [i for i, x in enumerate(system.coordinates) if x in ("theta", "theta2", "theta12", "theta22")]
     step = np.zeros(len(q))

@@ -1,0 +1,232 @@
+"""The method on systems that are not in the book: rheonomic terms, loops, chains; and every kind of derivative."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+import jaxkane as jk
+from jaxkane.catalog import DoublePendulum, RigidBody, WhippleBicycle
+
+
+class BeadOnTurningRod(jk.System):
+    """A bead on a rod that is turned at a prescribed, growing rate: x_ddot = (rate * t)^2 x - (k / m) x + F / m."""
+
+    mass: jk.Scalar = jk.parameter(positive=True)
+    stiffness: jk.Scalar = jk.parameter(0.0)
+    rate: jk.Scalar = jk.parameter(1.0)  # [rad/s^2]
+    coordinates = ("x",)
+    speeds = ("x_dot",)
+    inputs = ("push",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        rod = N.rotate(3, 0.5 * self.rate * t * t, self.rate * t, "rod")
+        bead = O.moving(q[0] * rod.x, u[0] * rod.x)
+        return jk.Motion([jk.Body(self.mass, 0.0, bead, name="bead")], frames={"rod": rod})
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force((inputs["push"] - self.stiffness * q["x"]) * motion["rod"].x, motion["bead"])
+
+
+def test_prescribed_motion():
+    bead = BeadOnTurningRod(mass=2.0, stiffness=3.0, rate=0.7)
+    t, x = 1.3, 0.4
+    u_dot = jk.accelerations(bead, t, [x], [0.9], {"push": 5.0})
+    np.testing.assert_allclose(u_dot, [(0.7 * t) ** 2 * x - 1.5 * x + 2.5], rtol=1e-14)
+    energy = jk.kinetic_energy(bead, t, [x], [0.9])
+    np.testing.assert_allclose(energy, 0.9**2 + (0.7 * t * x) ** 2, rtol=1e-14)  # the bead is carried round
+
+
+class CartesianPendulum(jk.System):
+    """A pendulum in x and y, its length a configuration constraint: a closed loop."""
+
+    length: jk.Scalar = jk.parameter(1.0)
+    coordinates = ("x", "y")
+    speeds = ("x_dot",)
+    dependent_speeds = ("y_dot",)
+    dependent_coordinates = ("y",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(q["x"] * N.x + q["y"] * N.y, u["x_dot"] * N.x + u["y_dot"] * N.y)
+        return jk.Motion([jk.Body(1.0, 0.0, P, name="bob")])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+
+    def configuration_constraints(self, t, q):
+        return [q["x"] ** 2 + q["y"] ** 2 - self.length**2]
+
+
+def test_a_closed_loop_moves_as_the_pendulum_in_its_angle():
+    loop = CartesianPendulum(length=1.3)
+    state = jk.assemble(loop, {"x": 0.5, "y": -1.0}, {"x_dot": 0.8})
+    x, y = np.asarray(state.q)
+    np.testing.assert_allclose(np.hypot(x, y), 1.3, rtol=1e-15)
+    np.testing.assert_allclose(jk.dependent_speeds(loop, 0.0, state.q, state.u), [-x * 0.8 / y], rtol=1e-14)
+    # theta from the downward vertical: x = l sin, theta_ddot = -g/l sin
+    theta_dot = 0.8 / -y
+    x_ddot = -9.81 / 1.3 * (x / 1.3) * -y - x * theta_dot**2
+    np.testing.assert_allclose(jk.accelerations(loop, 0.0, state.q, state.u), [x_ddot], rtol=1e-13)
+    y_ddot = 9.81 / 1.3 * (x / 1.3) * -x - y * theta_dot**2
+    np.testing.assert_allclose(jk.dependent_accelerations(loop, 0.0, state.q, state.u), [y_ddot], rtol=1e-12)
+
+
+class RollingCoin(jk.System):
+    """A thin disc that rolls upright on a line: a velocity residual that holds a term in time (a moving belt)."""
+
+    radius: jk.Scalar = jk.parameter(0.5)
+    belt: jk.Scalar = jk.parameter(0.0)  # [m/s^2]
+    coordinates = ("angle", "x")
+    speeds = ("spin",)
+    dependent_speeds = ("x_dot",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        disc = N.rotate(2, q["angle"], u["spin"], "disc")
+        center = O.moving(q["x"] * N.x, u["x_dot"] * N.x)
+        contact = center.velocity + disc.angular_velocity.cross(-self.radius * N.z)
+        body = jk.Body(2.0, (0.1, 0.2, 0.1), center, disc, name="disc")
+        return jk.Motion([body], [contact.dot(N.x) - self.belt * t])
+
+
+def test_a_residual_with_a_term_in_time_is_affine_not_only_linear():
+    coin = RollingCoin(belt=3.0)
+    at = (coin, 2.0, [0.3, 0.1], [1.5])
+    np.testing.assert_allclose(jk.dependent_speeds(*at), [0.5 * 1.5 + 6.0], rtol=1e-15)
+    # I spin_dot + m r (r spin_dot + belt) = 0
+    spin_dot = -2.0 * 0.5 * 3.0 / (0.2 + 2.0 * 0.25)
+    np.testing.assert_allclose(jk.accelerations(*at), [spin_dot], rtol=1e-14)
+    np.testing.assert_allclose(jk.dependent_accelerations(*at), [0.5 * spin_dot + 3.0], rtol=1e-14)
+
+
+def test_results_add_up_to_kanes_equations():
+    bike = WhippleBicycle.benchmark()
+    state = jk.assemble(bike, {"roll": 0.1, "steer": 0.2}, {"rear_wheel_rate": -10.0, "roll_rate": 0.3})
+    at, inputs = (bike, 0.0, state.q, state.u), {"steer_torque": 2.0}
+    M, f = jk.equations_of_motion(*at, inputs)
+    np.testing.assert_array_equal(M, jk.mass_matrix(*at, inputs))
+    np.testing.assert_array_equal(f, jk.forcing(*at, inputs))
+    u_dot = jk.accelerations(*at, inputs)
+    np.testing.assert_allclose(M @ u_dot, f, atol=1e-11)
+    Fr = jk.generalized_active_forces(*at, inputs)
+    np.testing.assert_allclose(Fr + jk.generalized_inertia_forces(*at), f, atol=1e-12)
+    np.testing.assert_allclose(Fr + jk.generalized_inertia_forces(*at, u_dot=u_dot), 0.0, atol=1e-10)
+    J = jk.constraint_jacobian(bike, 0.0, state.q)
+    np.testing.assert_allclose(J @ state.u, jk.dependent_speeds(*at), atol=1e-14)
+
+
+SYSTEMS = {
+    "DoublePendulum": (lambda: DoublePendulum(), [0.4, -0.7], [0.9, 0.3]),
+    "RigidBody": (
+        lambda: RigidBody(),
+        [0.1, 0.2, 0.3, 0.1, -0.4, 0.2, 0.88881944173],
+        [0.4, -0.2, 0.3, 1.0, 0.7, -0.5],
+    ),
+    "BeadOnTurningRod": (lambda: BeadOnTurningRod(mass=2.0, stiffness=3.0, rate=0.7), [0.4], [0.9]),
+    "RollingCoin": (lambda: RollingCoin(belt=3.0), [0.3, 0.1], [1.5]),
+}
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_derivatives_in_every_argument_both_modes_and_twice(name):
+    """Parameters, time, state and inputs, against central differences."""
+    rtol = 1e-6
+    make, q, u = SYSTEMS[name]
+    system = make()
+    inputs = {name: 0.7 for name in system.inputs}
+    flat, unflatten = ravel_pytree(
+        (system, jnp.array(0.8), jnp.array(q), jnp.array(u), jax.tree.map(jnp.array, inputs))
+    )
+    weights = jnp.linspace(0.5, 1.5, len(u))
+
+    def f(x):
+        return weights @ jk.accelerations(*unflatten(x))
+
+    forward, reverse = jax.jit(jax.jacfwd(f))(flat), jax.jit(jax.grad(f))(flat)
+    h = 1e-5
+    values = jax.jit(jax.vmap(lambda step: f(flat + step)))
+    steps = h * jnp.eye(flat.size)
+    differences = (values(steps) - values(-steps)) / (2 * h)
+    scale = float(jnp.abs(differences).max())
+    np.testing.assert_allclose(forward, differences, atol=rtol * scale)
+    np.testing.assert_allclose(reverse, forward, atol=1e-12 * scale)
+    # twice, along one direction: forward over reverse, reverse over forward
+    d = jnp.cos(jnp.arange(flat.size))
+    second = jax.jit(lambda x: jax.jvp(jax.grad(f), (x,), (d,))[1])(flat)
+    other = jax.jit(jax.grad(lambda x: jax.jvp(f, (x,), (d,))[1]))(flat)
+    np.testing.assert_allclose(second, other, atol=1e-11 * float(jnp.abs(second).max()))
+    gradient = jax.jit(jax.grad(f))
+    numeric = (gradient(flat + h * d) - gradient(flat - h * d)) / (2 * h)
+    np.testing.assert_allclose(second, numeric, atol=1e-5 * float(jnp.abs(second).max()))
+
+
+def test_eager_jit_and_vmap_agree():
+    pendulum = DoublePendulum()
+    q = jnp.array([[0.4, -0.7], [1.2, 0.1], [0.0, 3.0]])
+    u = jnp.array([[0.9, 0.3], [0.0, -2.0], [1.0, 1.0]])
+    eager = jnp.stack([jk.accelerations(pendulum, 0.0, a, b) for a, b in zip(q, u, strict=True)])
+    batched = jax.jit(jax.vmap(lambda a, b: jk.accelerations(pendulum, 0.0, a, b)))(q, u)
+    np.testing.assert_allclose(batched, eager, rtol=1e-14)
+    by_name = jk.accelerations(pendulum, 0.0, {"theta1": 0.4, "theta2": -0.7}, {"theta1_dot": 0.9, "theta2_dot": 0.3})
+    np.testing.assert_array_equal(by_name, eager[0])
+
+
+def test_a_batch_of_parameters():
+    masses = jnp.array([1.0, 2.0, 5.0])
+
+    def f(mass):
+        pendulum = DoublePendulum(mass=mass, length=1.0)
+        return jk.accelerations(pendulum, 0.0, [0.4, -0.7], [0.9, 0.3], {"elbow_torque": 2.0})
+
+    np.testing.assert_allclose(jax.vmap(f)(masses), jnp.stack([f(m) for m in masses]), rtol=1e-13)
+
+
+def test_float32_stays_float32():
+    pendulum = jax.tree.map(lambda x: x.astype(jnp.float32), DoublePendulum())
+    q, u = jnp.array([0.4, -0.7], jnp.float32), jnp.array([0.9, 0.3], jnp.float32)
+    u_dot = jk.accelerations(pendulum, 0.0, q, u, {"shoulder_torque": 1.0})
+    assert u_dot.dtype == jnp.float32
+    reference = jk.accelerations(DoublePendulum(), 0.0, [0.4, -0.7], [0.9, 0.3], {"shoulder_torque": 1.0})
+    np.testing.assert_allclose(np.asarray(u_dot), np.asarray(reference), rtol=2e-5)
+    bike = jax.tree.map(lambda x: x.astype(jnp.float32), WhippleBicycle.benchmark())
+    q, u = jnp.zeros(8, jnp.float32), jnp.array([0.5, -15.0, 0.0], jnp.float32)
+    assert jk.accelerations(bike, 0.0, q, u).dtype == jnp.float32
+    assert jax.grad(lambda u: jk.accelerations(bike, 0.0, q, u).sum())(u).dtype == jnp.float32
+
+
+def test_more_than_three_dependent_speeds_and_a_long_chain_use_lapack():
+    """Systems that are not written out as scalars to the end: linear algebra goes to LAPACK, derivatives still work."""
+
+    class Chain(jk.System):
+        coordinates = tuple(f"theta{i}" for i in range(10))
+        speeds = tuple(f"omega{i}" for i in range(10))
+        length: jk.Scalar = jk.parameter(1.0)
+
+        def motion(self, t, q, u):
+            N, P = jk.inertial()
+            bodies = []
+            for i in range(10):
+                L = N.rotate(3, q[i], u[i], f"L{i}")
+                P = P.fixed(-self.length * L.y)
+                bodies.append(jk.Body(1.0, 0.0, P, name=f"bob{i}"))
+            return jk.Motion(bodies)
+
+        def loads(self, t, q, u, motion, inputs):
+            return jk.weight(motion, -9.81 * motion.N.y)
+
+    chain = Chain()
+    q, u = jnp.linspace(0.1, 1.0, 10), jnp.linspace(1.0, -1.0, 10)
+    M, f = jk.equations_of_motion(chain, 0.0, q, u)
+    # Closed form: M_rs = (n - max(r, s)) l^2 cos(q_r - q_s); the same with sin and u_s^2, and gravity.
+    n, r = 10, np.arange(10)
+    left = (n - np.maximum(r[:, None], r[None, :])).astype(float)
+    difference = np.asarray(q)[:, None] - np.asarray(q)[None, :]
+    np.testing.assert_allclose(M, left * np.cos(difference), atol=1e-13)
+    expected = -(left * np.sin(difference)) @ np.asarray(u) ** 2 - 9.81 * (n - r) * np.sin(q)
+    np.testing.assert_allclose(f, expected, atol=1e-12)
+    gradient = jax.jit(jax.grad(lambda q: jk.accelerations(chain, 0.0, q, u).sum()))(q)
+    forward = jax.jit(jax.jacfwd(lambda q: jk.accelerations(chain, 0.0, q, u).sum()))(q)
+    np.testing.assert_allclose(gradient, forward, rtol=1e-9)
