@@ -57,8 +57,8 @@ def fit(
         unstable motions need. By default a trial is one window.
     - `outputs`: channels that are functions of the `Trajectory`, by name: values (n_t,).
     - `method`: "gradient_descent" or "least_squares"; `options` go to it (`steps`, `progress`, ...).
-    - `rtol`, `atol`, `step`, `solver`, `max_steps`: of the simulation. By default one step of Bosh3 between neighbouring
-        samples where inputs are sampled at a steady rate, and Tsit5 with a tolerance of 1e-6 elsewhere.
+    - `rtol`, `atol`, `step`, `solver`, `max_steps`: of the simulation. By default one step of Bosh3 between
+        neighbouring samples where inputs are sampled at a steady rate, and Tsit5 with a tolerance of 1e-6 elsewhere.
 
     **Returns:** a `Fit`.
 

@@ -19,8 +19,8 @@ def gradient_descent(
     *,
     steps: int = 100,
     optimizer: optax.GradientTransformation | None = None,
-    learning_rate: float | optax.Schedule | None = None,
-    precondition: bool = True,
+    refresh: int | None = 10,
+    rtol: float = 1e-6,
     start: Point | None = None,
     progress: bool = False,
 ) -> Fit:
@@ -28,16 +28,17 @@ def gradient_descent(
 
         minimize over x  1/2 min over z, b of |residual(x, z, b)|^2
 
-    The unknown starts z and biases b are re-solved to first order in every step (variable projection), so the gradient
-    is that of the best fit with given parameters. The descent runs in coordinates in which the sensitivity at the start
-    is round and the way to go about one: a step has the same meaning for every parameter, however differently the
-    data know them.
+    The unknown starts z and biases b are re-solved to first order in every step (variable projection), so the
+    gradient is that of the best fit with given parameters. The descent runs in coordinates y in which the sensitivity A
+    is round, x = x0 + (A^T A)^(-1/2) y: a step means the same for every parameter, however well it is known.
 
     **Arguments:**
 
-    - `steps`: how many. `optimizer`: any optax optimizer; by default Adam with `learning_rate`.
-    - `learning_rate`: a number or an optax schedule; by default a cosine that falls from 0.1 to 0 over `steps`.
-    - `precondition`: False for the plainly scaled parameters (`Free.scale`) instead of the round coordinates.
+    - `steps`: at most. `rtol`: stop when the linearized problem promises less than this part of the cost.
+    - `optimizer`: any optax optimizer, with its schedule; by default Nesterov's descent at a rate of 0.3 that falls
+        along a cosine. The unit of y is the way that there seems to be to go, so rates about 0.1 suit Adam.
+    - `refresh`: how many steps until the coordinates are made round anew; None for the plainly scaled
+        parameters (`Free.scale`) throughout.
     - `start`: a `Point` to go on from, such as `fit.point`. `progress`: show a progress bar.
 
     A step whose simulation fails, or which multiplies the cost, is halved until it does not.
@@ -48,25 +49,31 @@ def gradient_descent(
     **Raises:** `ValueError` where a window cannot be simulated with the first guess.
     """
     point, at = settle(problem, problem.start if start is None else start)
-    if optimizer is None:
-        optimizer = optax.adam(optax.cosine_decay_schedule(0.1, steps) if learning_rate is None else learning_rate)
-    elif learning_rate is not None:
-        raise ValueError("`learning_rate` belongs to the default optimizer: give it to your own `optimizer` instead.")
-    directions, unit = _coordinates(at, precondition)  # x = x0 + directions @ y
+    descent = optimizer
+    if descent is None:
+        descent = optax.sgd(optax.cosine_decay_schedule(0.3, max(steps, 1), 0.1), momentum=0.6, nesterov=True)
 
     @jax.jit
-    def descend(gradient, memory, y):
-        updates, memory = optimizer.update(directions.T @ gradient / unit**2, memory, y)
-        return directions @ updates, y + updates, memory
+    def descend(directions, unit, gradient, memory, y):
+        updates, memory = descent.update(directions.T @ gradient / unit, memory, y)
+        return unit * directions @ updates, y + updates, memory
 
-    y = jnp.zeros(directions.shape[1], point.x.dtype)
-    memory = optimizer.init(y)
+    y = jnp.zeros_like(point.x)
+    memory = descent.init(y)
+    unit = None
     history, best, status = [at.cost], (point, at), "steps"
     bar = tqdm(total=steps, disable=not progress, desc="gradient descent")
     try:
-        for _ in range(steps):
+        for i in range(steps):
             eliminated = eliminate(at.blocks, 0.0)
-            step, y, memory = descend(_gradient(eliminated), memory, y)
+            if _is_minimum(at, eliminated, rtol):
+                status = "converged"
+                break
+            if i % (refresh or steps) == 0:
+                directions = _directions(eliminated, at.cost / problem.size[0] if refresh else None)
+            gradient = _gradient(eliminated)
+            unit = jnp.linalg.norm(directions.T @ gradient) if unit is None else unit
+            step, y, memory = descend(directions, unit, gradient, memory, y)
             after = _guarded(problem, point, at, step, eliminated)
             if after is None:
                 status = "stuck"
@@ -77,14 +84,12 @@ def gradient_descent(
                 best = point, at
             bar.update()
             bar.set_postfix(cost=f"{at.cost:.6g}")
-        point, at = settle(problem, best[0], steps=3, rtol=1e-9)
-        best = (point, at) if at.cost <= best[1].cost else best
+        settled = settle(problem, best[0], steps=3, rtol=1e-9)
+        best = settled if settled[1].cost <= best[1].cost else best
     except KeyboardInterrupt:
         status = "interrupted"
     finally:
         bar.close()
-    if status == "steps" and _is_minimum(best[1]):
-        status = "converged"
     return Fit.of(problem, *best, history, status, "gradient descent")
 
 
@@ -94,21 +99,20 @@ def _gradient(eliminated: Eliminated) -> Array:
     return A.T @ r
 
 
-def _coordinates(at: Linearization, precondition: bool) -> tuple[Array, float]:
-    """Directions (p, p) in which the sensitivity is round, and their unit: how far the minimum seems to be."""
-    eliminated = eliminate(at.blocks, 0.0)
-    A, r = eliminated.rows
-    p = A.shape[1]
-    directions = jnp.eye(p, dtype=A.dtype)
-    if precondition:
-        _, s, V = jnp.linalg.svd(A, full_matrices=False)
-        # What the data do not tell may not run away: as if every parameter were known to about its scale.
-        floor = jnp.maximum(jnp.sqrt(jnp.mean(r**2)), 1e-6 * s[0]) + jnp.finfo(s.dtype).tiny
-        directions = V.T / jnp.sqrt(s**2 + floor**2)
-        unit = float(jnp.linalg.norm(directions.T @ A.T @ r))
-        return directions * max(unit, 1e-12), max(unit, 1e-12)
-    gradient = _gradient(eliminated)
-    return directions, max(float(jnp.linalg.norm(gradient)) ** 0.5, 1e-12)
+def _directions(eliminated: Eliminated, variance: float | None) -> Array:
+    """(A^T A)^(-1/2), (p, p): symmetric, so that momentum keeps its meaning when it is made anew."""
+    A, _ = eliminated.rows
+    if variance is None:
+        return jnp.eye(A.shape[1], dtype=A.dtype) / jnp.linalg.norm(A)
+    _, s, V = jnp.linalg.svd(A, full_matrices=False)
+    # What the data do not tell may not run away: as if every parameter were known to about its scale.
+    floor = jnp.maximum(variance**0.5, 1e-6 * s[0]) + jnp.finfo(s.dtype).tiny
+    return (V.T / jnp.sqrt(s**2 + floor**2)) @ V
+
+
+def _is_minimum(at: Linearization, eliminated: Eliminated, rtol: float) -> bool:
+    """Whether the linearized problem promises to lower the cost by less than `rtol` of it."""
+    return at.cost - float(eliminated.step(1e-9)[1]) <= rtol * at.cost
 
 
 def _guarded(problem: Problem, point: Point, at: Linearization, step: Array, eliminated: Eliminated):
@@ -122,10 +126,3 @@ def _guarded(problem: Problem, point: Point, at: Linearization, step: Array, eli
         # The nuisance values' own step may be what fails.
         eliminated = eliminate(at.blocks, 1e-2)
     return None
-
-
-def _is_minimum(at: Linearization) -> bool:
-    """Whether a Gauss-Newton step promises nothing worth a hundredth of a standard error."""
-    eliminated = eliminate(at.blocks, 0.0)
-    _, promised = eliminated.step(1e-9)
-    return at.cost - float(promised) <= 1e-5 * at.cost

@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -20,8 +19,8 @@ class Direction:
     """A combination of parameters, and how well it is known.
 
     Attributes: `singular_value`: by how many standard deviations of one measurement all residuals together move for a
-    step of one along it; `deviation`: its own standard deviation, in scaled units (1 is a change by the whole scale, which
-    for a positive parameter is a factor of e); `parts`: the parameters in it with their shares; `text`: in words.
+    step of one along it; `deviation`: its own standard deviation, in scaled units (1 is a change by the whole scale,
+    for a positive parameter by a factor of e); `parts`: the parameters in it with their shares; `text`: in words.
     """
 
     singular_value: float
@@ -78,7 +77,7 @@ def identifiability(
     **Arguments:**
 
     - `problem`: a `Fit`, a `Problem`, or a system with `trials`, `free` and the other arguments of `fit`.
-    - `flat`: where undetermined begins. `at`: a point of the problem; by default its start, with the nuisance values settled.
+    - `flat`: where undetermined begins. `at`: a point of the problem; by default its start, nuisance values settled.
 
     **Returns:** an `Identifiability`; print it for a table.
     """
@@ -132,7 +131,7 @@ def look(problem: Problem, at: Linearization, flat: float = 0.5) -> Identifiabil
     )
 
 
-def _direction(names: Sequence[str], s: float, deviation: float, row: np.ndarray, silent: np.ndarray) -> Direction:
+def _direction(names: tuple[str, ...], s: float, deviation: float, row: np.ndarray, silent: np.ndarray) -> Direction:
     main = np.abs(row) > 0.1
     parts = tuple((names[i], float(row[i])) for i in np.argsort(-np.abs(row)) if main[i])
     alone = len(parts) == 1

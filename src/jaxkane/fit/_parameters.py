@@ -29,7 +29,7 @@ class Free:
     - `start`: the first guess; by default the system's value.
     - `bounds`: (lower, upper) of which either may be None; it never leaves them. By default (0, None), a logarithmic
         scale, where the parameter is declared positive, and none elsewhere.
-    - `scale`: how much is a lot, in the parameter's unit; by default the start's magnitude, or 1 where it starts at zero.
+    - `scale`: how much is a lot, in the parameter's unit; by default the start's magnitude, or 1 for zero.
     - `prior`: (mean, standard deviation) of what was measured elsewhere.
     - `name`: for tables.
     """

@@ -1,4 +1,4 @@
-"""The residuals of a fit and their exact linearization. Knows windows, parameters and `simulate`; knows no optimizer."""
+"""The residuals of a fit and their exact linearization. Knows windows, parameters, `simulate`; knows no optimizer."""
 
 from __future__ import annotations
 

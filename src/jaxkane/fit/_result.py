@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -35,7 +36,8 @@ class Fit:
     - `clustered_errors`: by name, robust to residuals that are correlated within a trial (sandwich, one cluster a
         trial); NaN with fewer trials than parameters plus two.
     - `correlation` (p, p) of the estimates, in the order of `names`.
-    - `cost`: sum of squared residuals; `history`: of the cost. `status`, `message`: how it ended, in a word and in words.
+    - `cost`: sum of squared residuals; `history`: of the cost. `status`, `message`: how it ended, in a word and in
+        words.
     - `identifiability`: singular values and directions of the sensitivity, and what the data do not tell.
     - `residuals`: by trial and channel, (simulated - measured) / sigma (n_t,), NaN in gaps; `fitted`: simulated (n_t,).
     - `nuisance`: by trial, values of the biases and of the windows' starts by name.
@@ -202,8 +204,9 @@ class Fit:
     def __str__(self) -> str:
         n_r, n_unknown = self.problem.size
         title = (
-            f"{type(self.problem.system).__name__}: {len(self.problem.trials)} trials, {len(self.problem.places)} windows, "
-            f"{n_r} residuals, {len(self.names)} parameters, {n_unknown - len(self.names)} nuisance values"
+            f"{type(self.problem.system).__name__}: {len(self.problem.trials)} trials, "
+            f"{len(self.problem.places)} windows, {n_r} residuals, {len(self.names)} parameters, "
+            f"{n_unknown - len(self.names)} nuisance values"
         )
         end = f"sum of squares {self.history[0]:.6g} -> {self.cost:.6g} by {self.method}: {STATUS[self.status]}"
         return "\n".join([title, self.table(), end, *self.notes])
@@ -230,15 +233,18 @@ def _notes(fit: Fit) -> list[str]:
     lag = _autocorrelation(fit.residuals)
     if lag > 0.3:
         notes.append(
-            f"The residuals are not noise: neighbours correlate by {lag:.2f}. The formal standard errors are too small by "
-            f"a factor of about {((1 + lag) / max(1 - lag, 0.01)) ** 0.5:.1f}; compare `clustered_errors`."
+            f"The residuals are not noise: neighbours correlate by {lag:.2f}. The formal standard errors are too "
+            f"small by a factor of about {((1 + lag) / max(1 - lag, 0.01)) ** 0.5:.1f}; compare `clustered_errors`."
         )
     problem = fit.problem
-    try:
-        window = jax.tree.map(lambda x: x[0], problem.windows)
-        check_system(fit.system, window.t[0], window.q, window.u)
-    except ValueError as error:
-        notes.append(f"Not a possible body: {error}")
+    window = jax.tree.map(lambda x: x[0], problem.windows)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            check_system(fit.system, window.t[0], window.q, window.u)
+        except ValueError as error:
+            notes.append(f"Not a possible body: {error}")
+    notes.extend(f"Not a possible body: {warning.message}" for warning in caught)
     return notes
 
 

@@ -86,16 +86,15 @@ def _cannot_start(problem: Problem, at: Linearization | None, bad: np.ndarray) -
     why = "no consistent start"
     if at is not None:
         status = int(at.status[i])
-        now = trial.t[first], np.asarray(problem.windows.q[i]), np.asarray(problem.windows.u[i])
-        why = "not finite" if status == 0 else reason(status, _event_names(problem, *now))
+        why = "not finite" if status == 0 else reason(status, _event_names(problem))
     return (
-        f"{trial.name}: from {trial.t[first]:g} to {trial.t[first + n - 1]:g} s the first guess gives no finite residuals "
-        f"({why}; {int(bad.sum())} of {len(bad)} windows). Choose shorter windows or other starting values, or leave this "
-        "stretch out."
+        f"{trial.name}: from {trial.t[first]:g} to {trial.t[first + n - 1]:g} s the first guess gives no finite "
+        f"residuals ({why}; {int(bad.sum())} of {len(bad)} windows). Choose shorter windows or other starting values, "
+        "or leave this stretch out."
     )
 
 
-def _event_names(problem: Problem, t, q, u) -> tuple[str, ...]:
+def _event_names(problem: Problem) -> tuple[str, ...]:
     rides = jax.eval_shape(lambda p: p.simulate(jax.tree.map(lambda x: x[0], p.windows), *_first(p)), problem)
     return rides.events
 

@@ -56,8 +56,8 @@ class Trial:
         self.sigma = self._sigmas(sigma)
         if not any(np.isfinite(x).any() for x in self.measured.values()):
             raise ValueError(
-                f"{self.name}: every measurement is NaN ({', '.join(self.measured)}): there is nothing to fit. Leave this "
-                "trial out."
+                f"{self.name}: every measurement is NaN ({', '.join(self.measured)}): there is nothing to fit. Leave "
+                "this trial out."
             )
 
     def _times(self, t: Any) -> np.ndarray:
@@ -71,8 +71,8 @@ class Trial:
             i = int(np.argmax(steps <= 0))
             what = "repeated" if steps[i] == 0 else "unsorted"
             raise ValueError(
-                f"{self.name}: the times are {what}: t[{i}] = {t[i]:.6g} is followed by {t[i + 1]:.6g}. Sort the samples, "
-                "and keep one of each time."
+                f"{self.name}: the times are {what}: t[{i}] = {t[i]:.6g} is followed by {t[i + 1]:.6g}. Sort the "
+                "samples, and keep one of each time."
             )
         return t
 
@@ -96,8 +96,8 @@ class Trial:
             raise ValueError(f"{self.name}: {label}[{int(np.argmax(np.isinf(array)))}] is infinite.")
         if not gaps and np.isnan(array).any():
             raise ValueError(
-                f"{self.name}: {label}[{int(np.argmax(np.isnan(array)))}] is NaN; only measured channels may have gaps. "
-                "Fill it, or cut that stretch out with `between`."
+                f"{self.name}: {label}[{int(np.argmax(np.isnan(array)))}] is NaN; only measured channels may have "
+                "gaps. Fill it, or cut that stretch out with `between`."
             )
         return array
 
@@ -133,4 +133,5 @@ class Trial:
         )
 
     def __repr__(self) -> str:
-        return f"Trial({self.name!r}, {len(self.t)} times from {self.t[0]:g} to {self.t[-1]:g} s: {', '.join(self.measured)})"
+        span = f"{len(self.t)} times from {self.t[0]:g} to {self.t[-1]:g} s"
+        return f"Trial({self.name!r}, {span}: {', '.join(self.measured)})"

@@ -1,0 +1,187 @@
+"""Fits of a double pendulum: exact derivatives, both optimizers, and what the data cannot tell."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+import jaxkane as jk
+from jaxkane.catalog import DoublePendulum
+from jaxkane.fit import Free, Gain, Problem, Trial, fit, gradient_descent, identifiability, least_squares
+from jaxkane.fit._blocks import Blocks, eliminate
+from jaxkane.fit._problem import linearize
+
+TRUTH = DoublePendulum(mass=1.2, length=0.7)
+GUESS = DoublePendulum(mass=1.0, length=0.8)
+SIGMA = {"theta1": 0.01, "theta2": 0.01}
+OPTIONS = {"unknown": ("theta1", "theta2", "theta1_dot", "theta2_dot"), "window": 0.7}
+
+
+@pytest.fixture(scope="module")
+def swings():
+    """Two swings of different length, with torques, noise, gaps and an offset in one sensor."""
+    rng = np.random.default_rng(3)
+    trials = []
+    for duration, angle in ((1.5, 0.4), (2.1, -0.7)):
+        t = np.arange(0.0, duration, 0.02)
+        inputs = {"shoulder_torque": 2.0 * np.sin(3.0 * t), "elbow_torque": np.cos(5.0 * t)}
+        start = jk.assemble(TRUTH, {"theta1": angle, "theta2": 0.3})
+        swing = jk.simulate(TRUTH, start, t, inputs)
+        measured = {name: np.asarray(swing[name]) + rng.normal(0.0, s, t.size) for name, s in SIGMA.items()}
+        measured["theta2"] += 0.05
+        measured["theta1"][10:15] = np.nan
+        trials.append(Trial(t, measured, inputs, sigma=SIGMA, name=f"{duration} s"))
+    return trials
+
+
+@pytest.fixture(scope="module")
+def problem(swings):
+    return Problem.of(GUESS, swings, ("mass", "length"), sensor_bias=("theta2",), **OPTIONS)
+
+
+def test_jacobian_against_central_differences(swings):
+    tolerance = 1e-6
+    free = (Free("mass", prior=(1.0, 0.3)), "length", Gain("elbow_torque"))
+    problem = Problem.of(
+        GUESS,
+        swings,
+        free,
+        sensor_bias={"theta2": 0.1},
+        input_bias=("shoulder_torque",),
+        rtol=1e-12,
+        atol=1e-12,
+        **OPTIONS,
+    )
+    window = jax.tree.map(lambda x: x[1], problem.windows)
+    point = problem.start
+
+    @jax.jit
+    def residuals(unknowns):
+        z, b, x = jnp.split(unknowns, (4, 6))
+        return problem.residuals(window, problem.consistent(window, z, x), z, b, x)[0]
+
+    x = 0.05 * jnp.arange(1.0, 10.0)
+    exact = jax.jacfwd(residuals)(x)
+    h = 1e-5
+    differences = jnp.stack([(residuals(x + h * e) - residuals(x - h * e)) / (2 * h) for e in jnp.eye(9)], axis=1)
+    scale = jnp.max(jnp.abs(exact), axis=0, keepdims=True)
+    assert float(jnp.max(jnp.abs(exact - differences) / scale)) < tolerance
+
+    # The triangle that `linearize` keeps of it has the same J^T J and J^T r, priors included.
+    def at(x):
+        z = jnp.zeros_like(point.z).at[1].set(x[:4])
+        b = jnp.zeros_like(point.b).at[0].set(x[4:6])
+        return eqx.tree_at(lambda p: (p.z, p.b, p.x), point, (z, b, x[6:]))
+
+    R = linearize(problem, at(x)).blocks.R[1]
+    A = jnp.column_stack([exact, residuals(x)])
+    np.testing.assert_allclose(R.T @ R, A.T @ A, rtol=1e-8, atol=1e-8 * float(jnp.max(A.T @ A)))
+
+
+def test_elimination_is_the_dense_solution():
+    tolerance = 1e-9
+    rng = np.random.default_rng(0)
+    W, n_z, n_b, n_x = 5, 3, 2, 2
+    trial = jnp.array([0, 0, 1, 1, 1])
+    windows = jnp.array([[0, 1, W], [2, 3, 4]])
+    k = n_z + n_b + n_x + 1
+    A = rng.normal(size=(W, 20, k))
+    blocks = Blocks(jnp.linalg.qr(jnp.asarray(A), mode="r"), trial, windows, n_z, n_b)
+    eliminated = eliminate(blocks, 0.0)
+    x, least = eliminated.step(1e-14)
+    z, b = eliminated.others(x)
+    dense = np.zeros((W * 20, W * n_z + 2 * n_b + n_x))
+    for w in range(W):
+        rows = slice(20 * w, 20 * w + 20)
+        dense[rows, n_z * w : n_z * w + n_z] = A[w, :, :n_z]
+        place = W * n_z + n_b * int(trial[w])
+        dense[rows, place : place + n_b] = A[w, :, n_z : n_z + n_b]
+        dense[rows, -n_x:] = A[w, :, n_z + n_b : -1]
+    r = A[:, :, -1].ravel()
+    solution = np.linalg.lstsq(dense, -r, rcond=None)[0]
+    np.testing.assert_allclose(np.concatenate([z.ravel(), b.ravel(), x]), solution, rtol=tolerance, atol=tolerance)
+    np.testing.assert_allclose(least, np.sum((dense @ solution + r) ** 2), rtol=tolerance)
+
+
+def check(result):
+    assert result.ok, result.message
+    n, unknown = result.problem.size
+    assert result.cost == pytest.approx(n - unknown, rel=0.2)
+    for name in ("mass", "length"):
+        error = result.estimates[name] - float(getattr(TRUTH, name))
+        assert abs(error) < 3.0 * result.standard_errors[name] < 0.1
+    for trial in result.trial_names:
+        assert result.nuisance[trial]["bias of theta2"] == pytest.approx(0.05, abs=0.01)
+        assert np.isnan(result.residuals[trial]["theta1"]).sum() == 5
+    assert "mass" in result.table(TRUTH)
+
+
+def test_least_squares(problem):
+    check(least_squares(problem))
+
+
+def test_gradient_descent(problem):
+    result = gradient_descent(problem)
+    check(result)
+    assert len(result.history) < 60
+    assert result.history[-1] < 0.1 * result.history[0]
+
+
+def test_any_optax_optimizer(problem):
+    check(gradient_descent(problem, optimizer=optax.adam(optax.cosine_decay_schedule(0.2, 100)), rtol=1e-4))
+
+
+def test_plain_coordinates_go_down(problem):
+    result = gradient_descent(problem, refresh=None, steps=5)
+    assert result.status == "steps"
+    assert result.cost < result.history[0]
+
+
+def test_an_interrupted_fit_keeps_the_best(problem, monkeypatch):
+    import jaxkane.fit._gradient_descent as module
+
+    calls = []
+
+    def interrupted(*arguments):
+        calls.append(1)
+        if len(calls) > 4:
+            raise KeyboardInterrupt
+        return linearize(*arguments)
+
+    monkeypatch.setattr(module, "linearize", interrupted)
+    result = gradient_descent(problem)
+    assert result.status == "interrupted"
+    assert "best so far" in result.message
+    assert len(result.history) == 5
+    assert result.cost == min(result.history) < result.history[0]
+
+
+def test_steps_into_nowhere_are_halved(problem):
+    leap = optax.sgd(1e6)
+    result = gradient_descent(problem, optimizer=leap, steps=2)
+    assert np.all(np.isfinite(result.history))
+    assert np.isfinite(result.cost)
+
+
+def test_a_parameter_without_influence_is_named(swings):
+    # Without inputs only the ratio of gravity and length matters, and the mass not at all.
+    quiet = [Trial(s.t, s.measured, sigma=SIGMA, name=s.name) for s in swings]
+    seen = identifiability(GUESS, quiet, ("mass", "length", "gravity"), **OPTIONS)
+    assert not seen.ok
+    assert seen.without_influence == ("mass",)
+    assert any("mass has no influence" in text for text in seen.messages)
+    assert any("length, gravity trade off" in t or "gravity, length trade off" in t for t in seen.messages)
+    assert seen.singular_values[-1] == 0.0
+    result = fit(GUESS, quiet, ("mass", "length"), method="least_squares", **OPTIONS)
+    assert not result.ok
+    assert result.estimates["mass"] == 1.0
+    assert np.isinf(result.standard_errors["mass"])
+    assert np.isfinite(result.standard_errors["length"])
+    assert "mass has no influence" in result.message
+
+
+def test_a_start_that_cannot_be_simulated_is_named(swings):
+    with pytest.raises(ValueError, match=r"1\.5 s: from 0 to 0\.68 s the first guess gives no finite residuals"):
+        fit(GUESS, swings, "mass", max_steps=1, **OPTIONS)

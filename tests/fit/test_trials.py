@@ -1,0 +1,122 @@
+"""Bad input to trials, files and problems: one clear error each, which names the place."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxkane.catalog import DoublePendulum
+from jaxkane.fit import Free, Gain, Problem, Trial, read_trials
+
+t = np.linspace(0.0, 1.0, 11)
+good = np.sin(t)
+
+
+def trial(**changes):
+    arguments = {"t": t, "measured": {"theta1": good}, "sigma": 0.1, "name": "swing 3"} | changes
+    return Trial(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"measured": {"theta1": good[:-1]}}, r"swing 3: measured\['theta1'\] has the shape \(10,\)"),
+        ({"t": t[:, None]}, r"swing 3: `t` must be at least two times"),
+        ({"t": t[::-1]}, "swing 3: the times are unsorted: t.0. = 1 "),
+        ({"t": np.where(t == t[3], t[2], t)}, "swing 3: the times are repeated"),
+        ({"t": np.where(t == t[3], np.nan, t)}, r"swing 3: t\[3\] is not finite"),
+        ({"measured": {"theta1": ["a"] * 11}}, r"swing 3: measured\['theta1'\] must be real numbers"),
+        ({"measured": {"theta1": good + 1j}}, r"swing 3: measured\['theta1'\] must be real numbers"),
+        ({"measured": {"theta1": np.where(t > 0.5, np.inf, good)}}, r"swing 3: measured\['theta1'\]\[6\] is infinite"),
+        ({"measured": {"theta1": np.full(11, np.nan)}}, "swing 3: every measurement is NaN"),
+        ({"measured": {}}, "swing 3: `measured` is a dict of channels"),
+        ({"inputs": {"torque1": np.full(11, np.nan)}}, r"swing 3: inputs\['torque1'\]\[0\] is NaN"),
+        ({"sigma": {"theta2": 0.1}}, "swing 3: `sigma` lacks theta1"),
+        ({"sigma": 0.0}, r"swing 3: sigma\['theta1'\] must be positive"),
+    ],
+)
+def test_a_bad_trial_is_named(changes, message):
+    with pytest.raises(ValueError, match=message):
+        trial(**changes)
+
+
+def test_a_stretch():
+    cut = trial(inputs={"torque1": 2.0}).between(0.25, 0.55)
+    np.testing.assert_allclose(cut.t, [0.3, 0.4, 0.5])
+    assert cut.inputs["torque1"].shape == (3,)
+    with pytest.raises(ValueError, match="swing 3: fewer than two samples between 5 and 6 s"):
+        trial().between(5.0, 6.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t,angle\n0,1\n0.1,x\n", r"line 3, column angle: 'x' is not a number"),
+        ("t,corner\n0,1\n", "no column angle; there are t, corner"),
+        ("t,angle\n0,1\n0.1\n", "line 3: 1 cells, the header has 2"),
+        ("t,angle\n", "there is no line of data"),
+        ("", "no column t, angle"),
+        ("t,angle\n0,1\n0,2\n", "the times are repeated"),
+    ],
+)
+def test_a_bad_file_is_named_with_its_line(tmp_path, text, message):
+    path = tmp_path / "swings.csv"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        read_trials(path, {"theta1": "angle"}, sigma=0.1)
+
+
+def test_reading_trials_with_gaps(tmp_path):
+    path = tmp_path / "swings.csv"
+    path.write_text("run,t,angle,T\na,0,1,0\na,0.1,,1\nb,0,nan,2\nb,0.1,4,3\nb,0.2,5,4\n")
+    a, b = read_trials(path, {"theta1": "angle"}, sigma=0.1, inputs={"torque1": "T"}, by="run")
+    assert (a.name, b.name) == ("swings, run a", "swings, run b")
+    np.testing.assert_array_equal(a.measured["theta1"], [1.0, np.nan])
+    np.testing.assert_array_equal(b.inputs["torque1"], [2.0, 3.0, 4.0])
+
+
+pendulum = DoublePendulum(mass=1.0, length=0.5)
+
+
+@pytest.mark.parametrize(
+    ("trials", "free", "options", "message"),
+    [
+        ([trial(measured={"roll": good})], "mass", {}, "swing 3: DoublePendulum has no channel roll"),
+        ([trial(inputs={"wind": 1.0})], "mass", {}, "swing 3: DoublePendulum has no input wind"),
+        ([trial(initial={"wind": 1.0})], "mass", {}, "has no coordinate or independent speed wind"),
+        ([], "mass", {}, "There is no trial"),
+        ([trial()], "weight", {}, "DoublePendulum has no parameter 'weight'; it has mass"),
+        ([trial()], (), {}, "`free` names no parameter"),
+        ([trial()], ("mass", lambda s: s.mass), {}, "names mass twice"),
+        ([trial()], Free("mass", bounds=(2.0, 3.0)), {}, "mass starts at 1, which is not inside its bounds"),
+        ([trial()], Free("mass", prior=(1.0, 0.0)), {}, "mass: a prior is"),
+        ([trial()], Gain("wind"), {}, "has no input 'wind'"),
+        ([trial()], "mass", {"unknown": ("roll",)}, "`unknown` names roll"),
+        ([trial()], "mass", {"sensor_bias": ("theta2",)}, "`sensor_bias` names theta2"),
+        ([trial()], "mass", {"unknown": {"theta1": 0.0}}, "the standard deviation of theta1 must be positive"),
+        ([trial()], "mass", {"window": 0.0}, "`window` is a length of time"),
+    ],
+)
+def test_a_bad_problem_is_named(trials, free, options, message):
+    with pytest.raises(ValueError, match=message):
+        Problem.of(pendulum, trials, free, **options)
+
+
+def test_parameters_by_name_path_and_leaf():
+    free = ("mass", lambda s: s.length, Free("gravity", bounds=(9.0, 10.0), start=9.5))
+    parameters = Problem.of(pendulum, trial(), free).parameters
+    assert parameters.names == ("mass", "length", "gravity")
+    x = jnp.array([0.0, 0.0, 0.0])
+    np.testing.assert_allclose(parameters.values(x), [1.0, 0.5, 9.5], rtol=1e-14)
+    far = parameters.values(jnp.array([-20.0, 30.0, 50.0]))
+    assert far[0] > 0
+    assert far[2] <= 10.0
+    system, gains = parameters.apply(pendulum, jnp.array([1.0, 0.0, 0.0]))
+    assert float(system.mass) == pytest.approx(np.e)
+    assert not gains
+
+
+def test_windows_cover_every_sample_once():
+    problem = Problem.of(pendulum, [trial(), trial(t=2 * t)], "mass", window=0.4)
+    assert problem.places == ((0, 0, 4), (0, 4, 7), (1, 0, 2), (1, 2, 2), (1, 4, 2), (1, 6, 2), (1, 8, 3))
+    assert int(jnp.sum(problem.windows.weight > 0)) == 22
+    assert bool(jnp.all(jnp.diff(problem.windows.t_input, axis=1) > 0))
