@@ -45,7 +45,8 @@ def jvp(f: Callable[..., Any], primals: Sequence[Component], tangents: Sequence[
         constants[:] = [x if is_exact(x) else None for x in leaves]
         return [x for x in leaves if not is_exact(x)]
 
-    xs = [jnp.asarray(primals[i]) for i in moving]
+    arrays = [x for x in (*primals, *tangents) if not is_exact(x)]
+    xs = [jnp.asarray(primals[i], dtype=jnp.result_type(*arrays)) for i in moving]
     dxs = [jnp.asarray(tangents[i], dtype=x.dtype) for i, x in zip(moving, xs, strict=True)]
     if moving:
         values, derivatives = jax.jvp(arrays_only, xs, dxs)
@@ -56,11 +57,6 @@ def jvp(f: Callable[..., Any], primals: Sequence[Component], tangents: Sequence[
     f_x = [next(values) if c is None else c for c in constants]
     f_dx = [next(derivatives) if c is None else 0.0 for c in constants]
     return jax.tree.unflatten(treedef, f_x), jax.tree.unflatten(treedef, f_dx)
-
-
-def along_speeds(f: Callable[[Row], Any], direction: Row) -> Any:
-    """The derivative of `f(u)` along a direction of speeds, at u = 0: all of it, since f is affine in the speeds."""
-    return jvp(lambda s: f(tuple(mul(s, x) for x in direction)), (0.0,), (1.0,))[1]
 
 
 def _unit(n: int, r: int) -> Row:
@@ -104,6 +100,11 @@ class Instant:
     def loads(self, motion: Motion) -> tuple[Load, ...]:
         return flatten_loads(self.system.loads(self.t, self.q, self.u_all, motion, self.inputs))
 
+    def along_speeds(self, f: Callable[[Row], Any], direction: Row) -> Any:
+        """The derivative of `f(u)` along a direction of speeds, at u = 0: all of it, since f is affine in the speeds."""
+        zero = jnp.zeros((), jnp.result_type(*([x for x in (*self.q, *self.u) if not is_exact(x)] or [float])))
+        return jvp(lambda s: f(tuple(mul(s, x) for x in direction)), (zero,), (jnp.ones_like(zero),))[1]
+
     def configuration(self, t: Component, q: Row) -> Row:
         residuals = self.system.configuration_constraints(t, q)
         return tuple(component(h) for h in residuals)
@@ -128,7 +129,7 @@ class Instant:
         # c = C_ind u + C_dep u_dep + c0
         n, k = self.n, self.k
         c0 = self.residuals(self.t, self.q, (0.0,) * (n + k))
-        along = [along_speeds(lambda u: self.residuals(self.t, self.q, u), _unit(n + k, r)) for r in range(n + k)]
+        along = [self.along_speeds(lambda u: self.residuals(self.t, self.q, u), _unit(n + k, r)) for r in range(n + k)]
         rows = tuple(zip(*along, strict=True))
         return [row[:n] for row in rows], [row[n:] for row in rows], c0
 
@@ -137,12 +138,13 @@ class Instant:
     def partials(self) -> list[tuple[list, list]]:
         """For each independent speed: the partial velocities (V, W) of the bodies, and those of the loads."""
 
-        def velocities(u):
-            motion = self.motion(self.t, self.q, u)
-            bodies = [(b.center.velocity.components, b.angular_velocity.components_in(b.frame)) for b in motion.bodies]
-            return bodies, [load.velocity.components for load in self.loads(motion)]
+        return [self.along_speeds(self.velocities, (*_unit(self.n, r), *self.J[r])) for r in range(self.n)]
 
-        return [along_speeds(velocities, (*_unit(self.n, r), *self.J[r])) for r in range(self.n)]
+    def velocities(self, u: Row) -> tuple[list, list]:
+        """Velocities (v, omega) of the bodies, and those that the loads act on, at speeds `u`."""
+        motion = self.motion(self.t, self.q, u)
+        bodies = [(b.center.velocity.components, b.angular_velocity.components_in(b.frame)) for b in motion.bodies]
+        return bodies, [load.velocity.components for load in self.loads(motion)]
 
     def bias(self) -> Row:
         """u_dep_dot at u_dot = 0: the residual is differentiated, never the solution of the solve.
@@ -154,8 +156,11 @@ class Instant:
         _, c_dot = jvp(lambda t, *q: self.residuals(t, q, self.u_all), (self.t, *self.q), (1.0, *self.q_dot))
         return _negative(solve(self.C_dep, c_dot)[0])
 
-    def momentum_rates(self, motion: Motion) -> list[tuple[Row, Row]]:
-        """dp/dt and dH/dt of every body in the inertial frame, at u_dot = 0; each in the frame where it stands."""
+    def momentum_rates(self, motion: Motion, u_dot: Row | None = None) -> list[tuple[Row, Row]]:
+        """dp/dt and dH/dt of every body in the inertial frame; each in the frame where it stands.
+
+        `u_dot` (n + k,) of the independent and the dependent speeds; by default u_dot = 0 and `bias`.
+        """
 
         def momenta(t, *q):
             return [_momenta(body) for body in self.motion(t, q, self.u_all).bodies]
@@ -164,7 +169,9 @@ class Instant:
             return [_momenta(body) for body in self.motion(self.t, self.q, u).bodies]
 
         now, drift = jvp(momenta, (self.t, *self.q), (1.0, *self.q_dot))
-        turning = along_speeds(momenta_of, (*(0.0,) * self.n, *self.bias())) if self.k else None
+        if u_dot is None and self.k:
+            u_dot = (*(0.0,) * self.n, *self.bias())
+        turning = None if u_dot is None else self.along_speeds(momenta_of, u_dot)
         rates = []
         for i, body in enumerate(motion.bodies):
             # dx/dt in N = derivative of the components + omega x
