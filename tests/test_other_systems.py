@@ -121,7 +121,8 @@ class FourBarLinkage(jk.System):
 
     def motion(self, t, q, u):
         N, O = jk.inertial()
-        frame, joint = N, O.fixed(self.l1 * N.x)
+        pin = O.fixed(self.l1 * N.x)
+        frame, joint = N, pin
         links = []
         for l, angle, rate in zip((self.l2, self.l3, self.l4), q, u, strict=True):
             frame = frame.rotate(3, angle, rate)
@@ -129,7 +130,7 @@ class FourBarLinkage(jk.System):
             I = m * l**2 / 12
             links.append(jk.Body(m, (0.0, I, I), joint.fixed(0.5 * l * frame.x), frame))
             joint = joint.fixed(l * frame.x)
-        return jk.Motion(links, points={"end": joint})
+        return jk.Motion(links, points={"pin": pin, "end": joint})
 
 
 class CartesianPendulum(jk.System):

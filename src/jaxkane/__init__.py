@@ -17,6 +17,8 @@ from ._equations import generalized_inertia_forces as generalized_inertia_forces
 from ._equations import kinetic_energy as kinetic_energy
 from ._equations import mass_matrix as mass_matrix
 from ._equations import partial_velocities as partial_velocities
+from ._reactions import constraint_forces as constraint_forces
+from ._reactions import constraint_multipliers as constraint_multipliers
 from ._signals import Samples as Samples
 from ._simulate import Status as Status
 from ._simulate import Trajectory as Trajectory

@@ -187,7 +187,7 @@ class Motion:
     - `points`, `frames`: those that `loads`, pictures or a user need, by name: `motion["P"]`.
     """
 
-    __slots__ = ("N", "bodies", "constraints", "frames", "points")
+    __slots__ = ("N", "bodies", "constraints", "frames", "points", "vanishing")
 
     def __init__(
         self,
@@ -201,7 +201,8 @@ class Motion:
         if not self.bodies:
             raise ValueError("A Motion needs at least one Body.")
         residuals: list[Component] = []
-        for c in constraints:
+        self.vanishing = tuple(constraints)  # the residuals as they were given
+        for c in self.vanishing:
             residuals.extend(c.components if isinstance(c, Vector) else [component(c)])
         self.constraints = tuple(residuals)
         self.points = dict(points or {})

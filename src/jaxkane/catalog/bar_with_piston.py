@@ -24,6 +24,8 @@ class BarWithPiston(System):
     - Coordinate `theta`: of the bar from the vertical: x_B = l sin(theta), y_A = l cos(theta) [rad].
     - Speed: its rate [rad/s].
     - Input `force` (F): downward on the piston [N].
+    - Auxiliary speeds `piston_guide` (A along N.x) and `slider_guide` (B along N.y) [m/s]: their forces are the
+      walls' on piston and slider [N] (`constraint_forces`).
     """
 
     mass: Scalar = parameter(1.0, positive=True)  # [kg]
@@ -35,6 +37,7 @@ class BarWithPiston(System):
 
     coordinates = ("theta",)
     speeds = ("theta_dot",)
+    auxiliary_speeds = ("piston_guide", "slider_guide")
     inputs = ("force",)
 
     def motion(self, t, q, u):
@@ -42,7 +45,8 @@ class BarWithPiston(System):
         theta, theta_dot = q["theta"], u["theta_dot"]
         N, O = inertial()
         L = N.rotate(3, theta, theta_dot, "L")
-        A = O.moving(l * jnp.cos(theta) * N.y, -l * jnp.sin(theta) * theta_dot * N.y, name="A")
+        v_A = N.vector(u["piston_guide"], u["slider_guide"], 0.0) - l * jnp.sin(theta) * theta_dot * N.y
+        A = O.moving(l * jnp.cos(theta) * N.y, v_A, name="A")
         B = A.fixed(-l * L.y)  # from A the bar runs along -L.y
         G = A.fixed(-0.5 * l * L.y)
         I = m * l**2 / 12

@@ -153,7 +153,7 @@ class WhippleBicycle(System):
 
         P = O.fixed(x * N.x + y * N.y, N)  # the ground under the rear wheel, at rest
         r_P_A = -self.rR * R.z
-        G_A = Point(omega_A.cross(r_P_A), P, r_P_A)
+        G_A = Point(P.velocity + omega_A.cross(r_P_A), P, r_P_A)
         G_B = G_A.fixed(self.xB * B.x + (self.zB + self.rR) * B.z)
         S = G_A.fixed(xS * B.x - zS * B.z)
         G_C = S.fixed(from_S(self.xH, self.zH))

@@ -1,0 +1,197 @@
+"""Constraint forces, by auxiliary speeds that nobody has to write down. Knows the method; knows no mechanism.
+
+An auxiliary speed is zero in the motion and gives a point or a frame a velocity that it does not have. Its Kane
+equation holds one unknown more, the force there (Kamman, Unit 5, Example 7, note on constraint forces; Kane and
+Levinson, "Dynamics", section 4.9). With R_r = F_r + F*_r at the accelerations of the motion, without elimination of the
+dependent speeds, and the residuals c = C_ind u + C_dep u_dep + C_aux u_aux + c0:
+
+    R_dep + C_dep^T lambda = 0                  multipliers of the residuals
+    R_aux + C_aux^T lambda + Q = 0              the force (moment) Q that holds the auxiliary speed at zero
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from ._components import add, dot, mul
+from ._equations import InputValues, _arrays
+from ._fuse import fused
+from ._kane import Instant, Row
+from ._linear import solve, stack
+from ._simulate import Trajectory
+from ._system import Motion, System
+from ._types import Component, Triple
+from ._vectors import Frame, Point, virtual
+
+
+def constraint_forces(
+    system: System, t: Any, q: Any = None, u: Any = None, inputs: InputValues = None
+) -> dict[str, Float[Array, "*n_t 3"]]:
+    """The forces and moments that constraints carry, by name: `constraint_forces(system, t, q, u)["A"]`.
+
+    The names are those of `Motion(points=..., frames=...)` and of the auxiliary speeds.
+
+    - A point from which bodies are built (a joint): the force [N] on all that is built from it, by what it is built on.
+        Forces from `loads` and forces of other constraint residuals are not in it. A body whose mass centre is the
+        point belongs to what is built from it.
+    - A point whose velocity is a residual, or from which no body is built (a contact, the end of a closed loop): the
+        force [N] of the constraints on the mechanism there.
+    - A frame: the moment [N m] on all that turns with it, about the points from which that is built; torques from
+        `loads` are not in it. In the directions of the frame's speeds it is zero.
+    - An auxiliary speed: the force [N] or moment [N m] along it on the mechanism, a number.
+
+    **Arguments:** as `accelerations`: `t` [s], `q` (n_q,), `u` (n_u,), `inputs` numbers by name. Or a `Trajectory` in
+    the place of `t`, for all of its times: `constraint_forces(system, trajectory)`.
+
+    **Returns:** a dict: components in N, (3,) at one time and (n_t, 3) along a trajectory.
+
+    **Raises:** `ValueError` as `accelerations`; `TypeError` for a trajectory together with `q`, `u` or `inputs`.
+    """
+    return _along(_forces, system, t, q, u, inputs)
+
+
+def constraint_multipliers(
+    system: System, t: Any, q: Any = None, u: Any = None, inputs: InputValues = None
+) -> Float[Array, "*n_t k"]:
+    """The multipliers (k,) of the velocity residuals: the force [N] or moment [N m] along each residual.
+
+        R_dep + C_dep^T lambda = 0
+
+    In the order of the residuals: those of `Motion.constraints`, then the rates of the configuration constraints, where
+    these were added. A residual that was given as a Vector counts as three, along the axes of the frame it is kept in.
+    Arguments as `constraint_forces`.
+    """
+    return _along(_multipliers, system, t, q, u, inputs)
+
+
+def _along(forces: Any, system: System, t: Any, q: Any, u: Any, inputs: InputValues) -> Any:
+    if not isinstance(t, Trajectory):
+        return forces(*_arrays(system, t, q, u, inputs))
+    if not (q is None and u is None and inputs is None):
+        raise TypeError("A Trajectory holds coordinates, speeds and inputs already: constraint_forces(system, ride).")
+    for _ in range(t.t.ndim - 1):
+        forces = jax.vmap(forces, in_axes=(None, 0, 0, 0, 0))
+    return jax.vmap(forces, in_axes=(None, 0, 0, 0, 0))(system, t.t, t.q, t.u, t.inputs)
+
+
+@fused
+def _multipliers(system, t, q, u, inputs):
+    multipliers = _Reactions(system, t, q, u, inputs).multipliers
+    return stack([multipliers])[0].astype(q.dtype)
+
+
+@fused
+def _forces(system, t, q, u, inputs):
+    now = _Reactions(system, t, q, u, inputs)
+    vectors = {name: stack([row])[0].astype(q.dtype) for name, row in now.forces_of_parts()}
+    return vectors | {name: jnp.asarray(x, dtype=q.dtype) for name, x in now.forces_of_auxiliary_speeds()}
+
+
+class _Forces(NamedTuple):
+    """Along N.x, N.y, N.z."""
+
+    transmitted: Row  # on what is built from a point or a frame
+    of_residuals: Row  # of the constraint residuals that see it move
+
+
+class _Reactions(Instant):
+    """An instant of the motion, with its accelerations and the multipliers of its residuals."""
+
+    def __init__(self, system: System, t: Any, q: Any, u: Any, inputs: InputValues = None):
+        super().__init__(system, t, q, u, inputs)
+        self.description: Motion = self.motion(self.t, self.q, self.u_all)
+        u_dot = self.accelerations()
+        u_dep_dot = [add(dot(row, u_dot), b) for row, b in zip(zip(*self.J, strict=True), self.bias(), strict=True)]
+        self.momentum = self.momentum_rates(self.description, (*u_dot, *u_dep_dot))
+        self.load_vectors = [load.vector.components_in(load.velocity.frame) for load in self.loads(self.description)]
+        # R_dep + C_dep^T lambda = 0
+        units = [_unit(self.n + self.k, self.n + r) for r in range(self.k)]
+        R = [mul(-1.0, self.unbalanced(self.along_speeds(self.velocities, unit))) for unit in units]
+        self.multipliers: Row = solve(tuple(zip(*self.C_dep, strict=True)), R)[0] if self.k else ()
+
+    def unbalanced(self, partial: Any) -> Component:
+        """R = sum F . V + T . W - V . dp/dt - W . dH/dt along one direction."""
+        bodies, columns = partial
+        total: Component = 0.0
+        for V, F in zip(columns, self.load_vectors, strict=True):
+            total = add(total, dot(V, F))
+        for (V, W), (p_dot, H_dot) in zip(bodies, self.momentum, strict=True):
+            total = add(total, mul(-1.0, add(dot(V, p_dot), dot(W, H_dot))))
+        return total
+
+    def forces_of_parts(self) -> Iterator[tuple[str, Row]]:
+        """Forces at the named points, moments at the named frames."""
+        for name, point in self.description.points.items():
+            if self.is_cut(point):
+                yield name, self.along_axes(point).transmitted
+            elif self.k:
+                yield name, self.along_axes(point).of_residuals
+        for name, frame in self.description.frames.items():
+            if frame.parent is not None:
+                yield name, self.along_axes(frame).transmitted
+
+    def forces_of_auxiliary_speeds(self) -> Iterator[tuple[str, Component]]:
+        names = self.system.auxiliary_speeds
+        for i, name in enumerate(names):
+            unit = _unit(self.n + self.k + len(names), self.n + self.k + i)
+            C_aux = self.along_speeds(lambda u: self.residuals(self.t, self.q, u), unit)
+            # R_aux + C_aux^T lambda + Q = 0
+            R = self.unbalanced(self.along_speeds(self.velocities, unit))
+            yield name, mul(-1.0, add(R, dot(C_aux, self.multipliers)))
+
+    def along_axes(self, part: Point | Frame) -> _Forces:
+        """Three auxiliary speeds of a point or a frame, along N.x, N.y and N.z."""
+        of_residuals, transmitted = [], []
+        still = (0.0,) * (self.n + self.k)
+        for axis in range(3):
+            Q = dot(self._virtual_residuals(part, axis), self.multipliers)
+            partial = self._along_virtual(part, axis, lambda: self.velocities(still))
+            of_residuals.append(Q)
+            transmitted.append(mul(-1.0, add(self.unbalanced(partial), Q)))
+        return _Forces(tuple(transmitted), tuple(of_residuals))
+
+    def _virtual_residuals(self, part: Point | Frame, axis: int) -> Row:
+        """C_aux: how the residuals change with a virtual velocity; constraints of the configuration, with a
+        displacement."""
+        if not self.k:
+            return ()
+        still = (0.0,) * (self.n + self.k)
+        rows = self._along_virtual(part, axis, lambda: self.motion(self.t, self.q, still).constraints)
+        if len(rows) < self.k:
+            configuration = lambda: self.configuration(self.t, self.q)  # noqa: E731
+            rows = (*rows, *self._along_virtual(part, axis, configuration, displace=True))
+        return rows
+
+    def _along_virtual(self, part: Point | Frame, axis: int, read: Callable[[], Any], displace: bool = False) -> Any:
+        """The derivative of what `read` reads, along a virtual velocity (or displacement) of a point or a frame."""
+
+        def reading(row: Row) -> Any:
+            moving: Triple = tuple(row[0] if i == axis else 0.0 for i in range(3))  # type: ignore[assignment]
+            with virtual(part, displacement=moving) if displace else virtual(part, velocity=moving):
+                return read()
+
+        return self.along_speeds(reading, (1.0,))
+
+    def is_cut(self, point: Point) -> bool:
+        """Whether bodies are built from a point, which is not itself held by a residual."""
+        if any(point.velocity is residual for residual in self.description.vanishing):
+            return False
+        chains = [_chain(body.center) for body in self.description.bodies]
+        return any(point in chain for chain in chains)
+
+
+def _chain(point: Point | None) -> list[Point]:
+    chain = []
+    while point is not None:
+        chain.append(point)
+        point = point._base
+    return chain
+
+
+def _unit(n: int, r: int) -> Row:
+    return tuple(1.0 if i == r else 0.0 for i in range(n))
