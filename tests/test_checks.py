@@ -1,0 +1,254 @@
+"""Wrong descriptions and bad numbers: each is caught with an error that names what is wrong."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane.catalog import DoublePendulum, RigidBody, WhippleBicycle
+
+
+class Slider(jk.System):
+    """A right description, from which the wrong ones differ in one line."""
+
+    mass: jk.Scalar = jk.parameter(1.0)
+    inertia: jk.Scalar = jk.parameter(0.1)
+    coordinates = ("x", "angle")
+    speeds = ("x_dot", "angle_dot")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(q["x"] * N.x, u["x_dot"] * N.x)
+        B = N.rotate(3, q["angle"], u["angle_dot"], "B")
+        G = P.fixed(0.5 * B.x)
+        return jk.Motion([jk.Body(self.mass, (self.inertia,) * 3, G, B, name="rod")])
+
+
+STATE = ([0.1, 0.2], [0.3, 0.4])
+
+
+def evaluate(system, q=STATE[0], u=STATE[1]):
+    return jk.accelerations(system, 0.0, q, u)
+
+
+def test_the_right_one_passes():
+    assert np.isfinite(evaluate(Slider())).all()
+
+
+def test_no_motion():
+    class Empty(jk.System):
+        coordinates = speeds = ("x",)
+
+    with pytest.raises(NotImplementedError, match="Empty must define motion"):
+        evaluate(Empty(), [0.0], [0.0])
+
+
+def test_speeds_that_are_not_the_rates_of_the_coordinates():
+    class TooFewSpeeds(Slider):
+        speeds = ("x_dot",)
+
+        def motion(self, t, q, u):
+            return super().motion(t, q, (u[0], 0.0))
+
+    with pytest.raises(ValueError, match=r"TooFewSpeeds has 2 coordinates and 1 speeds.*define q_dot"):
+        evaluate(TooFewSpeeds(), u=[0.3])
+
+
+def test_wrong_number_of_dependent_speeds():
+    class TwoResiduals(Slider):
+        dependent_speeds = ("angle_dot",)
+        speeds = ("x_dot",)
+
+        def motion(self, t, q, u):
+            motion = super().motion(t, q, u)
+            return jk.Motion(motion.bodies, [u["x_dot"] - u["angle_dot"], u["angle_dot"] + u["x_dot"]])
+
+    with pytest.raises(
+        ValueError, match=r"1 dependent speeds are named \(angle_dot\), but there are 2 velocity residuals"
+    ):
+        evaluate(TwoResiduals(), u=[0.3])
+
+    class Unnamed(Slider):
+        def motion(self, t, q, u):
+            return jk.Motion(super().motion(t, q, u).bodies, [u["x_dot"] - u["angle_dot"]])
+
+    with pytest.raises(ValueError, match=r"0 dependent speeds are named \(none\)"):
+        evaluate(Unnamed())
+
+
+@pytest.mark.parametrize(
+    ("residual", "message"),
+    [
+        (lambda u: u["x_dot"] - u["angle_dot"] ** 2, "the velocity residual 0 is not affine in angle_dot"),
+        (lambda u: u["angle_dot"] + u["x_dot"] * u["angle_dot"], "products of two speeds"),
+    ],
+)
+def test_residuals_that_are_not_affine(residual, message):
+    class NotAffine(Slider):
+        dependent_speeds = ("angle_dot",)
+        speeds = ("x_dot",)
+
+        def motion(self, t, q, u):
+            return jk.Motion(super().motion(t, q, u).bodies, [residual(u)])
+
+    with pytest.raises(ValueError, match=message):
+        evaluate(NotAffine(), u=[0.3])
+
+
+def test_a_velocity_that_is_not_affine():
+    class Squared(Slider):
+        def motion(self, t, q, u):
+            N, O = jk.inertial()
+            return jk.Motion([jk.Body(1.0, 0.0, jk.Point.at(u[0] * u[0] * N.x + u[1] * N.y), name="rod")])
+
+    with pytest.raises(ValueError, match="the velocity of 'rod' is not affine in x_dot"):
+        evaluate(Squared())
+
+
+def test_a_rate_that_contradicts_the_coordinates():
+    class WrongRate(Slider):
+        def motion(self, t, q, u):
+            return super().motion(t, q, (u[0], 2.0 * u[1]))
+
+    with pytest.raises(
+        ValueError, match=r"WrongRate: the frame 'B' turns with .* rad/s by the rates of its coordinates"
+    ):
+        evaluate(WrongRate())
+
+    class NotFixed(Slider):
+        def motion(self, t, q, u):
+            N, O = jk.inertial()
+            B = N.rotate(3, q["angle"], u["angle_dot"], "B")
+            return jk.Motion([jk.Body(1.0, (0.1, 0.1, 0.1), O.fixed(q["x"] * B.x), B, name="rod")])
+
+    with pytest.raises(ValueError, match=r"the mass centre of 'rod' moves with .* m/s by the rates of its coordinates"):
+        evaluate(NotFixed())
+
+
+def test_a_body_that_turns_in_its_frame_must_be_symmetric():
+    class Lopsided(Slider):
+        def motion(self, t, q, u):
+            N, O = jk.inertial()
+            P = O.moving(q["x"] * N.x, u["x_dot"] * N.x)
+            return jk.Motion([jk.Body(1.0, (0.1, 0.2, 0.2), P, N, u["angle_dot"] * N.z, name="rotor")])
+
+    with pytest.raises(
+        ValueError, match="'rotor' turns in its frame 'N', but its inertia is not symmetric about that axis"
+    ):
+        evaluate(Lopsided())
+
+
+def test_what_motion_and_loads_return():
+    class NoMotion(Slider):
+        def motion(self, t, q, u):
+            return super().motion(t, q, u).bodies
+
+    with pytest.raises(TypeError, match=r"NoMotion.motion must return a jaxkane.Motion"):
+        evaluate(NoMotion())
+
+    class BadLoad(Slider):
+        def loads(self, t, q, u, motion, inputs):
+            return [3.0]
+
+    with pytest.raises(TypeError, match="`loads` returns Forces and Torques"):
+        evaluate(BadLoad())
+    with pytest.raises(TypeError, match="first argument is a Vector"):
+        jk.Force(3.0, None)
+
+
+# -- numbers
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "message"),
+    [
+        (np.nan, ValueError, "DoublePendulum.mass = nan is not finite"),
+        (np.inf, ValueError, "DoublePendulum.mass = inf is not finite"),
+        (0.0, ValueError, "DoublePendulum.mass = 0.0 must be positive"),
+        (-1, ValueError, "DoublePendulum.mass = -1.0 must be positive"),
+        ("heavy", TypeError, "DoublePendulum.mass must be a real number"),
+        (None, TypeError, "DoublePendulum.mass must be a real number"),
+        (1j, TypeError, "DoublePendulum.mass must be a real number"),
+        (True, TypeError, "DoublePendulum.mass must be a real number"),
+        (np.ones((2, 3)), None, None),  # a batch; `simulate` says what it needs
+    ],
+)
+def test_parameters(value, error, message):
+    if error is None:
+        assert DoublePendulum(mass=value).mass.shape == (2, 3)
+        return
+    with pytest.raises(error, match=message):
+        DoublePendulum(mass=value)
+
+
+def test_integers_become_floats():
+    pendulum = DoublePendulum(mass=2, length=np.int64(1))
+    assert pendulum.mass.dtype == pendulum.length.dtype == jnp.float64
+    assert float(jax.grad(lambda p: jk.accelerations(p, 0, [1, 0], [0, 1]).sum())(pendulum).length) != 0.0
+
+
+def test_a_negative_mass_of_a_parameter_that_was_not_declared_positive():
+    with pytest.raises(ValueError, match=r"Slider, body 'rod': the mass is -1 kg"):
+        evaluate(Slider(mass=-1.0))
+
+
+def test_inertias_that_no_body_can_have():
+    with pytest.raises(ValueError, match="none may be negative"):
+        evaluate(Slider(inertia=-0.1))
+    body = RigidBody()
+    names = [name for name in ("I11", "I22", "I33") if hasattr(body, name)] or [
+        f.name for f in dataclasses.fields(body) if "inertia" in f.name.lower() or f.name.startswith("I")
+    ][:3]
+    flat = dataclasses.replace(body, **dict(zip(names, (1.0, 1.0, 3.0), strict=True)))
+    q = np.zeros(len(body.coordinates))
+    q[-1] = 1.0
+    with pytest.warns(UserWarning, match="triangle inequality"):
+        jk.accelerations(flat, 0.0, q, np.ones(6))
+    with pytest.raises(ValueError, match="triangle inequality"):
+        jk.simulate(flat, jk.State(q, np.ones(6)), [0.0, 1.0])
+
+
+def test_shapes_and_names():
+    bike = WhippleBicycle.benchmark()
+    q, u = np.zeros(8), np.zeros(3)
+    with pytest.raises(ValueError, match=r"WhippleBicycle: q must have the shape \(8,\).*Got \(7,\)"):
+        jk.accelerations(bike, 0.0, q[:7], u)
+    with pytest.raises(ValueError, match=r"u must have the shape \(3,\): roll_rate, .*Got \(4, 3\).*vmap"):
+        jk.accelerations(bike, 0.0, q, np.zeros((4, 3)))
+    with pytest.raises(ValueError, match=r"no input named brake. It has: roll_torque, drive_torque, steer_torque"):
+        jk.accelerations(bike, 0.0, q, u, {"brake": 1.0})
+    with pytest.raises(ValueError, match=r"q has no lean; it has roll"):
+        jk.accelerations(bike, 0.0, {"lean": 0.1}, u)
+
+
+def test_assemble_says_when_it_cannot():
+    bike = WhippleBicycle.benchmark()
+    with pytest.raises(ValueError, match=r"no pitch satisfies the configuration constraints with roll = 1\.571"):
+        jk.assemble(bike, {"roll": np.pi / 2})
+    with pytest.raises(ValueError, match=r"pitch_rate = 3 contradicts the velocity constraints"):
+        jk.assemble(bike, {"roll": 0.1}, {"rear_wheel_rate": -10.0, "pitch_rate": 3.0})
+    with pytest.raises(ValueError, match="has no coordinate lean"):
+        jk.assemble(bike, {}, free=("lean",))
+    given = jk.assemble(bike, {}, {"rear_wheel_rate": -10.0, "front_wheel_rate": -10.0 * 0.3 / 0.35})
+    np.testing.assert_array_equal(given.u, [0.0, -10.0, 0.0])
+
+
+def test_assemble_is_differentiable_twice_and_maps():
+    bike = WhippleBicycle.benchmark()
+    pitch = lambda x: jk.assemble(bike, jnp.zeros(8).at[jnp.array([0, 2])].set(x)).q[4]  # noqa: E731
+    x, h = jnp.array([0.3, -0.5]), 1e-5
+    forward, reverse = jax.jacfwd(pitch)(x), jax.grad(pitch)(x)
+    e = h * jnp.eye(2)
+    numeric = jnp.stack([(pitch(x + d) - pitch(x - d)) / (2 * h) for d in e])
+    np.testing.assert_allclose(forward, numeric, atol=1e-9)
+    np.testing.assert_allclose(reverse, forward, atol=1e-13)
+    hessian = jax.jacfwd(jax.jacfwd(pitch))(x)
+    slopes = jax.jit(jax.jacfwd(pitch))
+    numeric = jnp.stack([(slopes(x + d) - slopes(x - d)) / (2 * h) for d in e])
+    np.testing.assert_allclose(hessian, numeric, atol=1e-7)
+    many = jax.vmap(pitch)(jnp.stack([x, jnp.array([np.pi / 2, 0.0])]))
+    assert np.isfinite(many[0])
+    assert np.isnan(many[1])  # under a trace there is nobody to raise to

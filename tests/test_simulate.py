@@ -1,0 +1,237 @@
+"""Motion over time: accuracy, inputs, statuses, gradients, and what is refused."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane.catalog import DoublePendulum, WhippleBicycle
+
+BIKE = WhippleBicycle.benchmark()
+PENDULUM = DoublePendulum(mass=1.0, length=1.0)
+TS = jnp.linspace(0.0, 1.0, 11)
+START = jk.State(jnp.array([1.0, -0.5]), jnp.array([0.0, 0.3]))
+
+
+def mechanical_energy(bike, q, u):
+    """Kinetic and potential; N3 points down."""
+
+    def one(q, u):
+        motion = bike.motion(0.0, q, jnp.zeros(6))
+        height = sum(body.mass * body.center.position.dot(motion.N.z) for body in motion.bodies)
+        return jk.kinetic_energy(bike, 0.0, q, u) - bike.g * height, motion["Q"].position.dot(motion.N.z)
+
+    return jax.jit(jax.vmap(one))(q, u)
+
+
+def test_energy_and_front_contact_over_five_seconds():
+    """v = 4.6 m/s, roll rate 0.5 rad/s (Meijaard et al., Figure 4), rtol 1e-10."""
+    state = jk.assemble(BIKE, {}, {"roll_rate": 0.5, "rear_wheel_rate": -4.6 / 0.3})
+    ride = jk.simulate(BIKE, state, jnp.linspace(0.0, 5.0, 101), rtol=1e-10, atol=1e-10)
+    assert ride.ok
+    energy, front_contact = mechanical_energy(BIKE, ride.q, ride.u)
+    kinetic = float(jk.kinetic_energy(BIKE, 0.0, state.q, state.u))
+    assert float(jnp.abs(energy - energy[0]).max()) / kinetic < 1e-9
+    assert float(jnp.abs(front_contact).max()) < 1e-9
+    assert abs(float(ride["roll"][-1])) < 0.05  # stable at this speed
+    np.testing.assert_allclose(ride["yaw_rate"], ride.u_dep[:, 0])
+
+
+def test_steps_of_any_solver_agree():
+    import diffrax
+
+    fine = jk.simulate(PENDULUM, START, TS, rtol=1e-11, atol=1e-11)
+    for options in ({"solver": diffrax.Dopri8()}, {"solver": diffrax.Kvaerno5()}, {"step": 1e-3}):
+        np.testing.assert_allclose(jk.simulate(PENDULUM, START, TS, **options).q, fine.q, atol=1e-6)
+
+
+def test_inputs_of_every_kind():
+    constant = jk.simulate(PENDULUM, START, TS, {"elbow_torque": 2.0})
+    kinds = {
+        "samples": {"elbow_torque": np.full(11, 2.0)},
+        "function": {"elbow_torque": lambda t, state: 2.0},
+        "samples at other times": {"elbow_torque": jk.Samples(jnp.array([0.0, 9.0]), jnp.array([2.0, 2.0]))},
+        "one function": lambda t, state: {"elbow_torque": 2.0},
+        "array": {"elbow_torque": jnp.array(2.0), "shoulder_torque": 0},
+    }
+    for inputs in kinds.values():
+        ride = jk.simulate(PENDULUM, START, TS, inputs)
+        np.testing.assert_allclose(ride.q, constant.q, atol=1e-9)
+        np.testing.assert_allclose(ride["elbow_torque"], 2.0)
+        np.testing.assert_allclose(ride["shoulder_torque"], 0.0)
+    ramp = jk.simulate(PENDULUM, START, TS, {"elbow_torque": np.asarray(TS) * 3.0})
+    function = jk.simulate(PENDULUM, START, TS, {"elbow_torque": lambda t, state: 3.0 * t})
+    np.testing.assert_allclose(ramp.q, function.q, atol=1e-7)
+
+
+def test_a_controller_reads_the_state_by_name():
+    """A rider who steers into the fall keeps the bicycle up at 3 m/s, where it falls by itself."""
+    state = jk.assemble(BIKE, {"roll": 0.02}, {"rear_wheel_rate": -3.0 / 0.3})
+    ts = jnp.linspace(0.0, 4.0, 41)
+
+    def steer_into_the_fall(t, state):
+        return {"steer_torque": 8.0 * state["roll_rate"] + 10.0 * state["roll"] - 0.5 * state["steer_rate"]}
+
+    alone, ridden = jk.simulate(BIKE, state, ts), jk.simulate(BIKE, state, ts, steer_into_the_fall)
+    assert not alone.ok or abs(float(alone["roll"][-1])) > 0.2
+    assert ridden.ok
+    assert abs(float(ridden["roll"][-1])) < 0.01
+    by_name = {"roll_torque": lambda t, state: -0.1 * state["yaw_rate"]}  # a dependent speed
+    assert float(jnp.abs(jk.simulate(BIKE, state, ts, by_name)["roll_torque"]).max()) > 0
+
+
+def test_statuses():
+    falls = jk.assemble(BIKE, {"roll": 0.3}, {"rear_wheel_rate": -1.0 / 0.3})
+    ride = jk.simulate(BIKE, falls, jnp.linspace(0.0, 5.0, 51))
+    assert ride.reason in ("fell over", "dependent speeds singular", "singular speeds")
+    reached = np.asarray(ride.t) <= float(ride.t_end)
+    assert np.isfinite(ride.q[reached]).all()
+    assert np.isnan(ride.q[~reached]).all()
+    assert not ride.ok
+    few = jk.simulate(BIKE, falls, jnp.linspace(0.0, 5.0, 51), max_steps=5)
+    assert few.status == jk.Status.MAX_STEPS
+    assert np.isfinite(few.q[0]).all()
+    bad = jk.simulate(PENDULUM, jk.State(jnp.array([jnp.nan, 0.0]), jnp.zeros(2)), TS)
+    assert bad.reason == "invalid"
+    explodes = jk.simulate(PENDULUM, START, TS, {"elbow_torque": lambda t, state: 1.0 / (0.5 - t) ** 3})
+    assert explodes.status in (jk.Status.STEP_TOO_SMALL, jk.Status.MAX_STEPS)
+    assert "0.5" in repr(explodes)
+
+
+def test_a_roll_of_eighty_degrees_is_a_fall():
+    falling = jk.assemble(BIKE, {"roll": 1.2}, {"roll_rate": 2.0, "rear_wheel_rate": -10.0})
+    assert jk.simulate(BIKE, falling, TS).reason == "fell over"
+
+
+def test_a_steer_of_1_6_rad():
+    """Just short of where the dependent speeds are singular: a status or a motion, never an exception."""
+    state = jk.assemble(BIKE, {"steer": 1.6}, {"steer_rate": 0.5, "rear_wheel_rate": -1.0})
+    ride = jk.simulate(BIKE, state, TS)
+    assert ride.status in (jk.Status.COMPLETED, jk.Status.SINGULAR_SPEEDS, jk.Status.STEP_TOO_SMALL, jk.Status.EVENT)
+
+
+def loss(system, state, torque, adjoint):
+    ride = jk.simulate(system, state, TS, {"elbow_torque": torque}, adjoint=adjoint, rtol=1e-10, atol=1e-10)
+    return jnp.sum(ride["theta1"] ** 2 + ride["theta2_dot"])
+
+
+@pytest.mark.parametrize("torque", [jnp.array(0.7), jnp.sin(jnp.linspace(0.0, 3.0, 11))], ids=["number", "samples"])
+def test_gradients_of_a_simulation_against_central_differences(torque):
+    """Parameters, initial state and inputs; forward, reverse, and both."""
+    rtol = 1e-6
+    arguments = (PENDULUM, START, torque)
+    direction = jax.tree.map(lambda x: jnp.cos(jnp.arange(x.size, dtype=x.dtype).reshape(x.shape)), arguments)
+
+    def along(h):
+        moved = jax.tree.map(lambda x, d: x + h * d, arguments, direction)
+        return float(jax.jit(lambda args: loss(*args, "reverse"))(moved))
+
+    h = 1e-5
+    numeric = (along(h) - along(-h)) / (2 * h)
+    forward = jax.jvp(lambda *args: loss(*args, "forward"), arguments, direction)[1]
+    np.testing.assert_allclose(forward, numeric, rtol=rtol)
+    for adjoint in ("reverse", "both"):
+        gradient = jax.grad(lambda *args: loss(*args, adjoint), argnums=(0, 1, 2))(*arguments)  # noqa: B023
+        products = jax.tree.map(lambda g, d: jnp.sum(g * d), gradient, direction)
+        np.testing.assert_allclose(sum(jax.tree.leaves(products)), numeric, rtol=rtol)
+
+
+def test_second_derivatives_forward_over_forward():
+    f = lambda m: loss(DoublePendulum(mass=m, length=1.0), START, 0.7, "forward")  # noqa: E731
+    slope = jax.jit(jax.jacfwd(f))
+    second = jax.jit(jax.jacfwd(jax.jacfwd(f)))(1.0)
+    np.testing.assert_allclose(second, (slope(1.0 + 1e-4) - slope(1.0 - 1e-4)) / 2e-4, rtol=1e-5)
+
+
+def test_gradients_of_the_bicycle():
+    """Reverse and forward through a ride, a parameter and the initial roll rate, against differences."""
+    import dataclasses
+
+    ts = jnp.linspace(0.0, 1.0, 6)
+
+    def final_roll(x, adjoint):
+        bike = dataclasses.replace(BIKE, IHzz=x[0])
+        state = jk.State(jnp.zeros(8), jnp.stack([x[1], jnp.array(-15.0), jnp.array(0.0)]))
+        return jk.simulate(bike, state, ts, adjoint=adjoint, rtol=1e-10, atol=1e-10)["roll"][-1]
+
+    x, h = jnp.array([0.00708, 0.5]), jnp.array([1e-6, 1e-5])
+    f = jax.jit(lambda x: final_roll(x, "reverse"))
+    numeric = [(f(x + e) - f(x - e)) / (2 * e.sum()) for e in jnp.diag(h)]
+    np.testing.assert_allclose(jax.jacfwd(lambda x: final_roll(x, "forward"))(x), numeric, rtol=1e-6)
+    np.testing.assert_allclose(jax.grad(lambda x: final_roll(x, "reverse"))(x), numeric, rtol=1e-6)
+
+
+def test_float32_and_what_follows_from_it():
+    pendulum = jax.tree.map(lambda x: x.astype(jnp.float32), PENDULUM)
+    start = jax.tree.map(lambda x: x.astype(jnp.float32), START)
+    ride = jk.simulate(pendulum, start, np.linspace(0.0, 1.0, 11), {"elbow_torque": 0.5})
+    assert ride.q.dtype == ride["elbow_torque"].dtype == jnp.float32
+    reference = jk.simulate(PENDULUM, START, TS, {"elbow_torque": 0.5})
+    np.testing.assert_allclose(np.asarray(ride.q), np.asarray(reference.q), atol=1e-3)
+
+
+def test_under_jit_and_vmap():
+    run = lambda u: jk.simulate(PENDULUM, jk.State(START.q, u), TS)  # noqa: E731
+    us = jnp.array([[0.0, 0.3], [1.0, -1.0]])
+    rides = jax.jit(jax.vmap(run))(us)
+    assert rides["theta1"].shape == (2, 11)
+    assert list(rides.ok) == [True, True]
+    assert rides.reason == ["completed", "completed"]
+    np.testing.assert_allclose(rides.q[1], run(us[1]).q, atol=1e-7)
+
+
+def test_going_on_from_where_a_ride_ended():
+    whole = jk.simulate(PENDULUM, START, TS, rtol=1e-11, atol=1e-11)
+    first = jk.simulate(PENDULUM, START, TS[:6], rtol=1e-11, atol=1e-11)
+    second = jk.simulate(PENDULUM, first.state(), TS[5:], rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(second.q[-1], whole.q[-1], atol=1e-9)
+
+
+def test_progress_is_shown_on_request_only(capfd):
+    jk.simulate(PENDULUM, START, TS)
+    assert capfd.readouterr() == ("", "")
+    jax.block_until_ready(jk.simulate(PENDULUM, START, TS, progress=True))
+    jax.effects_barrier()
+    assert "%" in "".join(capfd.readouterr())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ((PENDULUM, START, [0.0, 0.5, 0.4]), ValueError, r"`ts` must increase: ts\[1\] = 0.5 is followed by 0.4"),
+        ((PENDULUM, START, [0.0, 0.5, 0.5]), ValueError, "must increase"),
+        ((PENDULUM, START, [0.0, np.nan]), ValueError, "not finite"),
+        ((PENDULUM, START, [0.0]), ValueError, "at least two times"),
+        (
+            (PENDULUM, START, TS, {"elbow": 1.0}),
+            ValueError,
+            "no input named elbow. It has: shoulder_torque, elbow_torque",
+        ),
+        (
+            (PENDULUM, START, TS, {"elbow_torque": np.ones(7)}),
+            ValueError,
+            r"samples of 'elbow_torque' have the shape \(7,\)",
+        ),
+        ((PENDULUM, START, TS, {"elbow_torque": np.full(11, np.nan)}), ValueError, "not all finite"),
+        ((PENDULUM, START, TS, 3.0), TypeError, "dict by name or a function"),
+        ((PENDULUM, (1.0, 2.0), TS), TypeError, "jaxkane.State"),
+        ((PENDULUM, jk.State(np.zeros(3), np.zeros(2)), TS), ValueError, r"state.q must have the shape \(2,\)"),
+        ((PENDULUM, jk.State(np.zeros((4, 2)), np.zeros(2)), TS), ValueError, "sweep or jax.vmap"),
+        (
+            (BIKE, jk.State(np.full(8, 0.3), np.zeros(3)), TS),
+            ValueError,
+            r"violate the configuration constraints by \[",
+        ),
+    ],
+)
+def test_what_is_refused(arguments, error, message):
+    with pytest.raises(error, match=message):
+        jk.simulate(*arguments)
+
+
+def test_an_unknown_adjoint_and_an_unknown_name():
+    with pytest.raises(ValueError, match="adjoint is one of"):
+        jk.simulate(PENDULUM, START, TS, adjoint="backwards")
+    with pytest.raises(KeyError, match="no 'theta3' in this trajectory; there are theta1"):
+        _ = jk.simulate(PENDULUM, START, TS)["theta3"]
