@@ -24,15 +24,16 @@ def swings():
     """Two swings of different length, with torques, noise, gaps and an offset in one sensor."""
     rng = np.random.default_rng(3)
     trials = []
+    t = np.arange(0.0, 2.1, 0.02)
     for duration, angle in ((1.5, 0.4), (2.1, -0.7)):
-        t = np.arange(0.0, duration, 0.02)
         inputs = {"shoulder_torque": 2.0 * np.sin(3.0 * t), "elbow_torque": np.cos(5.0 * t)}
         start = jk.assemble(TRUTH, {"theta1": angle, "theta2": 0.3})
         swing = jk.simulate(TRUTH, start, t, inputs)
         measured = {name: np.asarray(swing[name]) + rng.normal(0.0, s, t.size) for name, s in SIGMA.items()}
         measured["theta2"] += 0.05
         measured["theta1"][10:15] = np.nan
-        trials.append(Trial(t, measured, inputs, sigma=SIGMA, name=f"{duration} s"))
+        trial = Trial(t, measured, inputs, sigma=SIGMA, name=f"{duration} s")
+        trials.append(trial.between(0.0, duration - 0.01))
     return trials
 
 
@@ -44,16 +45,7 @@ def problem(swings):
 def test_jacobian_against_central_differences(swings):
     tolerance = 1e-6
     free = (Free("mass", prior=(1.0, 0.3)), "length", Gain("elbow_torque"))
-    problem = Problem.of(
-        GUESS,
-        swings,
-        free,
-        sensor_bias={"theta2": 0.1},
-        input_bias=("shoulder_torque",),
-        rtol=1e-12,
-        atol=1e-12,
-        **OPTIONS,
-    )
+    problem = Problem.of(GUESS, swings, free, sensor_bias={"theta2": 0.1}, input_bias=("shoulder_torque",), **OPTIONS)
     window = jax.tree.map(lambda x: x[1], problem.windows)
     point = problem.start
 

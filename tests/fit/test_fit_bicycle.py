@@ -1,0 +1,100 @@
+"""Bicycles: four parameters of a simulated one, the damping of a measured one."""
+
+import json
+from pathlib import Path
+
+import equinox as eqx
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane.catalog import WhippleBicycle
+from jaxkane.fit import Gain, Trial, fit_bicycle, read_trials
+
+MEASURED = Path(__file__).parents[3] / "shared" / "data" / "steer_by_wire"
+SIGMA = {"roll": 0.005, "steer": 0.005, "roll_rate": 0.03, "steer_rate": 0.05}
+OFF = {"IBxx": 1.2, "zB": 0.8, "c": 1.2, "IFyy": 0.8}
+
+
+def waves(rng, t, size, frequencies):
+    phases = rng.uniform(0.0, 2.0 * np.pi, len(frequencies))
+    return size * sum(np.sin(2.0 * np.pi * f * t + p) for f, p in zip(frequencies, phases, strict=True))
+
+
+@pytest.mark.slow
+def test_four_parameters_of_a_simulated_bicycle():
+    within = 0.02
+    truth, rng, rides = WhippleBicycle.benchmark(), np.random.default_rng(1), []
+    t = np.linspace(0.0, 5.0, 501)
+    for speed in (4.4, 5.2, 6.0):
+        inputs = {
+            "steer_torque": waves(rng, t, 1.0, (0.4, 0.9, 1.7, 2.9)),
+            "roll_torque": waves(rng, t, 12.0, (0.3, 0.7, 1.3)),
+        }
+        start = jk.assemble(truth, {"roll": 0.02}, {"rear_wheel_rate": -speed / truth.rR, "roll_rate": 0.1})
+        ride = jk.simulate(truth, start, t, inputs)
+        measured = {name: np.asarray(ride[name]) + rng.normal(0.0, s, t.size) for name, s in SIGMA.items()}
+        rides.append(Trial(t, measured, inputs, sigma=SIGMA, initial={"speed": speed}, name=f"{speed} m/s"))
+    guess = truth
+    for name, factor in OFF.items():
+        guess = eqx.tree_at(lambda b, name=name: getattr(b, name), guess, factor * getattr(truth, name))
+    result = fit_bicycle(rides, guess, tuple(OFF), window=2.5, steps=100)
+    assert result.ok, result.message
+    for name in OFF:
+        error = result.estimates[name] - float(getattr(truth, name))
+        assert abs(error) < within * abs(float(getattr(truth, name))), name
+        assert abs(error) < 3.0 * result.standard_errors[name], name
+
+
+@pytest.fixture(scope="module")
+def measured():
+    """The first second of 31 rides of a steer-by-wire bicycle, and its authors' parameters."""
+    if not MEASURED.exists():
+        pytest.skip("../shared/data/steer_by_wire is absent: the measured rides are not part of the repository")
+    rides = read_trials(
+        MEASURED / "free_responses.csv",
+        {"roll": "roll_angle", "steer": "steer_angle", "roll_rate": "roll_rate", "steer_rate": "steer_rate"},
+        inputs={"steer_torque": "steer_torque"},
+        initial={"speed": "speed_treadmill"},
+        sigma={"roll": 0.01, "steer": 0.02, "roll_rate": 0.1, "steer_rate": 0.2},
+        by="segment",
+    )
+    parameters = json.loads((MEASURED / "parameters.json").read_text()) | {"IByy": 2.0, "IHyy": 0.01}
+    return [ride.between(0.0, 0.995) for ride in rides], WhippleBicycle.from_parameters(parameters)
+
+
+OPTIONS = {"input_bias": ("roll_torque", "steer_torque"), "hold": ("steer_torque",)}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("method", ["gradient_descent", "least_squares"])
+def test_steer_damping_of_a_measured_bicycle(measured, method):
+    rides, bicycle = measured
+    result = fit_bicycle(rides, bicycle, "steer_damping", method=method, **OPTIONS)
+    assert result.ok, result.message
+    assert len(rides) == 31
+    assert result.history[0] > 20000
+    assert result.cost < 4000
+    assert result.estimates["steer_damping"] == pytest.approx(0.545, abs=0.01)
+    assert any("not noise" in note for note in result.notes)
+
+
+@pytest.mark.slow
+def test_four_parameters_of_a_measured_bicycle(measured):
+    rides, bicycle = measured
+    free = (Gain("steer_torque"), "steer_damping", "IHzz", "c")
+    result = fit_bicycle(rides, bicycle, free, method="least_squares", **OPTIONS)
+    assert result.status == "converged"
+    assert result.cost < 2730
+    # What no fork can be is said.
+    assert any("Not a possible body" in note and "fork" in note for note in result.notes)
+
+
+def test_a_ride_needs_its_speed():
+    t = np.linspace(0.0, 1.0, 11)
+    ride = Trial(t, {"roll": 0.1 * t}, sigma=SIGMA, name="ride 7")
+    with pytest.raises(ValueError, match="ride 7: a ride needs its speed"):
+        fit_bicycle(ride, WhippleBicycle.benchmark(), "c")
+    ride = Trial(t, {"roll": 0.1 * t}, sigma=SIGMA, initial={"speed": 5.0})
+    with pytest.raises(ValueError, match="With rR free"):
+        fit_bicycle(ride, WhippleBicycle.benchmark(), ("c", "rR"))
