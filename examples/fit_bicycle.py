@@ -45,7 +45,7 @@ LABELS = {
     "roll_rate": "roll rate [deg/s]",
     "steer_rate": "steer rate [deg/s]",
 }
-DOTS, LINE, TRUE = "#9aa5b1", "#0b6e99", "#d1495b"
+DOTS, LINE, TRUE = "#e8a33d", "#14507a", "#c8354a"
 
 
 def simulated_rides(bicycle):
@@ -131,18 +131,20 @@ def draw(result, truth, path):
     for column, k in zip(axes.T, chosen, strict=True):
         trial, name = problem.trials[k], result.trial_names[k]
         for ax, channel in zip(column, problem.channels, strict=True):
-            ax.plot(trial.t, np.degrees(trial.measured[channel]), ".", color=DOTS, markersize=2.5, label="measured")
-            ax.plot(trial.t, np.degrees(fitted[name][channel]), color=LINE, linewidth=1.5, label="fitted")
+            ax.plot(
+                trial.t, np.degrees(trial.measured[channel]), ".", color=DOTS, markersize=3, alpha=0.6, label="measured"
+            )
+            ax.plot(trial.t, np.degrees(fitted[name][channel]), color=LINE, linewidth=1.0, label="fitted")
             ax.grid(alpha=0.25)
         speed = -trial.initial["rear_wheel_rate"][0] * float(result.system.rR)
         column[0].set_title(name if "m/s" in name else f"{name.split(', ')[-1]}, {speed:.2g} m/s")
         column[-1].set_xlabel("time [s]")
     for ax, channel in zip(axes[:, 0], problem.channels, strict=True):
         ax.set_ylabel(LABELS[channel])
-    axes[0, 0].legend(loc="upper right", frameon=False, ncols=2)
+    axes[0, 0].legend(loc="lower left", bbox_to_anchor=(-0.02, 0.98), frameon=False, ncols=2, markerscale=2)
     way, parameters = rows[1].subplots(1, 2, width_ratios=(1, 1.6))
     way.semilogy(result.history, color=LINE)
-    way.axhline(problem.size[0] - problem.size[1], color=DOTS, linestyle="--", linewidth=1)
+    way.axhline(problem.size[0] - problem.size[1], color="0.6", linestyle="--", linewidth=1)
     way.annotate("noise alone", (len(result.history) - 1, problem.size[0]), color="0.4", ha="right", va="bottom")
     way.set(xlabel="step", ylabel="sum of squares", title=f"{result.method}, {len(result.history) - 1} steps")
     way.grid(alpha=0.25)
@@ -157,7 +159,7 @@ def draw_parameters(ax, result, truth):
     if not truth:
         value, error = result.estimates[names[0]], result.clustered_errors[names[0]]
         ax.errorbar(value, 0, xerr=3 * error, fmt="o", color=LINE, capsize=4, label="estimate, 3 std. errors (by ride)")
-        ax.plot(result.start[names[0]], 0, "x", color=DOTS, markersize=8, label="start")
+        ax.plot(result.start[names[0]], 0, "x", color=TRUE, markersize=8, label="start")
         ax.set(yticks=[0], yticklabels=names, ylim=(-1, 1), xlabel="N m s/rad", title="parameter")
     else:
         for i, name in enumerate(names):
@@ -169,17 +171,17 @@ def draw_parameters(ax, result, truth):
                 value, i, xerr=error, fmt="o", color=LINE, capsize=4, label="estimate, 3 std. errors" if first else None
             )
             ax.annotate(
-                f"{name}: {result.start[name]:.4g} → {result.estimates[name]:.5g} ± {result.standard_errors[name]:.1g}"
-                f"   (truth {right:.5g})",
-                (0.02, i + 0.22), xycoords=("axes fraction", "data"), color="0.3",
+                f"{result.start[name]:.4g} → {result.estimates[name]:.5g} ± {result.standard_errors[name]:.1g}\n"
+                f"truth {right:.5g}",
+                (1.02, i), xycoords=("axes fraction", "data"), color="0.3", va="center", annotation_clip=False,
             )  # fmt: skip
         ax.axvline(0.0, color=TRUE, linewidth=1.2, label="truth")
-        ax.set(yticks=range(len(names)), yticklabels=names, ylim=(len(names) - 0.5, -0.9))
+        ax.set(yticks=range(len(names)), yticklabels=names, ylim=(len(names) - 0.4, -0.6))
         ax.set(xlabel="difference from the truth [%]", title="parameters: all started 20 % off")
         widest = max(abs(x) for x in ax.get_xlim())
         ax.set_xlim(-1.1 * widest, 1.1 * widest)
     ax.grid(alpha=0.25)
-    ax.legend(loc="lower right", frameon=False)
+    ax.legend(loc="lower left", frameon=False)
 
 
 def main():

@@ -202,7 +202,7 @@ class Problem(eqx.Module):
         """The same problem with only the first `samples` (W,) of every window; nothing is compiled anew."""
         windows = self.windows
         keep = jnp.asarray(samples, dtype=jnp.int32)[:, None]  # (W, 1)
-        inside = jnp.arange(windows.t.shape[1], dtype=jnp.int32) < keep  # (W, n_t)
+        inside = jnp.arange(windows.t.shape[1], dtype=jnp.int32)[None, :] < keep  # (W, n_t)
         t = jnp.where(inside, windows.t, jnp.take_along_axis(windows.t, keep - 1, axis=1))
         weight = jnp.where(inside[:, None, :], windows.weight, 0.0)
         return eqx.tree_at(lambda p: (p.windows.t, p.windows.weight), self, (t, weight))
