@@ -47,11 +47,13 @@ def test_no_motion():
 
 
 def test_speeds_that_are_not_the_rates_of_the_coordinates():
-    class TooFewSpeeds(Slider):
+    class TooFewSpeeds(jk.System):
+        coordinates = ("x", "angle")
         speeds = ("x_dot",)
 
         def motion(self, t, q, u):
-            return super().motion(t, q, (u[0], 0.0))
+            N, O = jk.inertial()
+            return jk.Motion([jk.Body(1.0, 0.0, O.moving(q[0] * N.x, u[0] * N.x))])
 
     with pytest.raises(ValueError, match=r"TooFewSpeeds has 2 coordinates and 1 speeds.*define q_dot"):
         evaluate(TooFewSpeeds(), u=[0.3])
@@ -101,7 +103,7 @@ def test_residuals_that_are_not_affine(residual, message):
 def test_a_velocity_that_is_not_affine():
     class Squared(Slider):
         def motion(self, t, q, u):
-            N, O = jk.inertial()
+            N, _ = jk.inertial()
             return jk.Motion([jk.Body(1.0, 0.0, jk.Point.at(u[0] * u[0] * N.x + u[1] * N.y), name="rod")])
 
     with pytest.raises(ValueError, match="the velocity of 'rod' is not affine in x_dot"):
@@ -224,10 +226,26 @@ def test_shapes_and_names():
         jk.accelerations(bike, 0.0, {"lean": 0.1}, u)
 
 
+class OnACircle(jk.System):
+    coordinates, speeds = ("x", "y"), ("x_dot",)
+    dependent_speeds, dependent_coordinates = ("y_dot",), ("y",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q[0] * N.x + q[1] * N.y, u[0] * N.x + u[1] * N.y))])
+
+    def configuration_constraints(self, t, q):
+        return [q["x"] ** 2 + q["y"] ** 2 - 1.0]
+
+
 def test_assemble_says_when_it_cannot():
     bike = WhippleBicycle.benchmark()
-    with pytest.raises(ValueError, match=r"no pitch satisfies the configuration constraints with roll = 1\.571"):
+    with pytest.raises(ValueError, match=r"constraints do not determine pitch with roll = 1\.571"):
         jk.assemble(bike, {"roll": np.pi / 2})
+    with pytest.raises(
+        ValueError, match=r"no pitch satisfies the configuration constraints with roll = 1\.5, steer = 3"
+    ):
+        jk.assemble(bike, {"roll": 1.5, "steer": 3.0})
     with pytest.raises(ValueError, match=r"pitch_rate = 3 contradicts the velocity constraints"):
         jk.assemble(bike, {"roll": 0.1}, {"rear_wheel_rate": -10.0, "pitch_rate": 3.0})
     with pytest.raises(ValueError, match="has no coordinate lean"):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -75,28 +75,25 @@ def _solve_configuration(system: System, q0, t, free: tuple[str, ...]):
             f"({', '.join(free)})."
         )
     places = np.array(places)
-    q, good, remainder, steps = _newton(system, q0, t, places)
-    if is_concrete(system, q, t) and not bool(good):
+    found = _newton(system, q0, t, places)
+    if is_concrete(system, found.q, t) and not bool(found.good):
         # The guess may be where the residual has no slope, as an Euler parameter of zero: look from beside it.
         again = _newton(system, q0.at[places].add(1.0), t, places)
-        q, good, remainder, steps = again if bool(again[1]) else (q, good, remainder, steps)
-    if is_concrete(system, q, t) and not bool(good):
-        moved = ", ".join(system.coordinates[i] for i in places)
-        held = ", ".join(
-            f"{c} = {float(x):.4g}"
-            for i, (c, x) in enumerate(zip(system.coordinates, q0, strict=True))
-            if i not in places
-        )
-        raise ValueError(
-            f"{name}: no {moved} satisfies the configuration constraints with {held}: after "
-            f"{int(steps)} Newton steps the residual is {float(remainder):.3g}. Start from "
-            "another guess, or change what is held."
-        )
-    return jnp.where(good, q, jnp.nan)
+        if not bool(again.good):
+            raise ValueError(_why_not(system, q0, places, found))
+        found = again
+    return jnp.where(found.good, found.q, jnp.nan)
 
 
-def _newton(system: System, q0, t, places):
-    """Coordinates, whether they meet the constraints, the residual, and the number of steps."""
+class _Found(NamedTuple):
+    q: Any
+    good: Any  # the constraints are met, and determine what was moved
+    remainder: Any  # largest residual
+    slope: Any  # smallest singular value of the residuals' derivatives along what was moved
+    steps: Any
+
+
+def _newton(system: System, q0, t, places) -> _Found:
     n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q0).shape[0]
     if len(places) == n_h:
         directions = jnp.eye(n_h, dtype=q0.dtype)
@@ -113,7 +110,30 @@ def _newton(system: System, q0, t, places):
     solution = optx.root_find(residual, newton, jnp.zeros(n_h, q0.dtype), args, max_steps=64, throw=False)
     q = q0.at[places].add(solution.value @ directions)
     remainder = jnp.max(jnp.abs(configuration_residual(system, t, q)))
-    return q, remainder <= eps**0.6, remainder, solution.stats["num_steps"]
+    derivatives = jax.jacfwd(residual)(jax.lax.stop_gradient(solution.value), jax.lax.stop_gradient(args))
+    slope = jnp.linalg.svd(derivatives, compute_uv=False)[-1]
+    good = (remainder <= eps**0.6) & (slope > eps**0.6)
+    return _Found(q, good, remainder, slope, solution.stats["num_steps"])
+
+
+def _why_not(system: System, q0, places, found: _Found) -> str:
+    name = type(system).__name__
+    moved = ", ".join(system.coordinates[i] for i in places)
+    held = ", ".join(
+        f"{c} = {float(x):.4g}"
+        for i, (c, x) in enumerate(zip(system.coordinates, q0, strict=True))
+        if i not in places and x != 0
+    )
+    held = held or "the others zero"
+    if float(found.remainder) < 1e-3 and not float(found.slope) > 1e-6:
+        return (
+            f"{name}: the configuration constraints do not determine {moved} with {held}: they do not change with it "
+            "(a singular configuration, or constraints that repeat each other). Change what is held."
+        )
+    return (
+        f"{name}: no {moved} satisfies the configuration constraints with {held}: after {int(found.steps)} Newton "
+        f"steps the residual is {float(found.remainder):.3g}. Start from another guess, or change what is held."
+    )
 
 
 def _check_dependent_speeds(name: str, given: Mapping[str, Any], found: Mapping[str, Any]) -> None:

@@ -77,9 +77,12 @@ def _solve_chunk(members: Any, shared: Any, ts: Any, settings: Settings) -> Traj
         system, state, signals = eqx.combine(member, shared)
         return solve(system, state, ts, signals, settings)
 
-    if jax.default_backend() == "cpu":
-        return jax.lax.map(one, members, batch_size=_GROUP)
-    return jax.vmap(one)(members)
+    if jax.default_backend() != "cpu":
+        return jax.vmap(one)(members)
+    n = jax.tree.leaves(members)[0].shape[0]
+    group = min(n, _GROUP)  # n is a multiple of it
+    groups = jax.tree.map(lambda x: x.reshape(n // group, group, *x.shape[1:]), members)
+    return jax.tree.map(lambda x: x.reshape(n, *x.shape[2:]), jax.lax.map(jax.vmap(one), groups))
 
 
 def _signals(inputs: Inputs, system: System, ts: Any) -> Any:
