@@ -118,7 +118,7 @@ def test_gradient_descent(problem):
     result = gradient_descent(problem)
     check(result)
     assert len(result.history) < 60
-    assert result.history[-1] < 0.1 * result.history[0]
+    assert result.history[-1] < 0.2 * result.history[0]
 
 
 def test_any_optax_optimizer(problem):

@@ -35,6 +35,12 @@ class Blocks(eqx.Module):
         """Norms (n_x,) of the sensitivity's columns before anything is eliminated."""
         return jnp.sqrt(jnp.sum(self.R[:, :, self.n_z + self.n_b : -1] ** 2, axis=(0, 1)))
 
+    @property
+    def silent(self) -> Array:
+        """Whether an x (n_x,) moves no residual by more than rounding errors."""
+        norms = self.column_norms
+        return norms <= 1e4 * jnp.finfo(norms.dtype).eps * jnp.max(norms)
+
 
 class Eliminated(eqx.Module):
     """What is left: `R` (T, n_x + 1, n_x + 1) with columns [x, r], and the rows that give z and b back."""
@@ -70,6 +76,9 @@ class Eliminated(eqx.Module):
 def eliminate(blocks: Blocks, damping: Array | float) -> Eliminated:
     """z and b eliminated, each with `damping` * |column| * unknown added to the residuals (Levenberg-Marquardt)."""
     R, n_z, n_b = blocks.R, blocks.n_z, blocks.n_b
+    # What has no influence has rounding errors; a step along them would lead anywhere.
+    silent = jnp.zeros(R.shape[-1], bool).at[n_z + n_b : -1].set(blocks.silent)
+    R = jnp.where(silent[None, None, :], 0.0, R)
     squares = jnp.sum(R**2, axis=1)  # (W, k)
     by_trial = jnp.zeros((blocks.windows.shape[0], R.shape[-1]), R.dtype).at[blocks.trial].add(squares)
     # Never quite zero: an unknown without influence then stays where it is, instead of becoming NaN.

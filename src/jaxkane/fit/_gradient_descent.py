@@ -55,7 +55,9 @@ def gradient_descent(
 
     @jax.jit
     def descend(directions, unit, gradient, memory, y):
-        updates, memory = descent.update(directions.T @ gradient / unit, memory, y)
+        # optax's schedules mix integers and floats, which a strict user's settings would refuse.
+        with jax.numpy_dtype_promotion("standard"):
+            updates, memory = descent.update(directions.T @ gradient / unit, memory, y)
         return unit * directions @ updates, y + updates, memory
 
     y = jnp.zeros_like(point.x)

@@ -97,7 +97,7 @@ def look(problem: Problem, at: Linearization, flat: float = 0.5) -> Identifiabil
     n_r, n_unknown = problem.size
     variance = at.cost / max(n_r - n_unknown, 1)  # of a residual; one where `sigma` is right
     before = np.asarray(at.blocks.column_norms)
-    silent = before <= 1e-12 * max(before.max(), 1e-300)
+    silent = np.asarray(at.blocks.silent)
     # Elimination leaves rounding errors of what it removed: less than this is nothing.
     floor = 1e3 * float(jnp.finfo(eliminated.R.dtype).eps) * before.max()
     heard = np.flatnonzero(~silent)
