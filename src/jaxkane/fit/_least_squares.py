@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 from tqdm import tqdm
 
 from ._blocks import eliminate
@@ -43,6 +44,10 @@ def least_squares(
                 break
             tried = moved(point, x, eliminated)
             there = linearize(problem, tried)
+            if there is not None and usable(there) and there.cost >= at.cost:
+                # Often only the nuisance values, which went along a straight line, are not yet where they belong.
+                tried = moved(tried, jnp.zeros_like(x), eliminate(there.blocks, 0.0))
+                there = linearize(problem, tried)
             if there is not None and usable(there) and there.cost < at.cost:
                 ratio = (at.cost - there.cost) / gain
                 point, at = tried, there
