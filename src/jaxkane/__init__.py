@@ -4,6 +4,9 @@ from . import catalog as catalog
 from . import rotations as rotations
 from . import sweep as sweep
 from ._assembly import assemble as assemble
+from ._audit import Audit as Audit
+from ._audit import audit as audit
+from ._drift import best_dependent_speeds as best_dependent_speeds
 from ._equations import accelerations as accelerations
 from ._equations import constraint_jacobian as constraint_jacobian
 from ._equations import constraint_jacobian_rate as constraint_jacobian_rate

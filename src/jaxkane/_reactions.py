@@ -81,13 +81,13 @@ def _along(forces: Any, system: System, t: Any, q: Any, u: Any, inputs: InputVal
 
 @fused
 def _multipliers(system, t, q, u, inputs):
-    multipliers = _Reactions(system, t, q, u, inputs).multipliers
+    multipliers = Reactions(system, t, q, u, inputs).multipliers
     return stack([multipliers])[0].astype(q.dtype)
 
 
 @fused
 def _forces(system, t, q, u, inputs):
-    now = _Reactions(system, t, q, u, inputs)
+    now = Reactions(system, t, q, u, inputs)
     vectors = {name: stack([row])[0].astype(q.dtype) for name, row in now.forces_of_parts()}
     return vectors | {name: jnp.asarray(x, dtype=q.dtype) for name, x in now.forces_of_auxiliary_speeds()}
 
@@ -99,7 +99,7 @@ class _Forces(NamedTuple):
     of_residuals: Row  # of the constraint residuals that see it move
 
 
-class _Reactions(Instant):
+class Reactions(Instant):
     """An instant of the motion, with its accelerations and the multipliers of its residuals."""
 
     def __init__(self, system: System, t: Any, q: Any, u: Any, inputs: InputValues = None):
@@ -123,6 +123,15 @@ class _Reactions(Instant):
         for (V, W), (p_dot, H_dot) in zip(bodies, self.momentum, strict=True):
             total = add(total, mul(-1.0, add(dot(V, p_dot), dot(W, H_dot))))
         return total
+
+    def power_of_prescribed_motions(self) -> Component:
+        """Power [W] of what drives velocities that are left when all speeds are zero, and of moving constraints.
+
+        sum V_t . dp/dt + W_t . dH/dt - F . V_t - T . W_t - lambda . c0
+        """
+        still = (0.0,) * (self.n + self.k)
+        c0 = self.residuals(self.t, self.q, still)
+        return mul(-1.0, add(self.unbalanced(self.velocities(still)), dot(c0, self.multipliers)))
 
     def forces_of_parts(self) -> Iterator[tuple[str, Row]]:
         """Forces at the named points, moments at the named frames."""

@@ -13,11 +13,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ._check import check_state, check_system, configuration_residual, configuration_tolerance
+from ._drift import correction, has_configuration_constraints, projected
 from ._equations import dependent_speeds, state_rates
 from ._fuse import fused
 from ._kane import Instant, checked_inputs
 from ._linear import determinant, stack
-from ._signals import as_signals, evaluate
+from ._signals import as_signals, evaluate, sample_times
 from ._system import State, System, parameter_info
 from ._types import Component, Inputs
 
@@ -141,6 +142,8 @@ def simulate(
     atol: float | None = None,
     solver: diffrax.AbstractSolver | None = None,
     step: float | None = None,
+    project: bool = False,
+    stabilize: float = 0.0,
     adjoint: Literal["reverse", "forward", "both"] | diffrax.AbstractAdjoint = "reverse",
     max_steps: int = 16384,
     progress: bool = False,
@@ -157,6 +160,10 @@ def simulate(
         is any coordinate or speed; or one function (t, state) -> dict, a controller. Those left out are zero.
     - `rtol`, `atol`: error tolerances of a step; by default 1e-8 in float64 and 1e-5 in float32.
     - `solver`: any diffrax solver, by default `Tsit5`. `step`: a fixed step [s] instead of error control.
+    - `project`: move the coordinates that are kept to the nearest that meet the configuration constraints. The
+        integration itself does not see it; dependent speeds are those of the projected coordinates.
+    - `stabilize`: a rate [1/s] at which the residuals h of the configuration constraints are led back to zero while
+        integrating, h_dot = -stabilize * h; some 10 for seconds of motion. 0.0 lets them drift, by the solver's error.
     - `adjoint`: how the motion will be differentiated. "reverse" (default): `jax.grad`, `jax.vjp`; "forward":
         `jax.jvp`, `jax.jacfwd`, and nested for Hessians, cheaper for fewer than about fifty parameters; "both" is
         slower; or a diffrax adjoint.
@@ -173,7 +180,16 @@ def simulate(
     check_state(system, ts[0], state.q)
     check_system(system, ts[0], state.q, state.u, strict=True)
     settings = settings_for(
-        ts, rtol=rtol, atol=atol, solver=solver, step=step, adjoint=adjoint, max_steps=max_steps, progress=progress
+        ts,
+        rtol=rtol,
+        atol=atol,
+        solver=solver,
+        step=step,
+        project=project,
+        stabilize=stabilize,
+        adjoint=adjoint,
+        max_steps=max_steps,
+        progress=progress,
     )
     return solve(system, state, ts, signals, settings)
 
@@ -188,6 +204,8 @@ class Settings(eqx.Module):
     adjoint: diffrax.AbstractAdjoint
     max_steps: int = eqx.field(static=True)
     progress: bool = eqx.field(static=True)
+    project: bool = eqx.field(static=True)
+    stabilize: float = eqx.field(static=True)
 
 
 def settings_for(
@@ -197,6 +215,8 @@ def settings_for(
     atol: float | None = None,
     solver: diffrax.AbstractSolver | None = None,
     step: float | None = None,
+    project: bool = False,
+    stabilize: float = 0.0,
     adjoint: str | diffrax.AbstractAdjoint = "reverse",
     max_steps: int = 16384,
     progress: bool = False,
@@ -215,6 +235,8 @@ def settings_for(
         adjoint=adjoint,
         max_steps=max_steps,
         progress=progress,
+        project=project,
+        stabilize=float(stabilize),
     )
 
 
@@ -227,10 +249,15 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
         lambda x: jnp.where(valid, x, jnp.ones_like(x)) if eqx.is_inexact_array(x) else x, (system, state)
     )
 
+    constrained = has_configuration_constraints(system, ts[0], state.q)
+
     def vector_field(t, y, args):
         system, signals = args
         inputs = _inputs(system, signals, t, *y)
-        return tuple(jnp.where(valid, rate, jnp.zeros_like(rate)) for rate in state_rates(system, t, *y, inputs))
+        q_dot, u_dot = state_rates(system, t, *y, inputs)
+        if constrained and settings.stabilize:
+            q_dot = q_dot + settings.stabilize * correction(system, t, y[0])
+        return tuple(jnp.where(valid, rate, jnp.zeros_like(rate)) for rate in (q_dot, u_dot))
 
     # A first step, right or wrong by a factor of ten, spares the two more copies of the right-hand side that diffrax
     # would compile to choose one.
@@ -238,6 +265,9 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
     if settings.step is None:
         smallest = 1e3 * jnp.finfo(ts.dtype).eps * (ts[-1] - ts[0])
         controller = diffrax.PIDController(rtol=settings.rtol, atol=settings.atol, dtmin=smallest, force_dtmin=False)
+        kinks = sample_times(signals)
+        if kinks is not None:  # a step over a kink would be of first order, whatever the solver
+            controller = diffrax.ClipStepSizeController(controller, step_ts=kinks)
     else:
         controller = diffrax.ConstantStepSize()
     at_times = diffrax.SubSaveAt(ts=ts)
@@ -261,6 +291,9 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
     )
     (_, t_end), ((q, u), _) = solution.ts, solution.ys
     reached = (jnp.isfinite(solution.ts[0]) & valid)[:, None]
+    if constrained and settings.project:
+        q = jnp.where(reached, q, state.q)  # what is not finite must not enter the projection either
+        q = jax.vmap(lambda t, q: projected(system, t, q))(ts, q)
     q, u = (jnp.where(reached, y, jnp.nan) for y in (q, u))
     return Trajectory(
         t=ts,

@@ -1,0 +1,92 @@
+"""The audit: energy balance of every entry, its honesty about quadrature, and what it says of what went wrong."""
+
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane._audit import _cumulative_integral
+from jaxkane.catalog import CATALOG
+
+RTOL = 1e-8
+matplotlib.use("agg")
+
+
+def run(name, end=10.0, times=1001, inputs=None, **options):
+    entry = CATALOG[name]
+    system, state = entry.example(), jk.State(jnp.array(entry.q), jnp.array(entry.u))
+    return system, jk.simulate(system, state, jnp.linspace(0.0, end, times), inputs, **options)
+
+
+@pytest.mark.parametrize("name", [name for name in CATALOG if name != "BarWithPiston"])
+def test_energy_balance_of_ten_seconds(name):
+    # Conservative or not: the audit counts the work of dampers, and of the motors of Example 5's engines.
+    audit = jk.audit(*run(name, rtol=1e-10, atol=1e-10))
+    assert audit.energy_balance < RTOL
+    assert audit.work_error < RTOL * audit.kinetic_energy.max()
+    assert audit.ok
+    assert audit.reason == "completed"
+    assert audit.drift < RTOL
+
+
+def test_work_that_the_times_do_not_resolve_is_not_blamed_on_the_motion():
+    # Exercise 5.1 comes to rest within a second: 100 times a second are too few for the damper's work.
+    audit = jk.audit(*run("BarWithPiston", rtol=1e-10, atol=1e-10))
+    assert audit.energy_balance > RTOL
+    assert np.abs(audit.energy_error).max() < 3 * audit.work_error
+    assert "save more times" in str(audit)
+    assert jk.audit(*run("BarWithPiston", times=4001, rtol=1e-10, atol=1e-10)).energy_balance < RTOL
+
+
+def test_inputs_do_work():
+    audit = jk.audit(*run("DoublePendulum", 2.0, 401, {"shoulder_torque": lambda t, s: jnp.sin(t) - s["theta1_dot"]}))
+    assert np.abs(audit.work).max() > 0.1
+    assert audit.energy_balance < 1e-7
+
+
+def test_a_free_body_keeps_its_momenta():
+    audit = jk.audit(*run("RigidBody", 2.0, 21))
+    text = str(audit)
+    assert text.count("conserved\n") == 2
+    assert "configuration" in text  # the norm of the Euler parameters
+    np.testing.assert_allclose(audit.angular_momentum, audit.angular_momentum[:1].repeat(21, 0), atol=1e-6)
+
+
+def test_a_coarse_run_is_found_out():
+    audit = jk.audit(*run("DoublePendulum", 10.0, 501, rtol=1e-2, atol=1e-2))
+    assert not audit.ok
+    assert "bad" in str(audit)
+
+
+def test_conditioning_of_the_bicycle():
+    system, ride = run("WhippleBicycle", 1.0, 11)
+    audit = jk.audit(system, ride)
+    M = jk.mass_matrix(system, 0.0, ride.q[0], ride.u[0])
+    np.testing.assert_allclose(audit.condition_M[0], np.linalg.cond(M), rtol=1e-10)
+    assert audit.velocity_residuals.shape == (11, 3)
+    assert 1 < audit.condition_C_dep.max() < 10
+    assert audit.plot().shape == (2, 2)
+
+
+def test_a_run_that_ended_early_is_audited_up_to_there():
+    bicycle = jk.catalog.WhippleBicycle.benchmark()
+    state = jk.assemble(bicycle, {"roll": 0.3}, {"rear_wheel_rate": -1.0})
+    audit = jk.audit(bicycle, jk.simulate(bicycle, state, jnp.linspace(0.0, 5.0, 101)))
+    assert audit.t[-1] < 1.0
+    assert "singular speeds" in str(audit)  # rolling slowly, the fork turns across
+    assert audit.energy_balance < 1e-5
+
+
+def test_quadrature_is_exact_for_polynomials_at_uneven_times():
+    t = np.sort(np.random.default_rng(3).uniform(0.0, 2.0, 30))
+    integral = _cumulative_integral(t, 8 * t**7 - 1.0, 8)
+    np.testing.assert_allclose(integral, t**8 - t - (t[0] ** 8 - t[0]), rtol=0, atol=1e-10)
+    np.testing.assert_allclose(_cumulative_integral(t[:2], t[:2], 8)[1], 0.5 * (t[1] ** 2 - t[0] ** 2))
+
+
+def test_a_batch_is_refused():
+    system, swing = run("DoublePendulum", 1.0, 5)
+    batch = jk.Trajectory(**{f: getattr(swing, f) for f in swing.__dataclass_fields__} | {"t": swing.t[None]})
+    with pytest.raises(ValueError, match="one member"):
+        jk.audit(system, batch)

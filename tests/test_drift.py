@@ -1,0 +1,97 @@
+"""Drift of configuration constraints, how it is held, and constraints that cannot be solved."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from test_other_systems import FourBarLinkage
+
+import jaxkane as jk
+from jaxkane import best_dependent_speeds
+
+HELD = 1e-9
+
+
+def crank_rocker():
+    """Grashof's condition holds: the crank l2 turns round and round."""
+    system = FourBarLinkage(l1=1.0, l2=0.3, l3=0.9, l4=0.7, rho=1.0)
+    return system, jk.assemble(system, {"q1": 0.5, "q2": 1.0, "q3": 2.0}, {"u1": 4.0})
+
+
+def test_a_minute_of_a_four_bar_linkage():
+    system, state = crank_rocker()
+    ts = jnp.linspace(0.0, 60.0, 601)
+    free = jk.audit(system, jk.simulate(system, state, ts))
+    projected = jk.audit(system, jk.simulate(system, state, ts, project=True))
+    assert free.drift > 10 * HELD
+    assert projected.drift < HELD * 1e-3
+    assert projected.energy_balance < 1e-6
+
+
+def top(**options):
+    entry = jk.catalog.CATALOG["SpinningTop"]
+    system, state = entry.example(), jk.State(jnp.array(entry.q), jnp.array(entry.u))
+    return system, jk.simulate(system, state, jnp.linspace(0.0, 5.0, 26), rtol=1e-5, atol=1e-5, **options)
+
+
+def test_stabilized_and_projected_coordinates_do_not_drift():
+    free, stabilized, projected = (jk.audit(*top(**how)) for how in ({}, {"stabilize": 10.0}, {"project": True}))
+    assert stabilized.drift < 0.3 * free.drift  # what is left is the interpolation between steps
+    assert projected.drift < 1e-14
+
+
+def test_a_projected_motion_has_gradients_also_where_it_ends_early():
+    top = jk.catalog.SpinningTop()
+    entry = jk.catalog.CATALOG["SpinningTop"]
+    state = jk.State(jnp.array(entry.q), jnp.array(entry.u))
+
+    def place(gravity, project, max_steps):
+        system = jk.catalog.SpinningTop(gravity=gravity)
+        options = {"project": project, "adjoint": "forward", "max_steps": max_steps}
+        ride = jk.simulate(system, state, jnp.linspace(0.0, 0.3, 4), **options)
+        return jnp.where(jnp.isfinite(ride.q), ride.q, 0.0)[1]
+
+    free, held = (jax.jacfwd(place)(top.gravity, project, 4096) for project in (False, True))
+    np.testing.assert_allclose(held, free, rtol=0, atol=1e-7)
+    steps = int(jk.simulate(top, state, jnp.linspace(0.0, 0.3, 4)).stats["steps"])
+    np.testing.assert_allclose(jax.jacfwd(place)(top.gravity, True, steps // 2), held, rtol=0, atol=1e-12)
+
+
+def test_the_best_dependent_speeds_of_the_bicycle():
+    bicycle = jk.catalog.WhippleBicycle.benchmark()
+    upright = best_dependent_speeds(bicycle, 0.0, jk.assemble(bicycle, {}).q)
+    assert upright.rank == 3
+    assert "well chosen" in str(upright)
+    # Steered across (91.77 deg for the upright benchmark bicycle), the front wheel has no grip on the yaw.
+    steered = jk.assemble(bicycle, {"steer": np.deg2rad(91.77), "roll": 1e-3})
+    across = best_dependent_speeds(bicycle, 0.0, steered.q)
+    assert across.condition > 100 * across.choices[0][1]
+    assert across.best != bicycle.dependent_speeds
+    assert "would be" in str(across)
+    # in the order of conditioning, and those of one's own among them
+    conditions = [x for _, x in across.choices]
+    assert conditions == sorted(conditions)
+    assert len(conditions) == 20
+
+
+class Twice(jk.System):
+    """A point in a plane whose two residuals say the same; or, with a drift, contradict each other."""
+
+    drift: jk.Scalar = jk.parameter(0.0)  # [m/s]
+    coordinates = ("x", "y")
+    speeds = ()
+    dependent_speeds = ("vx", "vy")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(N.vector(q["x"], q["y"], 0.0), N.vector(u["vx"], u["vy"], 0.0))
+        slope = u["vx"] - 2.0 * u["vy"]
+        return jk.Motion([jk.Body(1.0, 0.0, P)], [slope, 3.0 * slope + self.drift])
+
+
+def test_redundant_and_conflicting_residuals_are_told_apart():
+    redundant = best_dependent_speeds(Twice(), 0.0, jnp.array([0.1, 0.2]))
+    assert (redundant.rank, redundant.redundant, redundant.conflicting) == (1, (1,), ())
+    assert "rank 1" in str(redundant)
+    conflicting = best_dependent_speeds(Twice(drift=0.5), 0.0, jnp.array([0.1, 0.2]))
+    assert conflicting.conflicting == (1,)
+    assert "contradicts" in str(conflicting)
