@@ -66,19 +66,19 @@ def test_inputs_of_every_kind():
 
 
 def test_a_controller_reads_the_state_by_name():
-    """A rider who steers into the fall keeps the bicycle up at 3 m/s, where it falls by itself."""
-    state = jk.assemble(BIKE, {"roll": 0.02}, {"rear_wheel_rate": -3.0 / 0.3})
-    ts = jnp.linspace(0.0, 4.0, 41)
+    """A rider who steers into the fall keeps the bicycle up at 2.5 m/s, where it falls by itself."""
+    state = jk.assemble(BIKE, {"roll": 0.02}, {"rear_wheel_rate": -2.5 / 0.3})
+    ts = jnp.linspace(0.0, 5.0, 51)
 
     def steer_into_the_fall(t, state):
-        return {"steer_torque": 8.0 * state["roll_rate"] + 10.0 * state["roll"] - 0.5 * state["steer_rate"]}
+        return {"steer_torque": 15.0 * state["roll_rate"] + 20.0 * state["roll"] - state["steer_rate"]}
 
     alone, ridden = jk.simulate(BIKE, state, ts), jk.simulate(BIKE, state, ts, steer_into_the_fall)
-    assert not alone.ok or abs(float(alone["roll"][-1])) > 0.2
+    assert not alone.ok
     assert ridden.ok
-    assert abs(float(ridden["roll"][-1])) < 0.01
+    assert float(jnp.abs(ridden["roll"]).max()) < 0.03
     by_name = {"roll_torque": lambda t, state: -0.1 * state["yaw_rate"]}  # a dependent speed
-    assert float(jnp.abs(jk.simulate(BIKE, state, ts, by_name)["roll_torque"]).max()) > 0
+    assert float(jnp.nanmax(jnp.abs(jk.simulate(BIKE, state, ts, by_name)["roll_torque"]))) > 0
 
 
 def test_statuses():
@@ -96,7 +96,7 @@ def test_statuses():
     assert bad.reason == "invalid"
     explodes = jk.simulate(PENDULUM, START, TS, {"elbow_torque": lambda t, state: 1.0 / (0.5 - t) ** 3})
     assert explodes.status in (jk.Status.STEP_TOO_SMALL, jk.Status.MAX_STEPS)
-    assert "0.5" in repr(explodes)
+    assert 0.49 < float(explodes.t_end) < 0.51
 
 
 def test_a_roll_of_eighty_degrees_is_a_fall():

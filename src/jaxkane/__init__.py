@@ -1,6 +1,7 @@
 """Kane's equations in JAX: describe a mechanism; simulate, sweep, linearize and identify it by gradients."""
 
 from . import catalog as catalog
+from . import fit as fit
 from . import rotations as rotations
 from . import sweep as sweep
 from ._assembly import assemble as assemble

@@ -101,7 +101,7 @@ class Instant:
         return flatten_loads(self.system.loads(self.t, self.q, self.u_all, motion, self.inputs))
 
     def along_speeds(self, f: Callable[[Row], Any], direction: Row) -> Any:
-        """The derivative of `f(u)` along a direction of speeds, at u = 0: all of it, since f is affine in the speeds."""
+        """The derivative of `f(u)` along a direction of speeds, at u = 0: all of it, since f is affine in them."""
         zero = jnp.zeros((), jnp.result_type(*([x for x in (*self.q, *self.u) if not is_exact(x)] or [float])))
         return jvp(lambda s: f(tuple(mul(s, x) for x in direction)), (zero,), (jnp.ones_like(zero),))[1]
 

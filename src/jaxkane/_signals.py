@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -63,6 +64,13 @@ def _as_signal(name: str, value: Any, ts: Array) -> Any:
     if isinstance(value, np.ndarray) and not np.all(np.isfinite(value)):
         raise ValueError(f"The samples of {name!r} are not all finite: fill the gaps, or leave that stretch out.")
     return Samples(ts, array)
+
+
+def sample_times(signals: Any) -> Array | None:
+    """All times at which some signal has a kink, in their order; None where there is none."""
+    samples = [x for x in jax.tree.leaves(signals, is_leaf=lambda x: isinstance(x, Samples)) if isinstance(x, Samples)]
+    distinct = {id(x.ts): x.ts for x in samples}
+    return jnp.sort(jnp.concatenate(list(distinct.values()))) if distinct else None
 
 
 def evaluate(signals: Any, t: Component, state: Any) -> dict[str, Component]:
