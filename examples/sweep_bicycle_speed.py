@@ -39,14 +39,16 @@ MAP = plt.get_cmap("turbo")
 def main(folder: Path) -> None:
     bicycle = jk.catalog.WhippleBicycle.benchmark()
     speed = jnp.linspace(1.0, 10.0, 200)
-    upright = jk.assemble(bicycle, {}, {"roll_rate": PUSH})
-    wheel_rate = -speed / bicycle.rR  # the wheels' angles fall when riding forward
-    u = jnp.stack([jnp.full_like(speed, PUSH), wheel_rate, jnp.zeros_like(speed)], axis=-1)  # as bicycle.speeds
+
+    def pushed(speed):  # the wheels' angles fall when riding forward
+        return jk.assemble(bicycle, {}, {"roll_rate": PUSH, "rear_wheel_rate": -speed / bicycle.rR})
+
+    states = jax.vmap(pushed)(speed)
     ts = jnp.linspace(0.0, 10.0, 501)
 
     for attempt in ("first, with compilation", "again"):
         started = time.perf_counter()
-        rides = jax.block_until_ready(jk.sweep.sweep(bicycle, jk.State(upright.q, u), ts))
+        rides = jax.block_until_ready(jk.sweep.sweep(bicycle, states, ts))
         seconds = time.perf_counter() - started
         print(
             f"{attempt + ':':25s}{len(speed)} rides of 10 s in {seconds:5.2f} s, {len(speed) / seconds:4.0f} a second"
