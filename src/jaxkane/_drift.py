@@ -10,13 +10,13 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from ._check import configuration_residual
-from ._equations import _arrays
 from ._fuse import fused
-from ._kane import Instant
+from ._kane import Instant, as_array
 from ._linear import solve, stack
 from ._system import System
 from ._types import Component
@@ -113,15 +113,15 @@ def best_dependent_speeds(system: System, t: Component, q: Any) -> DependentSpee
     name = type(system).__name__
     if not system.dependent_speeds:
         raise ValueError(f"{name} has no dependent speeds.")
-    system, t, q, _, _ = _arrays(system, t, q, (0.0,) * len(system.speeds))
-    C, c0 = (np.asarray(x, dtype=float) for x in constraint_rows(system, t, q))
+    q = as_array(q, system.coordinates, f"{name}: q")
+    C, c0 = (np.asarray(x, dtype=float) for x in constraint_rows(system, jnp.asarray(t, q.dtype), q))
     return dependent_speeds_from(C, c0, (*system.speeds, *system.dependent_speeds), system.dependent_speeds, name)
 
 
 @fused
 def constraint_rows(system: System, t: Component, q: Array) -> tuple[Array, Array]:
     """C (k, n + k) and c0 (k,) of the velocity residuals."""
-    now = Instant(system, t, q, (0.0,) * len(system.speeds))
+    now = Instant(system, t, q, jnp.zeros(len(system.speeds), q.dtype))
     rows = [(*a, *b) for a, b in zip(now.C_ind, now.C_dep, strict=True)]
     c0 = now.residuals(now.t, now.q, (0.0,) * (now.n + now.k))
     return stack(rows).astype(q.dtype), stack([c0])[0].astype(q.dtype)

@@ -9,10 +9,12 @@ from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-from ._check import check_system
+from ._check import check_system, is_concrete
 from ._components import add, dot, matvec, sub
+from ._diagnose import diagnosis
 from ._fuse import fused
 from ._kane import Instant, as_array, checked_inputs, jvp
 from ._linear import is_written_out, solve_positive_array, stack
@@ -65,8 +67,18 @@ def _equations(system, t, q, u, inputs):
 
 
 def accelerations(system: System, t: Component, q: Any, u: Any, inputs: InputValues = None) -> Float[Array, " n"]:
-    """u_dot (n,): time derivatives of the independent speeds, M^-1 f. Arguments as `equations_of_motion`."""
-    return state_rates(*_arrays(system, t, q, u, inputs))[1]
+    """u_dot (n,): time derivatives of the independent speeds, M^-1 f. Arguments as `equations_of_motion`.
+
+    **Raises:** `ValueError` as `equations_of_motion`, and for a speed that no mass moves with, or constraints that
+    cannot be solved for the dependent speeds; under a trace these are NaN or infinite.
+    """
+    arrays = _arrays(system, t, q, u, inputs)
+    _, u_dot = state_rates(*arrays)
+    if is_concrete(u_dot) and not np.all(np.isfinite(u_dot)):
+        wrong = diagnosis(*arrays)
+        if wrong:
+            raise ValueError(wrong)
+    return u_dot
 
 
 def state_rates(

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ._check import check_state, check_system, configuration_residual, configuration_tolerance
+from ._check import check_state, check_system, configuration_residual, configuration_tolerance, is_concrete
+from ._diagnose import diagnosis
 from ._drift import correction, has_configuration_constraints, projected
 from ._equations import dependent_speeds, state_rates
 from ._fuse import fused
@@ -45,6 +46,9 @@ class Status(enum.IntEnum):
     violated a configuration constraint: nothing was solved."""
     INTERRUPTED = 5
     """A sweep was stopped before it came to this member."""
+    NO_SOLUTION = 6
+    """The equations have no finite solution at the first state: a speed that no mass moves with, angles that lock,
+    constraints that cannot be solved for the dependent speeds. One simulation alone raises an error that says which."""
     EVENT = 10
 
 
@@ -102,7 +106,9 @@ class Trajectory(eqx.Module):
         if isinstance(self.status, jax.core.Tracer) or np.ndim(self.status) > 0:
             return f"Trajectory(shape={self.t.shape})"
         steps = int(self.stats["steps"])
-        return f"Trajectory({self.t.shape[-1]} times to {float(self.t_end):.6g} s in {steps} steps: {self.reason})"
+        told = f"Trajectory({self.t.shape[-1]} times to {float(self.t_end):.6g} s in {steps} steps: {self.reason})"
+        advice = _advice(int(self.status), self.reason)
+        return f"{told}. {advice}" if advice else told
 
 
 def reason(code: int, events: tuple[str, ...]) -> str:
@@ -110,6 +116,17 @@ def reason(code: int, events: tuple[str, ...]) -> str:
     if code >= Status.EVENT:
         return events[code - Status.EVENT].replace("_", " ")
     return Status(code).name.lower().replace("_", " ")
+
+
+def _advice(code: int, reason: str) -> str:
+    if reason.startswith("gimbal lock"):
+        return "Angles lock there: describe the orientation with Euler parameters, or with another sequence of angles."
+    advice = {
+        Status.SINGULAR_SPEEDS: "Choose other dependent speeds: see jaxkane.best_dependent_speeds(system, t, q).",
+        Status.STEP_TOO_SMALL: "Something becomes infinite or jumps: look at the last times that were reached.",
+        Status.MAX_STEPS: "Raise max_steps; or look for what is stiff or jumps.",
+    }
+    return advice.get(Status(code), "") if code < Status.EVENT else ""
 
 
 class Now(eqx.Module):
@@ -171,8 +188,8 @@ def simulate(
 
     **Returns:** a `Trajectory`. A motion that cannot go on ends early, with its reason in `status`.
 
-    **Raises:** `ValueError` for wrong shapes or times, an unknown input, coordinates that violate a constraint, or a
-    description that contradicts itself.
+    **Raises:** `ValueError` for wrong shapes or times, an unknown input, coordinates that violate a constraint, a
+    description that contradicts itself, or equations without a finite solution at the first state.
     """
     state = checked_state(system, state)
     ts = checked_times(ts, state.q.dtype)
@@ -191,7 +208,16 @@ def simulate(
         max_steps=max_steps,
         progress=progress,
     )
-    return solve(system, state, ts, signals, settings)
+    ride = solve(system, state, ts, signals, settings)
+    if is_concrete(ride.status) and ride.status == Status.NO_SOLUTION:
+        inputs_now = _inputs(system, signals, ts[0], state.q, state.u)
+        raise ValueError(
+            diagnosis(system, ts[0], state.q, state.u, inputs_now) or _UNSOLVED.format(type(system).__name__)
+        )
+    return ride
+
+
+_UNSOLVED = "{}: the solver cannot take a first step: accelerations or rates are not finite beside the first state."
 
 
 class Settings(eqx.Module):
@@ -362,6 +388,8 @@ def _status(solution: diffrax.Solution, stops: dict[str, Any]) -> Array:
     result = solution.result
     status = jnp.where(result == diffrax.RESULTS.successful, Status.COMPLETED, Status.STEP_TOO_SMALL)
     status = jnp.where(result == diffrax.RESULTS.max_steps_reached, Status.MAX_STEPS, status)
+    unmoved = (status == Status.STEP_TOO_SMALL) & (solution.stats["num_accepted_steps"] == 0)
+    status = jnp.where(unmoved, Status.NO_SOLUTION, status)
     if stops:
         names = [name for name in stops if name != _SINGULAR]
         for name, happened in (solution.event_mask or {}).items():
