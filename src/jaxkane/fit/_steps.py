@@ -23,7 +23,7 @@ def usable(at: Linearization | None) -> bool:
     return at is not None and bool(np.all(at.good))
 
 
-def settle(problem: Problem, point: Point, steps: int = 8, rtol: float = 1e-3) -> tuple[Point, Linearization]:
+def settle(problem: Problem, point: Point, steps: int = 8, rtol: float = 1e-2) -> tuple[Point, Linearization]:
     """The nuisance values that fit best with the parameters held: Gauss-Newton, damped where that fails.
 
     Windows that cannot be simulated to their end with the first guess (an unstable ride falls over) begin with a
