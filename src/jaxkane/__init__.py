@@ -2,6 +2,7 @@
 
 from . import catalog as catalog
 from . import fit as fit
+from . import loads as loads
 from . import rotations as rotations
 from . import sweep as sweep
 from ._assembly import assemble as assemble

@@ -1,0 +1,132 @@
+"""Loads that people expect: springs, dampers, actuators and friction between points and between frames.
+
+Each returns a tuple of `Force`s or `Torque`s, with the reaction on the other end, for `System.loads`:
+
+    def loads(self, t, q, u, motion, inputs):
+        P, Q = motion["P"], motion["Q"]
+        return jk.loads.spring(P, Q, self.stiffness, self.length), jk.weight(motion, -9.81 * motion.N.y)
+
+A follower needs no function of its own: `jk.Force(10.0 * B.x, P)` turns with the frame B. Where a law is not linear,
+give a function of the extension, the rate or the angle in the place of the coefficient: `lambda x: k * x + k3 * x**3`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+
+from ._components import is_zero
+from ._system import Body, Force, Torque
+from ._types import Component
+from ._vectors import Frame, Point, Vector
+
+Law = Component | Callable[[Component], Component]
+
+
+def spring(P: Point | Body, Q: Point | Body, stiffness: Law, length: Component = 0.0) -> tuple[Force, Force]:
+    """A spring between two points, which pulls them together when it is longer than at rest.
+
+        tension = stiffness * (|r| - length),   r from P to Q
+
+    **Arguments:** `stiffness` [N/m], or a function extension [m] -> tension [N]; `length` at rest [m]. A linear spring
+    of zero length may shrink to a point, any other may not: its direction is lost there.
+    """
+    P, Q = _point(P), _point(Q)
+    r = Q.position_from(P)
+    if is_zero(length) and not callable(stiffness):
+        return _pair(stiffness * r, P, Q)
+    distance = r.norm()
+    return _pair(_law(stiffness, distance - length) * (r / distance), P, Q)
+
+
+def damper(P: Point | Body, Q: Point | Body, damping: Law) -> tuple[Force, Force]:
+    """A damper between two points, along the line that joins them.
+
+        tension = damping * d|r|/dt
+
+    **Arguments:** `damping` [N s/m], or a function rate [m/s] -> tension [N].
+    """
+    P, Q = _point(P), _point(Q)
+    direction = Q.position_from(P).normalize()
+    rate = (Q.velocity - P.velocity).dot(direction)
+    return _pair(_law(damping, rate) * direction, P, Q)
+
+
+def actuator(P: Point | Body, Q: Point | Body, force: Component) -> tuple[Force, Force]:
+    """A strut that pushes two points apart with `force` [N], and pulls where it is negative."""
+    P, Q = _point(P), _point(Q)
+    return _pair(-force * Q.position_from(P).normalize(), P, Q)
+
+
+def torsional_spring(
+    on: Frame | Body, reaction_on: Frame | Body | None, axis: Vector, angle: Component, stiffness: Law
+) -> tuple[Torque]:
+    """A spring in a hinge, which turns `on` back about `axis`.
+
+        T = -stiffness * angle * axis
+
+    **Arguments:** `axis`: a unit Vector along the hinge; `angle` of `on` about it from rest, relative to `reaction_on`
+    (None: the ground) [rad]; `stiffness` [N m/rad], or a function angle -> torque [N m].
+    """
+    return (Torque(-_law(stiffness, angle) * axis, on, reaction_on),)
+
+
+def torsional_damper(on: Frame | Body, reaction_on: Frame | Body | None, axis: Vector, damping: Law) -> tuple[Torque]:
+    """A damper in a hinge along `axis`.
+
+        T = -damping * (relative angular velocity . axis) * axis
+
+    **Arguments:** as `torsional_spring`; `damping` [N m s/rad], or a function rate [rad/s] -> torque [N m].
+    """
+    return (Torque(-_law(damping, _rate(on, reaction_on).dot(axis)) * axis, on, reaction_on),)
+
+
+def friction(
+    P: Point | Body,
+    Q: Point | Body | None,
+    normal_force: Component,
+    coefficient: Component,
+    normal: Vector | None = None,
+    *,
+    speed: Component = 1e-2,
+) -> tuple[Force, ...]:
+    """Coulomb friction at P, smoothed where the sliding changes its direction.
+
+        F = -coefficient * normal_force * v / sqrt(v . v + speed^2),   v the velocity of P relative to Q
+
+    **Arguments:** `Q`: the point of the other body, None for the ground; `normal_force` [N], not negative; `normal`: a
+    unit Vector across the surface, of which v is cleared; `speed` [m/s]: well above it friction is Coulomb's, below it
+    viscous, so that nothing sticks: it creeps. The equations become stiff as it falls.
+    """
+    P = _point(P)
+    v = P.velocity if Q is None else P.velocity - _point(Q).velocity
+    if normal is not None:
+        v = v - v.dot(normal) * normal
+    F = -(coefficient * normal_force) * (v / jnp.sqrt(v.dot(v) + speed**2))
+    return (Force(F, P),) if Q is None else (Force(F, P), Force(-F, _point(Q)))
+
+
+def torsional_friction(
+    on: Frame | Body, reaction_on: Frame | Body | None, axis: Vector, torque: Component, *, rate: Component = 1e-2
+) -> tuple[Torque]:
+    """Dry friction in a hinge along `axis`, smoothed: T = -torque * w / sqrt(w^2 + rate^2) [N m], w [rad/s]."""
+    w = _rate(on, reaction_on).dot(axis)
+    return (Torque(-torque * w / jnp.sqrt(w * w + rate**2) * axis, on, reaction_on),)
+
+
+def _law(law: Law, x: Component) -> Component:
+    return law(x) if callable(law) else law * x
+
+
+def _point(part: Point | Body) -> Point:
+    return part.center if isinstance(part, Body) else part
+
+
+def _pair(pull: Vector, P: Point, Q: Point) -> tuple[Force, Force]:
+    """`pull` acts on P towards Q, and its reaction on Q."""
+    return Force(pull, P), Force(-pull, Q)
+
+
+def _rate(on: Frame | Body, reaction_on: Frame | Body | None) -> Vector:
+    return on.angular_velocity if reaction_on is None else on.angular_velocity - reaction_on.angular_velocity

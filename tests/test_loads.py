@@ -1,0 +1,130 @@
+"""Springs, dampers, actuators and friction: each in a description of a few lines, against what it must do by hand."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+
+RTOL = 1e-12
+
+
+class Two(jk.System):
+    """Two particles in a plane, and between them what `law(P, Q, motion)` says."""
+
+    coordinates = ("x1", "y1", "x2", "y2")
+    speeds = ("vx1", "vy1", "vx2", "vy2")
+    inputs = ("force",)
+    law = staticmethod(lambda P, Q, inputs: ())
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P, Q = (O.moving(q[i] * N.x + q[i + 1] * N.y, u[i] * N.x + u[i + 1] * N.y) for i in (0, 2))
+        bodies = [jk.Body(2.0, 0.0, P, N, name="one"), jk.Body(3.0, 0.0, Q, N, name="two")]
+        return jk.Motion(bodies, points={"P": P, "Q": Q})
+
+    def loads(self, t, q, u, motion, inputs):
+        return self.law(motion["P"], motion["Q"], inputs)
+
+
+def forces(law, q, u=(0.0, 0.0, 0.0, 0.0), inputs=None):
+    """Forces on both particles (2, 2), from their accelerations."""
+    system = type("Two", (Two,), {"law": staticmethod(law)})()
+    u_dot = jk.accelerations(system, 0.0, jnp.array(q), jnp.array(u), inputs)
+    return np.array(u_dot).reshape(2, 2) * np.array([[2.0], [3.0]])
+
+
+Q0 = (1.0, 2.0, 4.0, 6.0)  # five metres apart, along (0.6, 0.8)
+ALONG = np.array([0.6, 0.8])
+
+
+@pytest.mark.parametrize(
+    ("law", "tension"),
+    [
+        (lambda P, Q, i: jk.loads.spring(P, Q, 10.0, 4.5), 5.0),
+        (lambda P, Q, i: jk.loads.spring(P, Q, 10.0), 50.0),
+        (lambda P, Q, i: jk.loads.spring(P, Q, lambda x: 10.0 * x + 4.0 * x**3, 4.0), 14.0),
+        (lambda P, Q, i: jk.loads.damper(P, Q, 2.0), 2.0 * 1.4),
+        (lambda P, Q, i: jk.loads.damper(P, Q, lambda v: 3.0 * v**3), 3.0 * 1.4**3),
+        (lambda P, Q, i: jk.loads.actuator(P, Q, i["force"]), -7.0),
+    ],
+)
+def test_struts_pull_along_their_line_with_their_reaction(law, tension):
+    on_P, on_Q = forces(law, Q0, (0.0, 1.0, 1.0, 2.0), {"force": 7.0})  # they part at (1, 1) . (0.6, 0.8)
+    np.testing.assert_allclose(on_P, tension * ALONG, rtol=RTOL)
+    np.testing.assert_allclose(on_Q, -tension * ALONG, rtol=RTOL)
+
+
+def test_a_spring_of_no_length_may_shrink_to_a_point():
+    law = lambda P, Q, i: jk.loads.spring(P, Q, 10.0)  # noqa: E731
+    system = type("Two", (Two,), {"law": staticmethod(law)})()
+    f = lambda q: jk.accelerations(system, 0.0, q, jnp.zeros(4))  # noqa: E731
+    stiffness = jax.jacfwd(f)(jnp.array([1.0, 1.0, 1.0, 1.0]))
+    np.testing.assert_allclose(stiffness[0], [-5.0, 0.0, 5.0, 0.0])
+
+
+def test_friction_is_coulombs_but_for_its_smoothing():
+    def law(P, Q, inputs):
+        return jk.loads.friction(P, Q, 20.0, 0.5, speed=1e-6)
+
+    on_P, on_Q = forces(law, Q0, (3.0, 4.0, 0.0, 0.0))
+    np.testing.assert_allclose(on_P, -10.0 * ALONG, rtol=1e-10)
+    np.testing.assert_allclose(on_Q, -on_P, rtol=RTOL)
+    at_rest, _ = forces(lambda P, Q, i: jk.loads.friction(P, None, 20.0, 0.5), Q0)
+    np.testing.assert_allclose(at_rest, 0.0)
+    # along a surface only: the part of the velocity across it is not sliding
+    on_P, on_Q = forces(
+        lambda P, Q, i: jk.loads.friction(P, None, 20.0, 0.5, P.velocity.frame.y, speed=1e-6), Q0, (3.0, 4.0, 0.0, 0.0)
+    )
+    np.testing.assert_allclose([on_P, on_Q], [[-10.0, 0.0], [0.0, 0.0]], rtol=1e-10)
+
+
+class Hinged(jk.System):
+    """A disk on a shaft on the ground, both about N.z; spring, damper and dry friction between them."""
+
+    coordinates = ("shaft", "disk")
+    speeds = ("shaft_rate", "disk_rate")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        S = N.rotate(3, q[0], u[0], "S")
+        D = N.rotate(3, q[1], u[1], "D")
+        bodies = [jk.Body(1.0, (0.5, 0.5, 1.0), O, S, name="shaft"), jk.Body(1.0, (1.0, 1.0, 2.0), O, D, name="disk")]
+        return jk.Motion(bodies)
+
+    def loads(self, t, q, u, motion, inputs):
+        N, shaft, disk = motion.N, motion["shaft"], motion["disk"]
+        return (
+            jk.loads.torsional_spring(disk, shaft, N.z, q["disk"] - q["shaft"], lambda a: 8.0 * jnp.sin(a)),
+            jk.loads.torsional_damper(disk, shaft, N.z, 0.3),
+            jk.loads.torsional_friction(shaft, None, N.z, 0.7, rate=1e-8),
+        )
+
+
+def test_hinges():
+    u_dot = jk.accelerations(Hinged(), 0.0, jnp.array([0.2, 0.7]), jnp.array([1.5, -0.5]))
+    on_disk = -8.0 * np.sin(0.5) + 0.3 * 2.0
+    np.testing.assert_allclose(u_dot, [-on_disk - 0.7, on_disk / 2.0], rtol=1e-10)
+
+
+def test_what_a_spring_takes_it_gives_back():
+    law = lambda P, Q, i: jk.loads.spring(P, Q, 10.0, 4.5)  # noqa: E731
+    system = type("Two", (Two,), {"law": staticmethod(law)})()
+    state = jk.State(jnp.array(Q0), jnp.array([0.0, 1.0, 1.0, -0.5]))
+    ride = jk.simulate(system, state, jnp.linspace(0.0, 3.0, 301), rtol=1e-10, atol=1e-10)
+    audit = jk.audit(system, ride)
+    assert audit.energy_balance < 1e-9
+    distance = np.hypot(ride["x2"] - ride["x1"], ride["y2"] - ride["y1"])
+    potential = 5.0 * (distance - 4.5) ** 2
+    np.testing.assert_allclose(audit.kinetic_energy + potential, audit.kinetic_energy[0] + potential[0], rtol=1e-9)
+    assert "conserved" in str(audit)
+
+
+def test_loads_take_bodies_for_their_mass_centres():
+    class Bodies(Two):
+        def loads(self, t, q, u, motion, inputs):
+            return jk.loads.spring(motion["one"], motion["two"], 10.0, 4.5)
+
+    u_dot = jk.accelerations(Bodies(), 0.0, jnp.array(Q0), jnp.zeros(4))
+    np.testing.assert_allclose(u_dot[:2], 2.5 * ALONG, rtol=RTOL)
