@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from ._components import cross
 from ._fuse import fused
@@ -25,7 +26,7 @@ _CHECKED: weakref.WeakSet[type] = weakref.WeakSet()
 
 def is_concrete(*trees: Any) -> bool:
     """Whether all arrays in these are numbers rather than traced."""
-    return not any(isinstance(x, jax.core.Tracer) for x in jax.tree.leaves(trees))
+    return not any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))
 
 
 def is_batch(system: System) -> bool:

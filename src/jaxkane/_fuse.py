@@ -224,7 +224,7 @@ def _is_plain(program: Jaxpr) -> bool:
     for equation in program.eqns:
         if equation.primitive.name not in _PLAIN:
             return False
-        if equation.primitive.name == "reduce_sum" and equation.invars[0].aval.size > _LARGEST_SUM:
+        if equation.primitive.name == "reduce_sum" and getattr(equation.invars[0].aval, "size", 0) > _LARGEST_SUM:
             return False
         if equation.primitive.name in _CALLS and not _is_plain(equation.params["jaxpr"].jaxpr):
             return False

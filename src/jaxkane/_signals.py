@@ -76,7 +76,8 @@ def sample_times(signals: Any) -> Array | None:
 def evaluate(signals: Any, t: Component, state: Any) -> dict[str, Component]:
     """The inputs' values at one time."""
     if callable(signals):
-        return dict(signals(t, state))
+        values: Any = signals(t, state)
+        return dict(values)
     return {name: signal(t, state) if callable(signal) else signal for name, signal in signals.items()}
 
 

@@ -11,6 +11,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ._components import component, dot
@@ -99,9 +100,8 @@ class Body:
         return f"Body({self.name})"
 
 
-def _inertia(inertia: Any, name: str) -> tuple[Triple, Triple, Triple]:
-    if isinstance(inertia, (int, float)) and inertia == 0:
-        inertia = (0.0, 0.0, 0.0)
+def _inertia(given: Any, name: str) -> tuple[Triple, Triple, Triple]:
+    inertia: Any = (0.0, 0.0, 0.0) if isinstance(given, (int, float)) and given == 0 else given
     shape = np.shape(inertia) if hasattr(inertia, "shape") else (len(inertia), *_inner(inertia))
     if shape == (3,):
         a, b, c = (component(x) for x in inertia)
@@ -308,11 +308,11 @@ class System(eqx.Module):
         for name, info in parameter_info(self).items():
             check_parameter(f"{type(self).__name__}.{name}", getattr(self, name), info)
 
-    def motion(self, t: Component, q: Values, u: Values) -> Motion:
+    def motion(self, t: Component, q: Any, u: Any) -> Motion:
         """Bodies and velocity residuals at time `t` [s], coordinates `q` and speeds `u`."""
         raise NotImplementedError(f"{type(self).__name__} must define motion(self, t, q, u) and return a Motion.")
 
-    def q_dot(self, t: Component, q: Values, u: Values) -> Sequence[Component]:
+    def q_dot(self, t: Component, q: Any, u: Any) -> Sequence[Component]:
         """Rates of the coordinates. By default they are the speeds."""
         n_q, n = len(self.coordinates), len(self.speeds) + len(self.dependent_speeds)
         if n_q != n:
@@ -322,15 +322,15 @@ class System(eqx.Module):
             )
         return u[:n_q]
 
-    def loads(self, t: Component, q: Values, u: Values, motion: Motion, inputs: Mapping[str, Component]) -> Any:
+    def loads(self, t: Component, q: Any, u: Any, motion: Motion, inputs: Mapping[str, Component]) -> Any:
         """Active forces and torques: `Force`s and `Torque`s, nested in tuples as is convenient."""
         return ()
 
-    def configuration_constraints(self, t: Component, q: Values) -> Sequence[Component]:
+    def configuration_constraints(self, t: Component, q: Any) -> Sequence[Component]:
         """Residuals that are zero in every possible configuration."""
         return ()
 
-    def events(self, t: Component, q: Values, u: Values) -> Mapping[str, Component]:
+    def events(self, t: Component, q: Any, u: Any) -> Mapping[str, Component]:
         """Signed, smooth quantities by name; a simulation stops, with that name as its status, where one vanishes."""
         return {}
 
@@ -362,7 +362,7 @@ def _values(values: Any, names: Sequence[str], label: str, n_optional: int = 0) 
 
 def check_parameter(label: str, value: Any, info: ParameterInfo) -> None:
     """Refuse what is no finite float; a batch is left to the status of its members."""
-    if isinstance(value, jax.core.Tracer):
+    if isinstance(value, Tracer):
         return
     if not (isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)):
         raise TypeError(f"{label} must be a real number or a float array, got {value!r}.")

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from jaxtyping import Array, Float
 
-Scalar: TypeAlias = Float[Array, ""]
-"""A physical parameter: one float array without axes."""
+if TYPE_CHECKING:
+    Scalar: TypeAlias = Any  # numbers are given, arrays are kept: no checker follows the conversion
+else:
+    Scalar = Float[Array, ""]
+    """A physical parameter: one float array without axes."""
 
 Component: TypeAlias = Any
 """One component of a vector: a float array without axes, or an exact Python float."""

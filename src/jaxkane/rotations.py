@@ -47,10 +47,12 @@ def _frozen(rows) -> Matrix:
 
 
 def transpose(matrix: Matrix) -> Matrix:
+    """The transpose: for a rotation matrix, its inverse."""
     return _frozen(zip(*matrix, strict=True))
 
 
 def matmul(a: Matrix, b: Matrix) -> Matrix:
+    """The product a b."""
     columns = transpose(b)
     return _frozen([dot(row, column) for column in columns] for row in a)
 

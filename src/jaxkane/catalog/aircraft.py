@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 
 from .. import rotations
 from .._system import Body, Force, Motion, System, Torque, parameter
-from .._types import Scalar
-from .._vectors import Point, inertial
+from .._types import Component, Scalar
+from .._vectors import Frame, Point, inertial
 
 
 class _Aircraft(System):
@@ -30,6 +32,12 @@ class _Aircraft(System):
 
     speeds = ("v1", "v2", "v3", "omega1", "omega2", "omega3")
     inputs = ("force1", "force2", "force3", "torque1", "torque2", "torque3")
+
+    def _airframe(self, N: Frame, q, u) -> Frame:
+        raise NotImplementedError
+
+    def _orientation_rates(self, q, u) -> Sequence[Component]:
+        raise NotImplementedError
 
     def q_dot(self, t, q, u):
         N, _ = inertial()

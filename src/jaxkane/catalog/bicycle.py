@@ -25,6 +25,11 @@ _BENCHMARK = {
 # What other sources write out although the model implies it: the name, and what it must be equal to.
 _IMPLIED = {"IRzz": "IRxx", "IFzz": "IFxx", "yB": None, "yH": None}
 
+# BicycleParameters' split of the front assembly H into handlebar G and fork S, which H already holds.
+_PARTS_OF_H = frozenset(f"{what}{part}" for part in "GS" for what in ("m", "x", "z")) | frozenset(
+    f"I{part}{axes}" for part in "GS" for axes in ("xx", "yy", "zz", "xz")
+)
+
 
 class WhippleBicycle(System):
     """A bicycle with four rigid bodies, knife-edge wheels and ideal rolling on level ground (Example 7).
@@ -116,13 +121,14 @@ class WhippleBicycle(System):
     def from_file(cls, path: str | os.PathLike[str]) -> WhippleBicycle:
         """A bicycle from a text file of BicycleParameters (`NAME = value+/-deviation`).
 
-        The deviations are read by `jaxkane.catalog.read_bicycle_file`.
+        The deviations are read by `jaxkane.catalog.read_bicycle_file`. Where a file also splits the front assembly H
+        into handlebar G and fork S, those parts are passed over.
 
         **Raises:** `ValueError` that names the lines that are unknown, repeated or malformed, and what is missing.
         """
-        values, _ = read_bicycle_file(path, known=(*parameter_info(cls), *_IMPLIED))
+        values, _ = read_bicycle_file(path, known=(*parameter_info(cls), *_IMPLIED, *_PARTS_OF_H))
         try:
-            return cls.from_parameters(values)
+            return cls.from_parameters({name: x for name, x in values.items() if name not in _PARTS_OF_H})
         except ValueError as error:
             raise ValueError(f"{os.fspath(path)}: {error}") from None
 
