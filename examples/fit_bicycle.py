@@ -177,7 +177,7 @@ def draw_parameters(ax, result, truth):
                 (1.02, i), xycoords=("axes fraction", "data"), color="0.3", va="center", annotation_clip=False,
             )  # fmt: skip
         ax.axvline(0.0, color=TRUE, linewidth=1.2, label="truth")
-        ax.set(yticks=range(len(names)), yticklabels=names, ylim=(len(names) - 0.4, -0.6))
+        ax.set(yticks=range(len(names)), yticklabels=names, ylim=(len(names) + 0.4, -0.6))
         ax.set(xlabel="difference from the truth [%]", title="parameters: all started 20 % off")
         widest = max(abs(x) for x in ax.get_xlim())
         ax.set_xlim(-1.1 * widest, 1.1 * widest)

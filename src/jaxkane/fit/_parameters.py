@@ -124,6 +124,7 @@ def _value(e: _Entry, x: Array) -> Array:
     if e.lower is None:
         span = e.upper - e.start
         return e.upper - span * jnp.exp(-e.scale / span * x)
+    assert e.lower is not None
     width = e.upper - e.lower
     share = (e.start - e.lower) / width
     return e.lower + width * jax.nn.sigmoid(math.log(share / (1 - share)) + e.scale / (width * share * (1 - share)) * x)

@@ -279,7 +279,11 @@ def _linearize(problem: Problem, point: Point, starts: Array, starts_dot: Array)
 @eqx.filter_jit
 def _rides(problem: Problem, point: Point, starts: Array) -> Trajectory:
     windows = problem.windows
-    return _each(problem, lambda a: problem.simulate(*a, point.x), (windows, starts, point.b[windows.trial]))
+    return _each(
+        problem,
+        lambda each: problem.simulate(each[0], each[1], each[2], point.x),
+        (windows, starts, point.b[windows.trial]),
+    )
 
 
 def _each(problem: Problem, f: Callable[..., Any], windows: Any) -> Any:
