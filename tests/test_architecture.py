@@ -16,7 +16,8 @@ SOURCE = Path(jk.__file__).parent
 FLOORS = [
     ["_types", "_components", "_linear", "_fuse"],
     ["rotations", "_vectors"],
-    ["_system", "loads"],
+    ["_system"],
+    ["loads"],
     ["catalog"],
     ["_kane"],
     ["_check"],
