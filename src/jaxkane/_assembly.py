@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -68,17 +69,16 @@ def _solve_configuration(system: System, q0, t, free: tuple[str, ...]):
     n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q0).shape[0]
     if n_h == 0:
         return q0
-    places = [system.coordinates.index(c) for c in free] or list(range(len(system.coordinates)))
+    places = tuple(system.coordinates.index(c) for c in free) or tuple(range(len(system.coordinates)))
     if len(places) < n_h:
         raise ValueError(
             f"{name}: {n_h} configuration constraints cannot be met by moving {len(places)} coordinates "
             f"({', '.join(free)})."
         )
-    places = np.array(places)
     found = _newton(system, q0, t, places)
     if is_concrete(system, found.q, t) and not bool(found.good):
         # The guess may be where the residual has no slope, as an Euler parameter of zero: look from beside it.
-        again = _newton(system, q0.at[places].add(1.0), t, places)
+        again = _newton(system, q0.at[np.array(places)].add(1.0), t, places)
         if not bool(again.good):
             raise ValueError(_why_not(system, q0, places, found))
         found = again
@@ -93,7 +93,9 @@ class _Found(NamedTuple):
     steps: Any
 
 
-def _newton(system: System, q0, t, places) -> _Found:
+@eqx.filter_jit
+def _newton(system: System, q0, t, where: tuple[int, ...]) -> _Found:
+    places = np.array(where)
     n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q0).shape[0]
     if len(places) == n_h:
         directions = jnp.eye(n_h, dtype=q0.dtype)

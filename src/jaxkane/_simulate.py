@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import enum
-from typing import Any, Literal
+import functools
+from typing import Any, Literal, cast
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from ._check import check_state, check_system, configuration_residual, configuration_tolerance, is_concrete
@@ -31,7 +33,7 @@ ADJOINTS = {
 
 
 class Status(enum.IntEnum):
-    """How a simulation ended. Codes from `EVENT` on are events of the system, in the order of `System.events`."""
+    """How a simulation ended. Codes from `EVENT` on are events of the system, in the order of the alphabet."""
 
     COMPLETED = 0
     """Reached the last time."""
@@ -103,7 +105,7 @@ class Trajectory(eqx.Module):
         return State(self.q[..., i, :], self.u[..., i, :])
 
     def __repr__(self) -> str:
-        if isinstance(self.status, jax.core.Tracer) or np.ndim(self.status) > 0:
+        if isinstance(self.status, Tracer) or np.ndim(self.status) > 0:
             return f"Trajectory(shape={self.t.shape})"
         steps = int(self.stats["steps"])
         told = f"Trajectory({self.t.shape[-1]} times to {float(self.t_end):.6g} s in {steps} steps: {self.reason})"
@@ -249,16 +251,14 @@ def settings_for(
 ) -> Settings:
     """The options of `simulate`, with defaults that follow the type of the times."""
     default = 1e-8 if ts.dtype == jnp.float64 else 1e-5
-    if isinstance(adjoint, str):
-        if adjoint not in ADJOINTS:
-            raise ValueError(f"adjoint is one of {', '.join(ADJOINTS)}, or a diffrax adjoint; got {adjoint!r}.")
-        adjoint = ADJOINTS[adjoint]()
+    if isinstance(adjoint, str) and adjoint not in ADJOINTS:
+        raise ValueError(f"adjoint is one of {', '.join(ADJOINTS)}, or a diffrax adjoint; got {adjoint!r}.")
     return Settings(
         rtol=default if rtol is None else rtol,
         atol=default if atol is None else atol,
         solver=diffrax.Tsit5() if solver is None else solver,
         step=step,
-        adjoint=adjoint,
+        adjoint=ADJOINTS[adjoint]() if isinstance(adjoint, str) else adjoint,
         max_steps=max_steps,
         progress=progress,
         project=project,
@@ -279,10 +279,10 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
 
     def vector_field(t, y, args):
         system, signals = args
-        inputs = _inputs(system, signals, t, *y)
-        q_dot, u_dot = state_rates(system, t, *y, inputs)
+        q, u = y
+        q_dot, u_dot = state_rates(system, t, q, u, _inputs(system, signals, t, q, u))
         if constrained and settings.stabilize:
-            q_dot = q_dot + settings.stabilize * correction(system, t, y[0])
+            q_dot = q_dot + settings.stabilize * correction(system, t, q)
         return tuple(jnp.where(valid, rate, jnp.zeros_like(rate)) for rate in (q_dot, u_dot))
 
     # A first step, right or wrong by a factor of ten, spares the two more copies of the right-hand side that diffrax
@@ -315,8 +315,9 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
         progress_meter=diffrax.TqdmProgressMeter() if settings.progress else diffrax.NoProgressMeter(),
         throw=False,
     )
-    (_, t_end), ((q, u), _) = solution.ts, solution.ys
-    reached = (jnp.isfinite(solution.ts[0]) & valid)[:, None]
+    times, states = cast(Any, (solution.ts, solution.ys))
+    (t_reached, t_end), ((q, u), _) = times, states
+    reached = (jnp.isfinite(t_reached) & valid)[:, None]
     if constrained and settings.project:
         q = jnp.where(reached, q, state.q)  # what is not finite must not enter the projection either
         q = jax.vmap(lambda t, q: projected(system, t, q))(ts, q)
@@ -369,19 +370,23 @@ _SINGULAR = "dependent speeds singular"
 
 def _stops(system: System, t0: Array, state: State) -> dict[str, Any]:
     """Signed, smooth quantities (t, y, args) whose change of sign ends the simulation."""
-
-    def event(name):
-        def value(t, y, args, **_):
-            now = Instant(args[0], t, *y)
-            return jnp.asarray(args[0].events(t, now.q, now.u_all)[name])
-
-        return value
-
-    now = Instant(system, t0, state.q, state.u)
-    stops = {name: event(name) for name in system.events(t0, now.q, now.u_all)}
+    names = jax.eval_shape(_events, system, t0, state.q, state.u)
+    stops: dict[str, Any] = {}
+    for name in names:
+        stops[name] = lambda t, y, args, name=name, **_: _event(name)(args[0], t, *y)
     if system.dependent_speeds:
         stops[_SINGULAR] = lambda t, y, args, **_: _determinant(args[0], t, *y)
     return stops
+
+
+def _events(system: System, t: Component, q: Array, u: Array) -> dict[str, Array]:
+    now = Instant(system, t, q, u)
+    return {name: jnp.asarray(value, dtype=q.dtype) for name, value in system.events(t, now.q, now.u_all).items()}
+
+
+@functools.cache
+def _event(name: str) -> Any:
+    return fused(lambda *now: _events(*now)[name])
 
 
 def _status(solution: diffrax.Solution, stops: dict[str, Any]) -> Array:
@@ -403,8 +408,8 @@ def checked_times(ts: Any, dtype: Any) -> Array:
     ts = jnp.asarray(ts, dtype=dtype)
     if ts.ndim != 1 or ts.shape[0] < 2:
         raise ValueError(f"`ts` must be at least two times in an array of shape (n_t,), got the shape {ts.shape}.")
-    if not isinstance(ts, jax.core.Tracer):
-        steps = np.diff(np.asarray(ts))
+    if not isinstance(ts, Tracer):
+        steps: Any = np.diff(np.asarray(ts))
         if not np.all(np.isfinite(steps)):
             raise ValueError("`ts` holds times that are not finite.")
         if not np.all(steps > 0):
