@@ -116,15 +116,14 @@ class Parameters(eqx.Module):
 
 
 def _value(e: _Entry, x: Array) -> Array:
-    if e.lower is None and e.upper is None:
-        return e.start + e.scale * x
+    if e.lower is None:
+        if e.upper is None:
+            return e.start + e.scale * x
+        span = e.upper - e.start
+        return e.upper - span * jnp.exp(-e.scale / span * x)
     if e.upper is None:
         span = e.start - e.lower
         return e.lower + span * jnp.exp(e.scale / span * x)
-    if e.lower is None:
-        span = e.upper - e.start
-        return e.upper - span * jnp.exp(-e.scale / span * x)
-    assert e.lower is not None
     width = e.upper - e.lower
     share = (e.start - e.lower) / width
     return e.lower + width * jax.nn.sigmoid(math.log(share / (1 - share)) + e.scale / (width * share * (1 - share)) * x)
