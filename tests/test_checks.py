@@ -246,6 +246,8 @@ def test_assemble_says_when_it_cannot():
         jk.assemble(OnACircle(), {"x": 2.0})
     with pytest.raises(ValueError, match=r"pitch_rate = 3 contradicts the velocity constraints"):
         jk.assemble(bike, {"roll": 0.1}, {"rear_wheel_rate": -10.0, "pitch_rate": 3.0})
+    with pytest.raises(ValueError, match="WhippleBicycle: steer, roll_rate is not finite"):
+        jk.assemble(bike, {"steer": np.nan}, {"roll_rate": np.inf})
     with pytest.raises(ValueError, match="has no coordinate lean"):
         jk.assemble(bike, {}, free=("lean",))
     given = jk.assemble(bike, {}, {"rear_wheel_rate": -10.0, "front_wheel_rate": -10.0 * 0.3 / 0.35})
@@ -265,6 +267,17 @@ def test_assemble_is_differentiable_twice_and_maps():
     slopes = jax.jit(jax.jacfwd(pitch))
     numeric = jnp.stack([(slopes(x + d) - slopes(x - d)) / (2 * h) for d in e])
     np.testing.assert_allclose(hessian, numeric, atol=1e-7)
-    many = jax.vmap(pitch)(jnp.stack([x, jnp.array([np.pi / 2, 0.0])]))
+    many = jax.vmap(pitch)(jnp.stack([x, jnp.array([np.pi / 2, 0.0]), jnp.array([np.nan, 0.0])]))
     assert np.isfinite(many[0])
-    assert np.isnan(many[1])  # under a trace there is nobody to raise to
+    assert np.isnan(many[1:]).all()  # under a trace there is nobody to raise to
+
+
+def test_assemble_and_simulate_in_one_program():
+    bike = WhippleBicycle.benchmark()
+
+    @jax.jit
+    def final_roll(roll):
+        state = jk.assemble(bike, jnp.zeros(8).at[0].set(roll), [0.0, -15.0, 0.0])
+        return jk.simulate(bike, state, [0.0, 0.1])["roll"][-1]
+
+    assert abs(float(final_roll(0.1))) < 0.2

@@ -51,6 +51,10 @@ def assemble(
         given = {speed: u[speed] for speed in system.dependent_speeds if speed in u}
         u = {speed: value for speed, value in u.items() if speed not in given}
     u0 = as_array({} if u is None else u, system.speeds, f"{name}: u").astype(q0.dtype)
+    if is_concrete(q0, u0) and not np.all(np.isfinite(np.concatenate([q0, u0]))):
+        names = (*system.coordinates, *system.speeds)
+        bad = [n for n, x in zip(names, np.concatenate([q0, u0]), strict=True) if not np.isfinite(x)]
+        raise ValueError(f"{name}: {', '.join(bad)} is not finite.")
     q0 = _solve_configuration(system, q0, t, tuple(free if free is not None else system.dependent_coordinates))
     if is_concrete(system, q0, u0, t):
         check_system(system, t, q0, u0, strict=True)
@@ -96,6 +100,9 @@ class _Found(NamedTuple):
 @eqx.filter_jit
 def _newton(system: System, q0, t, where: tuple[int, ...]) -> _Found:
     places = np.array(where)
+    # What is not finite must not enter the linear solver, which would raise for all members of a batch.
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((system, q0))]))
+    system, q0 = jax.tree.map(lambda x: jnp.where(finite, x, jnp.ones_like(x)), (system, q0))
     n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q0).shape[0]
     if len(places) == n_h:
         directions = jnp.eye(n_h, dtype=q0.dtype)
@@ -114,7 +121,7 @@ def _newton(system: System, q0, t, where: tuple[int, ...]) -> _Found:
     remainder = jnp.max(jnp.abs(configuration_residual(system, t, q)))
     derivatives = jax.jacfwd(residual)(jax.lax.stop_gradient(solution.value), jax.lax.stop_gradient(args))
     slope = jnp.linalg.svd(derivatives, compute_uv=False)[-1]
-    good = (remainder <= eps**0.6) & (slope > eps**0.6)
+    good = finite & (remainder <= eps**0.6) & (slope > eps**0.6)
     return _Found(q, good, remainder, slope, solution.stats["num_steps"])
 
 

@@ -92,7 +92,7 @@ def _fault(mass: float, I: np.ndarray) -> tuple[str, bool]:
     listed = ", ".join(f"{x:.6g}" for x in moments)
     if moments[0] < -slack:
         return f"the principal moments of inertia are {listed} kg m^2; none may be negative.", True
-    if _excess(I) > 1e-6:
+    if _excess(I) > 2e-3:  # beyond what the rounding of printed values does
         return (
             f"no body has the principal moments of inertia {listed} kg m^2: the largest exceeds the sum of the other "
             "two (triangle inequality). Measured values may do so by a few per cent; more is a mistake."
