@@ -192,15 +192,13 @@ def _measured(system, t, q, u, inputs):
     in_N = lambda vector: as_array(vector.components_in(motion.N))  # noqa: E731
     loads = now.loads(motion)
     centers = [body.center for body in motion.bodies if body.center.has_position]
-    simple = [isinstance(load, Force) and load.point in centers for load in loads]
+    at_centers = [load if isinstance(load, Force) and load.point in centers else None for load in loads]
     p, H = _momenta(motion)
     return {
         "T": as_array([kinetic_energy_of(motion)])[0],
         "power": as_array([load.vector.dot(load.velocity) for load in loads]),
-        "force": [in_N(load.vector) if at_center else None for load, at_center in zip(loads, simple, strict=True)],
-        "place": [
-            in_N(load.point.position) if at_center else None for load, at_center in zip(loads, simple, strict=True)
-        ],
+        "force": [load and in_N(load.vector) for load in at_centers],
+        "place": [load and in_N(load.point.position) for load in at_centers],
         "prescribed": as_array([now.power_of_prescribed_motions()])[0],
         "p": in_N(p),
         "H": in_N(H),

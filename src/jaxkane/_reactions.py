@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -52,7 +53,7 @@ def constraint_forces(
 
     **Raises:** `ValueError` as `accelerations`; `TypeError` for a trajectory together with `q`, `u` or `inputs`.
     """
-    return _along(_forces, system, t, q, u, inputs)
+    return _along(_compiled_forces, system, t, q, u, inputs)
 
 
 def constraint_multipliers(
@@ -66,7 +67,7 @@ def constraint_multipliers(
     these were added. A residual that was given as a Vector counts as three, along the axes of the frame it is kept in.
     Arguments as `constraint_forces`.
     """
-    return _along(_multipliers, system, t, q, u, inputs)
+    return _along(_compiled_multipliers, system, t, q, u, inputs)
 
 
 def _along(forces: Any, system: System, t: Any, q: Any, u: Any, inputs: InputValues) -> Any:
@@ -90,6 +91,11 @@ def _forces(system, t, q, u, inputs):
     now = Reactions(system, t, q, u, inputs)
     vectors = {name: stack([row])[0].astype(q.dtype) for name, row in now.forces_of_parts()}
     return vectors | {name: jnp.asarray(x, dtype=q.dtype) for name, x in now.forces_of_auxiliary_speeds()}
+
+
+# What calls into libraries (four dependent speeds, long chains) is not fused: compiled all the same.
+_compiled_forces = eqx.filter_jit(_forces)
+_compiled_multipliers = eqx.filter_jit(_multipliers)
 
 
 class _Forces(NamedTuple):
