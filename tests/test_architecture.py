@@ -16,7 +16,7 @@ SOURCE = Path(jk.__file__).parent
 FLOORS = [
     ["_types", "_components", "_linear", "_fuse"],
     ["rotations", "_vectors"],
-    ["_system"],
+    ["_system", "_trajectory"],
     ["loads"],
     ["catalog"],
     ["_kane"],
@@ -29,7 +29,12 @@ FLOORS = [
     ["sweep", "_audit"],
     ["fit"],
 ]
-WITHIN_A_FLOOR = {"_vectors": {"rotations"}, "_components": {"_types"}, "_linear": {"_types", "_components"}}
+WITHIN_A_FLOOR = {
+    "_trajectory": {"_system"},
+    "_vectors": {"rotations"},
+    "_components": {"_types"},
+    "_linear": {"_types", "_components"},
+}
 
 
 def unit_of(path):

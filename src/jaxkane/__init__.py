@@ -1,4 +1,4 @@
-"""Kane's equations in JAX: describe a mechanism; simulate, sweep, linearize and identify it by gradients."""
+"""Kane's equations in JAX: describe a mechanism; simulate, sweep, audit and identify it by gradients."""
 
 from . import catalog as catalog
 from . import fit as fit
@@ -25,8 +25,6 @@ from ._equations import partial_velocities as partial_velocities
 from ._reactions import constraint_forces as constraint_forces
 from ._reactions import constraint_multipliers as constraint_multipliers
 from ._signals import Samples as Samples
-from ._simulate import Status as Status
-from ._simulate import Trajectory as Trajectory
 from ._simulate import simulate as simulate
 from ._system import Body as Body
 from ._system import Force as Force
@@ -36,6 +34,8 @@ from ._system import System as System
 from ._system import Torque as Torque
 from ._system import parameter as parameter
 from ._system import weight as weight
+from ._trajectory import Status as Status
+from ._trajectory import Trajectory as Trajectory
 from ._types import Scalar as Scalar
 from ._vectors import Frame as Frame
 from ._vectors import Point as Point

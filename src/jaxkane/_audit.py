@@ -14,8 +14,8 @@ from ._components import matvec
 from ._fuse import fused
 from ._linear import stack
 from ._reactions import Reactions
-from ._simulate import Trajectory
 from ._system import Force, Motion, System, kinetic_energy_of
+from ._trajectory import Trajectory
 from ._vectors import Vector
 
 ORDERS = (8, 6)  # points under the polynomials whose integrals are the work, and its estimated error

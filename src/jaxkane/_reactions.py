@@ -24,8 +24,8 @@ from ._equations import InputValues, _arrays
 from ._fuse import fused
 from ._kane import Instant, Row
 from ._linear import solve, stack
-from ._simulate import Trajectory
 from ._system import Motion, System
+from ._trajectory import Trajectory
 from ._types import Component, Triple
 from ._vectors import Frame, Point, virtual
 

@@ -17,8 +17,9 @@ import numpy as np
 from tqdm.auto import tqdm
 
 from ._signals import Samples, as_signals
-from ._simulate import Settings, Status, Trajectory, checked_times, settings_for, solve
+from ._simulate import Settings, checked_times, settings_for, solve
 from ._system import State, System, parameter_info
+from ._trajectory import Status, Trajectory
 from ._types import Inputs
 
 _GROUP = 32

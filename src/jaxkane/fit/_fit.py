@@ -8,8 +8,8 @@ from typing import Any, Literal
 import diffrax
 from jaxtyping import Array
 
-from .._simulate import Trajectory
 from .._system import System
+from .._trajectory import Trajectory
 from ._gradient_descent import gradient_descent
 from ._least_squares import least_squares
 from ._problem import Problem

@@ -14,8 +14,9 @@ from jaxtyping import Array, Float
 
 from .._assembly import assemble
 from .._signals import Samples
-from .._simulate import Settings, Trajectory, settings_for, solve
+from .._simulate import Settings, settings_for, solve
 from .._system import State, System
+from .._trajectory import Trajectory
 from ._blocks import Blocks
 from ._parameters import Parameters, parameters_of
 from ._trial import Trial

@@ -11,8 +11,8 @@ import jax
 import numpy as np
 
 from .._check import check_system
-from .._simulate import Trajectory
 from .._system import System
+from .._trajectory import Trajectory
 from ._blocks import eliminate
 from ._identifiability import Identifiability, look
 from ._parameters import Parameters

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._simulate import reason
+from .._trajectory import reason
 from ._blocks import Eliminated, eliminate
 from ._problem import Linearization, Point, Problem, linearize
 
