@@ -129,12 +129,25 @@ def test_gradients_of_a_simulation_against_central_differences(torque):
 
     h = 1e-5
     numeric = (along(h) - along(-h)) / (2 * h)
-    forward = jax.jvp(lambda *args: loss(*args, "forward"), arguments, direction)[1]
-    np.testing.assert_allclose(forward, numeric, rtol=rtol)
-    for adjoint in ("reverse", "both"):
+    for adjoint in ("forward", "auto"):
+        forward = jax.jvp(lambda *args: loss(*args, adjoint), arguments, direction)[1]  # noqa: B023
+        np.testing.assert_allclose(forward, numeric, rtol=rtol)
+    for adjoint in ("auto", "both"):
         gradient = jax.grad(lambda *args: loss(*args, adjoint), argnums=(0, 1, 2))(*arguments)  # noqa: B023
         products = jax.tree.map(lambda g, d: jnp.sum(g * d), gradient, direction)
         np.testing.assert_allclose(sum(jax.tree.leaves(products)), numeric, rtol=rtol)
+
+
+def test_the_trajectory_says_how_it_is_differentiated():
+    said = []
+
+    def final_angle(u):
+        ride = jk.simulate(PENDULUM, jk.State(START.q, u), TS)
+        said.append(ride.adjoint)
+        return ride["theta1"][-1]
+
+    np.testing.assert_allclose(jax.jacfwd(final_angle)(START.u), jax.grad(final_angle)(START.u), rtol=1e-8)
+    assert said == ["ForwardMode", "RecursiveCheckpointAdjoint"]
 
 
 def test_second_derivatives_forward_over_forward():

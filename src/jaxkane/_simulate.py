@@ -26,6 +26,7 @@ from ._trajectory import Status, Trajectory
 from ._types import Component, Inputs
 
 ADJOINTS = {
+    "auto": diffrax.RecursiveCheckpointAdjoint,
     "reverse": diffrax.RecursiveCheckpointAdjoint,
     "forward": diffrax.ForwardMode,
     "both": diffrax.DirectAdjoint,
@@ -64,7 +65,7 @@ def simulate(
     step: float | None = None,
     project: bool = False,
     stabilize: float = 0.0,
-    adjoint: Literal["reverse", "forward", "both"] | diffrax.AbstractAdjoint = "reverse",
+    adjoint: Literal["auto", "reverse", "forward", "both"] | diffrax.AbstractAdjoint = "auto",
     max_steps: int = 16384,
     progress: bool = False,
 ) -> Trajectory:
@@ -84,9 +85,10 @@ def simulate(
         integration itself does not see it; dependent speeds are those of the projected coordinates.
     - `stabilize`: a rate [1/s] at which the residuals h of the configuration constraints are led back to zero while
         integrating, h_dot = -stabilize * h; some 10 for seconds of motion. 0.0 lets them drift, by the solver's error.
-    - `adjoint`: how the motion will be differentiated. "reverse" (default): `jax.grad`, `jax.vjp`; "forward":
-        `jax.jvp`, `jax.jacfwd`, and nested for Hessians, cheaper for fewer than about fifty parameters; "both" is
-        slower; or a diffrax adjoint.
+    - `adjoint`: how the motion will be differentiated. "reverse": `jax.grad`, `jax.vjp`; "forward": `jax.jvp`,
+        `jax.jacfwd`, and nested for Hessians, cheaper for fewer than about fifty parameters; "both" is slower; or a
+        diffrax adjoint. "auto" (default) is reverse, or forward where a `jax.jvp` or `jax.jacfwd` is under way. The
+        trajectory says which it was.
     - `max_steps`: of the solver. `progress`: show a progress bar.
 
     **Returns:** a `Trajectory`. A motion that cannot go on ends early, with its reason in `status`.
@@ -111,7 +113,13 @@ def simulate(
         max_steps=max_steps,
         progress=progress,
     )
-    ride = solve(system, state, ts, signals, settings)
+    try:
+        ride = solve(system, state, ts, signals, settings)
+    except TypeError as error:
+        if adjoint != "auto" or "forward-mode autodiff" not in str(error):
+            raise
+        forward = eqx.tree_at(lambda s: s.adjoint, settings, ADJOINTS["forward"](), is_leaf=lambda x: x is None)
+        ride = solve(system, state, ts, signals, forward)
     if is_concrete(ride.status) and ride.status == Status.NO_SOLUTION:
         inputs_now = _inputs(system, signals, ts[0], state.q, state.u)
         raise ValueError(
@@ -146,7 +154,7 @@ def settings_for(
     step: float | None = None,
     project: bool = False,
     stabilize: float = 0.0,
-    adjoint: str | diffrax.AbstractAdjoint = "reverse",
+    adjoint: str | diffrax.AbstractAdjoint = "auto",
     max_steps: int = 16384,
     progress: bool = False,
 ) -> Settings:
