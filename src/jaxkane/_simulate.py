@@ -282,10 +282,15 @@ def _stops(system: System, t0: Array, state: State) -> dict[str, Any]:
     names = jax.eval_shape(_events, system, t0, state.q, state.u)
     stops: dict[str, Any] = {}
     for name in names:
-        stops[name] = lambda t, y, args, name=name, **_: _event(name)(args[0], t, *y)
+        stops[name] = lambda t, y, args, name=name, **_: _event(name)(*_unmoved(args[0], t, *y))
     if system.dependent_speeds:
-        stops[_SINGULAR] = lambda t, y, args, **_: _determinant(args[0], t, *y)
+        stops[_SINGULAR] = lambda t, y, args, **_: _determinant(*_unmoved(args[0], t, *y))
     return stops
+
+
+def _unmoved(*now: Any) -> Any:
+    # A simulation ends between two steps: what ends it has no derivative, and compiling one would take its time.
+    return jax.lax.stop_gradient(now)
 
 
 def _events(system: System, t: Component, q: Array, u: Array) -> dict[str, Array]:

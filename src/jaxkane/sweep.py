@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from tqdm.auto import tqdm
+from tqdm import tqdm
 
 from ._signals import Samples, as_signals
 from ._simulate import Settings, checked_times, settings_for, solve
