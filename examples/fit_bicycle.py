@@ -188,7 +188,7 @@ def draw_parameters(ax, result, truth):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="folder with free_responses.csv and parameters.json")
-    parser.add_argument("--out", type=Path, default=Path("."), help="folder for the picture")
+    parser.add_argument("--out", type=Path, default=Path("figures"), help="folder of the picture (default: figures)")
     arguments = parser.parse_args()
     result, truth = fit_measured(arguments.data) if arguments.data else fit_simulated()
     arguments.out.mkdir(parents=True, exist_ok=True)
