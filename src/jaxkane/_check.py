@@ -17,7 +17,7 @@ from jax.core import Tracer
 from ._components import cross
 from ._fuse import fused
 from ._kane import Instant
-from ._linear import stack
+from ._linear import as_vector, stack
 from ._system import Motion, System, parameter_info
 from ._vectors import Frame
 
@@ -114,7 +114,7 @@ def _velocities(now: Instant, u) -> dict[str, Any]:
     for body in motion.bodies:
         found[f"the velocity of {body.name!r}"] = body.center.velocity.components
         found[f"the angular velocity of {body.name!r}"] = body.angular_velocity.components
-    for name, rate in zip(now.system.coordinates, now.rates(u), strict=True):
+    for name, rate in zip(now.system.coordinates, now.rates(now.t, now.q, u), strict=True):
         found[f"the rate of the coordinate {name!r}"] = [rate]
     return {name: np.array([float(x) for x in values]) for name, values in found.items()}
 
@@ -240,4 +240,4 @@ def configuration_tolerance(dtype: Any) -> float:
 def configuration_residual(system: System, t: Any, q: Any):
     """Residuals (h,) of the configuration constraints."""
     residuals = system.configuration_constraints(t, [q[i] for i in range(len(system.coordinates))])
-    return stack([tuple(residuals)])[0].astype(q.dtype)
+    return as_vector(tuple(residuals), q)

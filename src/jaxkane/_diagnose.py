@@ -10,7 +10,7 @@ import numpy as np
 from ._drift import constraint_rows, dependent_speeds_from
 from ._fuse import fused
 from ._kane import Instant
-from ._linear import stack
+from ._linear import as_vector, stack
 from ._system import System
 
 ROUNDING = 1e-12
@@ -63,7 +63,7 @@ def diagnosis(system: System, t: Any, q: Any, u: Any, inputs: Any = None) -> str
 def _parts(system, t, q, u, inputs):
     now = Instant(system, t, q, u, inputs)
     M, f = now.equations()
-    return stack(M).astype(q.dtype), stack([f])[0].astype(q.dtype), stack([now.q_dot])[0].astype(q.dtype)
+    return stack(M).astype(q.dtype), as_vector(f, q), as_vector(now.q_dot, q)
 
 
 def _massless(M: np.ndarray, speeds: tuple[str, ...]) -> str:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from ._check import configuration_residual
 from ._fuse import fused
 from ._kane import Instant, as_array
-from ._linear import solve, stack
+from ._linear import as_vector, solve, stack
 from ._system import System
 from ._types import Component
 
@@ -34,7 +34,7 @@ def correction(system: System, t: Component, q: Array) -> Float[Array, " n_q"]:
     GG = G @ G.T
     rows = [[GG[i, j] for j in range(len(h))] for i in range(len(h))]
     (multipliers,) = solve(rows, [h[i] for i in range(len(h))])
-    return -stack([multipliers])[0].astype(q.dtype) @ G
+    return -as_vector(multipliers, q) @ G
 
 
 def projected(system: System, t: Component, q: Array, steps: int = 3) -> Float[Array, " n_q"]:
@@ -124,7 +124,7 @@ def constraint_rows(system: System, t: Component, q: Array) -> tuple[Array, Arra
     now = Instant(system, t, q, jnp.zeros(len(system.speeds), q.dtype))
     rows = [(*a, *b) for a, b in zip(now.C_ind, now.C_dep, strict=True)]
     c0 = now.residuals(now.t, now.q, (0.0,) * (now.n + now.k))
-    return stack(rows).astype(q.dtype), stack([c0])[0].astype(q.dtype)
+    return stack(rows).astype(q.dtype), as_vector(c0, q)
 
 
 def dependent_speeds_from(

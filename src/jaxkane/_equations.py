@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ._check import check_system, is_concrete
-from ._components import add, dot, matvec, sub
+from ._components import matvec, sub
 from ._diagnose import diagnosis
 from ._fuse import fused
 from ._kane import Instant, as_array, checked_inputs, jvp
-from ._linear import is_written_out, solve_positive_array, stack
+from ._linear import as_vector, is_written_out, solve_positive_array, stack
 from ._system import System, kinetic_energy_of
 from ._types import Component
 
@@ -33,10 +33,6 @@ def _arrays(system: System, t: Component, q: Any, u: Any, inputs: InputValues = 
     checked_inputs(system, inputs)
     check_system(system, t, q, u)
     return system, t, q, u, {name: jnp.asarray(x, dtype=q.dtype) for name, x in (inputs or {}).items()}
-
-
-def _array(row: Any, like: Array) -> Array:
-    return stack([row])[0].astype(like.dtype)
 
 
 def equations_of_motion(
@@ -63,7 +59,7 @@ def equations_of_motion(
 @fused
 def _equations(system, t, q, u, inputs):
     M, f = Instant(system, t, q, u, inputs).equations()
-    return stack(M).astype(q.dtype), _array(f, q)
+    return stack(M).astype(q.dtype), as_vector(f, q)
 
 
 def accelerations(system: System, t: Component, q: Any, u: Any, inputs: InputValues = None) -> Float[Array, " n"]:
@@ -94,14 +90,14 @@ def state_rates(
 @fused
 def _state_rates(system, t, q, u, inputs):
     now = Instant(system, t, q, u, inputs)
-    return _array(now.q_dot, q), _array(now.accelerations(), q)
+    return as_vector(now.q_dot, q), as_vector(now.accelerations(), q)
 
 
 @fused
 def _state_rates_unsolved(system, t, q, u, inputs):
     now = Instant(system, t, q, u, inputs)
     M, f = now.equations()
-    return _array(now.q_dot, q), stack(M).astype(q.dtype), _array(f, q)
+    return as_vector(now.q_dot, q), stack(M).astype(q.dtype), as_vector(f, q)
 
 
 def mass_matrix(system: System, t: Component, q: Any, u: Any, inputs: InputValues = None) -> Float[Array, "n n"]:
@@ -147,7 +143,7 @@ def generalized_active_forces(
 @fused
 def _generalized_active_forces(system, t, q, u, inputs):
     now = Instant(system, t, q, u, inputs)
-    return _array(now.active_forces(now.motion(now.t, now.q, now.u_all), now.partials()), q)
+    return as_vector(now.active_forces(now.motion(now.t, now.q, now.u_all), now.partials()), q)
 
 
 def generalized_inertia_forces(
@@ -172,7 +168,7 @@ def _generalized_inertia_forces(system, t, q, u, inputs, u_dot):
     if u_dot is not None:
         M_u_dot = matvec(now.mass_matrix(motion, partials), [u_dot[r] for r in range(now.n)])
         Fr_star = [sub(x, y) for x, y in zip(Fr_star, M_u_dot, strict=True)]
-    return _array(Fr_star, q)
+    return as_vector(Fr_star, q)
 
 
 def coordinate_rates(system: System, t: Component, q: Any, u: Any) -> Float[Array, " n_q"]:
@@ -182,7 +178,7 @@ def coordinate_rates(system: System, t: Component, q: Any, u: Any) -> Float[Arra
 
 @fused
 def _coordinate_rates(system, t, q, u, inputs):
-    return _array(Instant(system, t, q, u).q_dot, q)
+    return as_vector(Instant(system, t, q, u).q_dot, q)
 
 
 def dependent_speeds(system: System, t: Component, q: Any, u: Any) -> Float[Array, " k"]:
@@ -192,7 +188,7 @@ def dependent_speeds(system: System, t: Component, q: Any, u: Any) -> Float[Arra
 
 @fused
 def _dependent_speeds(system, t, q, u, inputs):
-    return _array(Instant(system, t, q, u).u_dep, q)
+    return as_vector(Instant(system, t, q, u).u_dep, q)
 
 
 def dependent_accelerations(
@@ -205,8 +201,7 @@ def dependent_accelerations(
 @fused
 def _dependent_accelerations(system, t, q, u, inputs):
     now = Instant(system, t, q, u, inputs)
-    u_dot = now.accelerations()
-    return _array([add(dot(row, u_dot), b) for row, b in zip(zip(*now.J, strict=True), now.bias(), strict=True)], q)
+    return as_vector(now.dependent_accelerations(now.accelerations()), q)
 
 
 def constraint_jacobian(system: System, t: Component, q: Any) -> Float[Array, "k n"]:
@@ -245,4 +240,4 @@ def kinetic_energy(system: System, t: Component, q: Any, u: Any) -> Float[Array,
 @fused
 def _kinetic_energy(system, t, q, u, inputs):
     now = Instant(system, t, q, u)
-    return _array([kinetic_energy_of(now.motion(now.t, now.q, now.u_all))], q)[0]
+    return as_vector([kinetic_energy_of(now.motion(now.t, now.q, now.u_all))], q)[0]

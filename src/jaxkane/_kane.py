@@ -59,7 +59,8 @@ def jvp(f: Callable[..., Any], primals: Sequence[Component], tangents: Sequence[
     return jax.tree.unflatten(treedef, f_x), jax.tree.unflatten(treedef, f_dx)
 
 
-def _unit(n: int, r: int) -> Row:
+def unit(n: int, r: int) -> Row:
+    """The r-th of n directions of the speeds."""
     return tuple(1.0 if i == r else 0.0 for i in range(n))
 
 
@@ -83,7 +84,7 @@ class Instant:
         self.J = [_negative(column) for column in columns]  # n columns of (k,)
         self.u_dep = _negative(u_dep)
         self.u_all = (*self.u, *self.u_dep)
-        self.q_dot = self.rates(self.u_all)
+        self.q_dot = self.rates(self.t, self.q, self.u_all)
 
     # The description at this instant, or beside it.
 
@@ -93,8 +94,8 @@ class Instant:
             raise TypeError(f"{self.name}.motion must return a jaxkane.Motion, got {motion!r}.")
         return motion
 
-    def rates(self, u: Row) -> Row:
-        q_dot = self.system.q_dot(self.t, self.q, u)
+    def rates(self, t: Component, q: Row, u: Row) -> Row:
+        q_dot = self.system.q_dot(t, q, u)
         return as_row(q_dot, self.system.coordinates, f"{self.name}.q_dot")
 
     def loads(self, motion: Motion) -> tuple[Load, ...]:
@@ -114,8 +115,7 @@ class Instant:
         rolling = self.motion(t, q, u).constraints
         if len(rolling) == self.k:
             return rolling  # the configuration constraints, if there are any, are integrals of these
-        q_dot = as_row(self.system.q_dot(t, q, u), self.system.coordinates, f"{self.name}.q_dot")
-        h, h_dot = jvp(lambda t, *q: self.configuration(t, q), (t, *q), (1.0, *q_dot))
+        h, h_dot = jvp(lambda t, *q: self.configuration(t, q), (t, *q), (1.0, *self.rates(t, q, u)))
         if len(rolling) + len(h) != self.k:
             names = ", ".join(self.system.dependent_speeds) or "none"
             raise ValueError(
@@ -129,7 +129,7 @@ class Instant:
         # c = C_ind u + C_dep u_dep + c0
         n, k = self.n, self.k
         c0 = self.residuals(self.t, self.q, (0.0,) * (n + k))
-        along = [self.along_speeds(lambda u: self.residuals(self.t, self.q, u), _unit(n + k, r)) for r in range(n + k)]
+        along = [self.along_speeds(lambda u: self.residuals(self.t, self.q, u), unit(n + k, r)) for r in range(n + k)]
         rows = tuple(zip(*along, strict=True))
         return [row[:n] for row in rows], [row[n:] for row in rows], c0
 
@@ -138,7 +138,7 @@ class Instant:
     def partials(self) -> list[tuple[list, list]]:
         """For each independent speed: the partial velocities (V, W) of the bodies, and those of the loads."""
 
-        return [self.along_speeds(self.velocities, (*_unit(self.n, r), *self.J[r])) for r in range(self.n)]
+        return [self.along_speeds(self.velocities, (*unit(self.n, r), *self.J[r])) for r in range(self.n)]
 
     def velocities(self, u: Row) -> tuple[list, list]:
         """Velocities (v, omega) of the bodies, and those that the loads act on, at speeds `u`."""
@@ -155,6 +155,12 @@ class Instant:
             return ()
         _, c_dot = jvp(lambda t, *q: self.residuals(t, q, self.u_all), (self.t, *self.q), (1.0, *self.q_dot))
         return _negative(solve(self.C_dep, c_dot)[0])
+
+    def dependent_accelerations(self, u_dot: Row) -> Row:
+        """u_dep_dot = J u_dot + bias."""
+        if not self.k:
+            return ()
+        return tuple(add(dot(row, u_dot), b) for row, b in zip(zip(*self.J, strict=True), self.bias(), strict=True))
 
     def momentum_rates(self, motion: Motion, u_dot: Row | None = None) -> list[tuple[Row, Row]]:
         """dp/dt and dH/dt of every body in the inertial frame; each in the frame where it stands.

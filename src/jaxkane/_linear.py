@@ -7,6 +7,7 @@ ones), which keeps exact zeros and lets a batch stay component-major; larger one
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
@@ -85,6 +86,11 @@ def solve_positive(M: Rows, b: Sequence[Component]) -> tuple[Component, ...]:
         for k in range(i + 1, n):
             x[i] = sub(x[i], mul(L[k][i], x[k]))
     return tuple(x)
+
+
+def as_vector(row: Sequence[Component], like: Any) -> Any:
+    """A row of components as an array (n,) of the type of `like`."""
+    return stack([row])[0].astype(like.dtype)
 
 
 def stack(rows: Rows):

@@ -22,8 +22,8 @@ from jaxtyping import Array, Float
 from ._components import add, dot, mul
 from ._equations import InputValues, _arrays
 from ._fuse import fused
-from ._kane import Instant, Row
-from ._linear import solve, stack
+from ._kane import Instant, Row, unit
+from ._linear import as_vector, solve
 from ._system import Motion, System
 from ._trajectory import Trajectory
 from ._types import Component, Triple
@@ -83,13 +83,13 @@ def _along(forces: Any, system: System, t: Any, q: Any, u: Any, inputs: InputVal
 @fused
 def _multipliers(system, t, q, u, inputs):
     multipliers = Reactions(system, t, q, u, inputs).multipliers
-    return stack([multipliers])[0].astype(q.dtype)
+    return as_vector(multipliers, q)
 
 
 @fused
 def _forces(system, t, q, u, inputs):
     now = Reactions(system, t, q, u, inputs)
-    vectors = {name: stack([row])[0].astype(q.dtype) for name, row in now.forces_of_parts()}
+    vectors = {name: as_vector(row, q) for name, row in now.forces_of_parts()}
     return vectors | {name: jnp.asarray(x, dtype=q.dtype) for name, x in now.forces_of_auxiliary_speeds()}
 
 
@@ -112,12 +112,12 @@ class Reactions(Instant):
         super().__init__(system, t, q, u, inputs)
         self.description: Motion = self.motion(self.t, self.q, self.u_all)
         u_dot = self.accelerations()
-        u_dep_dot = [add(dot(row, u_dot), b) for row, b in zip(zip(*self.J, strict=True), self.bias(), strict=True)]
+        u_dep_dot = self.dependent_accelerations(u_dot)
         self.momentum = self.momentum_rates(self.description, (*u_dot, *u_dep_dot))
         self.load_vectors = [load.vector.components_in(load.velocity.frame) for load in self.loads(self.description)]
         # R_dep + C_dep^T lambda = 0
-        units = [_unit(self.n + self.k, self.n + r) for r in range(self.k)]
-        R = [mul(-1.0, self.unbalanced(self.along_speeds(self.velocities, unit))) for unit in units]
+        directions = [unit(self.n + self.k, self.n + r) for r in range(self.k)]
+        R = [mul(-1.0, self.unbalanced(self.along_speeds(self.velocities, direction))) for direction in directions]
         self.multipliers: Row = solve(tuple(zip(*self.C_dep, strict=True)), R)[0] if self.k else ()
 
     def unbalanced(self, partial: Any) -> Component:
@@ -153,10 +153,10 @@ class Reactions(Instant):
     def forces_of_auxiliary_speeds(self) -> Iterator[tuple[str, Component]]:
         names = self.system.auxiliary_speeds
         for i, name in enumerate(names):
-            unit = _unit(self.n + self.k + len(names), self.n + self.k + i)
-            C_aux = self.along_speeds(lambda u: self.residuals(self.t, self.q, u), unit)
+            direction = unit(self.n + self.k + len(names), self.n + self.k + i)
+            C_aux = self.along_speeds(lambda u: self.residuals(self.t, self.q, u), direction)
             # R_aux + C_aux^T lambda + Q = 0
-            R = self.unbalanced(self.along_speeds(self.velocities, unit))
+            R = self.unbalanced(self.along_speeds(self.velocities, direction))
             yield name, mul(-1.0, add(R, dot(C_aux, self.multipliers)))
 
     def along_axes(self, part: Point | Frame) -> _Forces:
@@ -206,7 +206,3 @@ def _chain(point: Point | None) -> list[Point]:
         chain.append(point)
         point = point._base
     return chain
-
-
-def _unit(n: int, r: int) -> Row:
-    return tuple(1.0 if i == r else 0.0 for i in range(n))

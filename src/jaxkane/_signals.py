@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -79,6 +79,3 @@ def evaluate(signals: Any, t: Component, state: Any) -> dict[str, Component]:
         values: Any = signals(t, state)
         return dict(values)
     return {name: signal(t, state) if callable(signal) else signal for name, signal in signals.items()}
-
-
-Controller = Callable[[Component, Any], Mapping[str, Component]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from typing import Any, Literal, cast
 
@@ -19,7 +20,7 @@ from ._drift import correction, has_configuration_constraints, projected
 from ._equations import dependent_speeds, state_rates
 from ._fuse import fused
 from ._kane import Instant, checked_inputs
-from ._linear import determinant, stack
+from ._linear import as_vector, determinant
 from ._signals import as_signals, evaluate, sample_times
 from ._system import State, System, parameter_info
 from ._trajectory import Status, Trajectory
@@ -118,8 +119,7 @@ def simulate(
     except TypeError as error:
         if adjoint != "auto" or "forward-mode autodiff" not in str(error):
             raise
-        forward = eqx.tree_at(lambda s: s.adjoint, settings, ADJOINTS["forward"](), is_leaf=lambda x: x is None)
-        ride = solve(system, state, ts, signals, forward)
+        ride = solve(system, state, ts, signals, dataclasses.replace(settings, adjoint=ADJOINTS["forward"]()))
     if is_concrete(ride.status) and ride.status == Status.NO_SOLUTION:
         inputs_now = _inputs(system, signals, ts[0], state.q, state.u)
         raise ValueError(
@@ -253,11 +253,7 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
 @fused
 def _determinant(system: System, t: Component, q: Array, u: Array) -> Array:
     """det C_dep: where it vanishes, the dependent speeds no longer follow from the independent ones."""
-    return _array([determinant(Instant(system, t, q, u).C_dep)], q)[0]
-
-
-def _array(row, like: Array) -> Array:
-    return stack([row])[0].astype(like.dtype)
+    return as_vector([determinant(Instant(system, t, q, u).C_dep)], q)[0]
 
 
 def _inputs(system: System, signals: Any, t: Component, q: Array, u: Array, all_of_them: bool = False):
