@@ -14,7 +14,7 @@ SOURCE = Path(jk.__file__).parent
 
 # Each module may import from the lines above it, and within the same package.
 FLOORS = [
-    ["_types", "_components", "_linear", "_fuse"],
+    ["_types", "_components", "_linear", "_native", "_fuse"],
     ["rotations", "_vectors"],
     ["_system", "_trajectory"],
     ["loads"],
@@ -26,7 +26,7 @@ FLOORS = [
     ["_equations", "_assembly", "_signals"],
     ["_simulate"],
     ["_reactions"],
-    ["sweep", "_audit"],
+    ["sweep", "_audit", "_configure"],
     ["fit"],
 ]
 WITHIN_A_FLOOR = {
@@ -34,6 +34,7 @@ WITHIN_A_FLOOR = {
     "_vectors": {"rotations"},
     "_components": {"_types"},
     "_linear": {"_types", "_components"},
+    "_fuse": {"_native"},
 }
 
 

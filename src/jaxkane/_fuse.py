@@ -22,6 +22,9 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
 from jax.interpreters.partial_eval import dce_jaxpr
 
+from . import _native as native
+from ._native import CALLS, NotScalarError, Scalars
+
 # What one compiled function may hold: elementwise work and the moving of scalars. Calls into libraries (LAPACK) may not
 # be compiled so, and loops would gain nothing.
 _PLAIN = frozenset(
@@ -30,8 +33,9 @@ _PLAIN = frozenset(
     "neg not or pad pjit pow reduce_sum rem reshape round rsqrt select_n sign sin sinh slice sqrt square squeeze stack "
     "stop_gradient sub tan tanh transpose unstack".split()
 )
-_CALLS = ("jit", "pjit")
 _LARGEST_SUM = 64  # XLA may hand larger ones to a library
+
+Where = tuple[tuple[bool, ...], ...]
 
 
 def fused(f: Callable[..., Any]) -> Callable[..., Any]:
@@ -75,10 +79,11 @@ class _Program:
         self.tangent = functools.cache(self._tangent)
         self.transposed = functools.cache(self._transposed)
         self.batched = functools.cache(self._batched)
+        self.scalars = functools.cache(self._scalars)
         self.compiled = jax.jit(self.__call__)
 
     def __call__(self, *leaves: Any) -> list[Any]:
-        return _program_p.bind(*leaves, program=self)
+        return _program_p.bind(*leaves, program=self, sizes=(), where=((),) * len(leaves))
 
     def _tangent(self, moving: tuple[bool, ...]) -> _Program:
         """(primals, tangents of those that move) -> tangents of the outputs."""
@@ -110,16 +115,27 @@ class _Program:
 
         return _Program(jax.make_jaxpr(cotangents)(*[specs[i] for i in others], *_specs(self.out_avals)))
 
-    def _batched(self, axes: tuple[int | None, ...], size: int) -> _Program:
-        """The program with a leading axis at the outputs, for inputs with an axis each at `axes`."""
+    def _batched(self, sizes: tuple[int, ...], where: Where) -> _Program:
+        """The program over leading axes of these sizes, of which input i has those in `where[i]`."""
+        avals = [
+            jax.ShapeDtypeStruct((*_chosen(sizes, has), *a.shape), a.dtype, weak_type=a.weak_type)
+            for a, has in zip(_specs(self.in_avals), where, strict=True)
+        ]
+        f = lambda *xs: self.evaluate(*xs)  # noqa: E731
+        for d in reversed(range(len(sizes))):
+            f = jax.vmap(f, in_axes=tuple(0 if has[d] else None for has in where), axis_size=sizes[d])
+        return _Program(jax.make_jaxpr(f)(*avals))
 
-        def specs():
-            for aval, axis in zip(_specs(self.in_avals), axes, strict=True):
-                shape = aval.shape if axis is None else (*aval.shape[:axis], size, *aval.shape[axis:])
-                yield jax.ShapeDtypeStruct(shape, aval.dtype, weak_type=aval.weak_type)
+    def _scalars(self) -> Scalars | None:
+        """The program as a graph of scalars for machine code, where it can be written so."""
+        try:
+            return Scalars(self.program)
+        except NotScalarError:
+            return None
 
-        over_axis = jax.vmap(lambda *xs: self.evaluate(*xs), in_axes=axes, axis_size=size)
-        return _Program(jax.make_jaxpr(over_axis)(*specs()))
+
+def _chosen(sizes: Sequence[int], has: Sequence[bool]) -> tuple[int, ...]:
+    return tuple(n for n, h in zip(sizes, has, strict=True) if h)
 
 
 def _replaced(values: Sequence[Any], places: Sequence[int], new: Sequence[Any]) -> list[Any]:
@@ -133,40 +149,69 @@ _program_p = Primitive("scalar_program")
 _program_p.multiple_results = True
 
 
+# A call stands for a batch over leading axes `sizes`; input i has those of them that `where[i]` says, outputs have all.
+
+
 @_program_p.def_impl
-def _run(*args, program):
-    return program.compiled(*args)
+def _run(*args, program, sizes, where):
+    if not sizes:
+        return program.compiled(*args)
+    return jax.jit(functools.partial(_program_p.bind, program=program, sizes=sizes, where=where))(*args)
 
 
 @_program_p.def_abstract_eval
-def _abstract(*_, program):
-    return program.out_avals
+def _abstract(*_, program, sizes, where):
+    return [a.update(shape=(*sizes, *a.shape)) for a in program.out_avals]
 
 
-def _jvp(primals, tangents, *, program):
+def _jvp(primals, tangents, *, program, sizes, where):
     moving = tuple(type(dx) is not ad.Zero for dx in tangents)
-    tangent = program.tangent(moving)
-    return program(*primals), tangent(*primals, *[dx for dx, m in zip(tangents, moving, strict=True) if m])
+    moves = [(dx, w) for dx, m, w in zip(tangents, moving, where, strict=True) if m]
+    outputs = _program_p.bind(*primals, program=program, sizes=sizes, where=where)
+    return outputs, _program_p.bind(
+        *primals,
+        *(dx for dx, _ in moves),
+        program=program.tangent(moving),
+        sizes=sizes,
+        where=(*where, *(w for _, w in moves)),
+    )
 
 
-def _transpose(cotangents, *args, program):
+def _transpose(cotangents, *args, program, sizes, where):
     linear = tuple(ad.is_undefined_primal(x) for x in args)
-    known = [x for x, is_linear in zip(args, linear, strict=True) if not is_linear]
-    found = iter(program.transposed(linear)(*known, *map(ad.instantiate_zeros, cotangents)))
-    return [next(found) if is_linear else None for is_linear in linear]
+    known = [(x, w) for x, w, is_linear in zip(args, where, linear, strict=True) if not is_linear]
+    everywhere = ((True,) * len(sizes),) * len(cotangents)
+    found = iter(
+        _program_p.bind(
+            *(x for x, _ in known),
+            *map(ad.instantiate_zeros, cotangents),
+            program=program.transposed(linear),
+            sizes=sizes,
+            where=(*(w for _, w in known), *everywhere),
+        )
+    )
+
+    def over_missing(ct, has):
+        axes = tuple(d for d, h in enumerate(has) if not h)
+        return ct.sum(axes) if axes else ct
+
+    return [over_missing(next(found), w) if is_linear else None for is_linear, w in zip(linear, where, strict=True)]
 
 
-def _batch(args, axes, *, program):
+def _batch(args, axes, *, program, sizes, where):
     size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
-    outputs = program.batched(tuple(axes), size)(*args)
+    args = [x if axis is None else jax.numpy.moveaxis(x, axis, 0) for x, axis in zip(args, axes, strict=True)]
+    where = tuple((axis is not None, *w) for axis, w in zip(axes, where, strict=True))
+    outputs = _program_p.bind(*args, program=program, sizes=(size, *sizes), where=where)
     return outputs, [0] * len(outputs)
 
 
-def _inlined(*args, program):
-    return program.evaluate(*args)
+def _inlined(*args, program, sizes, where):
+    return (program.batched(sizes, where) if sizes else program).evaluate(*args)
 
 
-def _as_one_function(*args, program):
+def _as_one_function(*args, program, sizes, where):
+    program = program.batched(sizes, where) if sizes else program
     if not program.is_plain:
         return program.evaluate(*args)
 
@@ -180,11 +225,21 @@ def _as_one_function(*args, program):
     return values
 
 
+_lower_as_one_function = mlir.lower_fun(_as_one_function, multiple_results=True)
+
+
+def _lower_on_cpu(context, *args, program, sizes, where):
+    scalars = program.scalars() if native.is_on() and 0 not in sizes else None
+    if scalars is None:
+        return _lower_as_one_function(context, *args, program=program, sizes=sizes, where=where)
+    return jax.ffi.ffi_lowering(scalars.target(sizes, where))(context, *args)
+
+
 ad.primitive_jvps[_program_p] = _jvp
 ad.primitive_transposes[_program_p] = _transpose
 batching.primitive_batchers[_program_p] = _batch
 mlir.register_lowering(_program_p, mlir.lower_fun(_inlined, multiple_results=True))
-mlir.register_lowering(_program_p, mlir.lower_fun(_as_one_function, multiple_results=True), platform="cpu")
+mlir.register_lowering(_program_p, _lower_on_cpu, platform="cpu")
 
 
 def without_repetition(program: ClosedJaxpr) -> ClosedJaxpr:
@@ -205,7 +260,7 @@ def _evaluate_once(program: Jaxpr, consts: Sequence[Any], args: Sequence[Any], k
     read = lambda v: v.val if isinstance(v, Literal) else values[v]  # noqa: E731
     for equation in program.eqns:
         inputs = [read(v) for v in equation.invars]
-        if equation.primitive.name in _CALLS:
+        if equation.primitive.name in CALLS:
             inner = equation.params["jaxpr"]
             outputs = _evaluate_once(inner.jaxpr, inner.consts, inputs, known)
         else:
@@ -226,6 +281,6 @@ def _is_plain(program: Jaxpr) -> bool:
             return False
         if equation.primitive.name == "reduce_sum" and getattr(equation.invars[0].aval, "size", 0) > _LARGEST_SUM:
             return False
-        if equation.primitive.name in _CALLS and not _is_plain(equation.params["jaxpr"].jaxpr):
+        if equation.primitive.name in CALLS and not _is_plain(equation.params["jaxpr"].jaxpr):
             return False
     return True
