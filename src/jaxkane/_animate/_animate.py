@@ -1,0 +1,224 @@
+"""Animations: from a motion to a page or a GIF. Knows how its parts fit together; leaves mechanics to `_record`."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import functools
+import html
+import json
+import os
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .._system import System
+from .._trajectory import Trajectory
+from ._figures import bodies_and_points, figure_of
+from ._gif import write_gif
+from ._record import Record, record
+from ._scene import FIXED, UPRIGHT, Builder, Scene, turned_by, view_of, which_way_is_up
+from ._sketch import COLORS, Figure
+
+_FRAMES_PER_SECOND = 50.0
+_MOST_FRAMES = 3000
+THEMES = ("auto", "light", "dark")
+
+
+def animate(
+    system: System,
+    trajectory: Trajectory,
+    figure: Figure | None = None,
+    *,
+    speed: float = 1.0,
+    up: str | None = None,
+    follow: bool | None = None,
+    azimuth: float | None = None,
+    elevation: float | None = None,
+    ground: bool | None = None,
+    theme: str = "auto",
+    title: str | None = None,
+    height: int = 420,
+) -> Animation:
+    """A moving picture of a simulation: shown by a notebook, or saved as a page or a GIF.
+
+        jk.animate(bicycle, ride)                      # the last line of a notebook's cell
+        jk.animate(bicycle, ride).save("ride.html")    # a page that needs no network
+        jk.animate(bicycle, ride, speed=0.5).save("ride.gif")
+
+    Bicycles are drawn as bicycles. Of any other system every body is drawn as the uniform solid that has its mass and
+    inertia, and points are joined by lines where nothing moves between them; or it is drawn as `figure` says. The page
+    is orbited with the mouse or a finger, zoomed with the wheel, and played, slowed and stepped with keys: "?" lists
+    them.
+
+    **Arguments:**
+
+    - `system`, `trajectory`: one motion of the system; of a batch one member. It is drawn as far as it came, at most 50
+        times a second: more is interpolated.
+    - `figure`: a function (system, motion, sketch) that draws with a `Sketch`, between the places of a `Motion`.
+    - `speed`: how fast it is played at first; 0.1 is slow motion.
+    - `up`: the axis of N that points up, "x", "-x", "y", "-y", "z" or "-z"; by default opposite to the weights.
+    - `follow`: whether the camera goes along with the mass centre; by default where the motion goes far.
+    - `azimuth`, `elevation`: from where it is seen [degrees], about the vertical and above the horizon.
+    - `ground`: whether a grid is drawn; for bicycles at the wheels' contacts, for others below the lowest place.
+    - `theme`: "light", "dark", or "auto": what the reader's system prefers.
+    - `title`: by default the system's name. `height`: of the notebook's frame [pixels].
+
+    **Returns:** an `Animation`.
+
+    **Raises:** `ValueError` for a batch, for the motion of another system, and where no body has a position.
+    """
+    if up is not None and up not in UPRIGHT:
+        raise ValueError(f"animate: `up` is one of {', '.join(UPRIGHT)}, got {up!r}.")
+    if theme not in THEMES:
+        raise ValueError(f"animate: `theme` is one of {', '.join(THEMES)}, got {theme!r}.")
+    if not speed > 0:
+        raise ValueError(f"animate: `speed` must be positive, got {speed!r}.")
+    drawn = figure or figure_of(system)
+    scene = _scene(record(system, trajectory, drawn), drawn, speed, up, follow, ground, title, type(system).__name__)
+    angles = {"azimuth": azimuth, "elevation": elevation}
+    angles = {key: float(np.deg2rad(x)) for key, x in angles.items() if x is not None}
+    scene = dataclasses.replace(scene, view=dataclasses.replace(scene.view, **angles))
+    return Animation(scene, speed, theme, height)
+
+
+def _scene(found: Record, figure: Any, speed: float, up, follow, ground, title, name) -> Scene:
+    turned = turned_by(found.t, found.spin, found.orientation)
+    kept = _frames(found.t, _FRAMES_PER_SECOND / speed)
+    total = found.mass.sum()
+    leader = (found.place * found.mass[:, None]).sum(axis=1) / (total if total > 0 else 1.0)
+    scale = float(np.linalg.norm(found.place - leader[:, None], axis=-1).max())
+    scale += float(np.sqrt(np.trace(found.inertia.sum(axis=0)) / (total if total > 0 else 1.0)))
+    upright = UPRIGHT[up or which_way_is_up(found.forces)]
+
+    few = dataclasses.replace(
+        found,
+        orientation=found.orientation[kept],
+        place=found.place[kept],
+        points=found.points[kept],
+        frames=found.frames[kept],
+    )
+    build = Builder(few.orientation, few.place, turned[kept], scale or 1.0)
+    if figure is None:
+        bodies_and_points(few, build)
+    for e in found.elements:
+        body = None if e.body is None else found.numbers.index(e.body)
+        build.moving(e.places[kept], body)
+        style = {"width": e.width, "closed": e.closed, "fill": e.fill, "label": e.label}
+        build.shape(e.kind, e.color, e.places.shape[1], **style)
+
+    leader = leader[kept] @ upright.T
+    scene = Scene(
+        t=found.t[kept],
+        **build.arrays(upright),
+        shapes=tuple(build.shapes),
+        leader=leader,
+        ground=None,
+        view=None,  # type: ignore[arg-type]
+        title=name if title is None else title,
+        name=name,
+    )
+    times = np.linspace(scene.t[0], scene.t[-1], 200)
+    x, followed = scene.at(times)
+    view = view_of(x, scene.owner != FIXED, followed, follow)
+    lowest = float(x[..., 2].min())
+    flat = view.elevation == 0.0  # a grid seen from its edge is a line
+    if ground if ground is not None else not flat:
+        scene = dataclasses.replace(scene, ground=lowest - (0.0 if figure is not None else 0.03 * view.span))
+    return dataclasses.replace(scene, view=view)
+
+
+def _frames(t: np.ndarray, rate: float) -> np.ndarray:
+    """The instants that are kept: those nearest to `rate` a second, or all where there are fewer."""
+    n = int(min(max(np.ceil((t[-1] - t[0]) * rate) + 1, 2), _MOST_FRAMES))
+    if n >= len(t):
+        return np.arange(len(t))
+    wanted = np.linspace(t[0], t[-1], n)
+    after = np.clip(np.searchsorted(t, wanted), 1, len(t) - 1)
+    return np.unique(after - (wanted - t[after - 1] < t[after] - wanted))
+
+
+class Animation:
+    """A moving picture: `save` writes it to a file, a notebook shows it as it is, `html()` is the page.
+
+    `scene` holds what is drawn, as NumPy arrays.
+    """
+
+    def __init__(self, scene: Scene, speed: float, theme: str, height: int):
+        self.scene, self.speed, self.theme, self.height = scene, speed, theme, height
+
+    def html(self) -> str:
+        """The page: one canvas and its script, without anything from elsewhere."""
+        return self._page
+
+    @functools.cached_property
+    def _page(self) -> str:
+        page = resources.files("jaxkane._animate").joinpath("viewer.html").read_text(encoding="utf-8")
+        scene = json.dumps(_compact(self.scene, self.speed), separators=(",", ":")).replace("<", "\\u003c")
+        for mark, text in (("theme", self.theme), ("title", html.escape(self.scene.title)), ("scene", scene)):
+            page = page.replace(f"%%{mark}%%", text)
+        return page
+
+    def _repr_html_(self) -> str:
+        return (
+            f'<iframe srcdoc="{html.escape(self.html())}" title="{html.escape(self.scene.title, quote=True)}" '
+            f'style="width: 100%; height: {self.height}px; border: 0" loading="lazy" allowfullscreen></iframe>'
+        )
+
+    def save(self, path: str | os.PathLike[str], **options: Any) -> Path:
+        """Writes the animation to NAME.html or NAME.gif.
+
+        **Arguments:** for a GIF also `size` = (480, 300) [pixels], `fps` = 20, `seconds`: how much of the motion, and
+        `azimuth`, `elevation` [degrees] as those of `animate`.
+
+        **Returns:** the path.
+
+        **Raises:** `ValueError` for any other ending.
+        """
+        path = Path(path)
+        if path.suffix == ".html" and not options:
+            path.write_text(self.html(), encoding="utf-8")
+        elif path.suffix == ".gif":
+            write_gif(path, self.scene, self.speed, dark=self.theme == "dark", **options)
+        else:
+            raise ValueError(f"Animation.save: the name ends with .html (without options) or .gif, got {path.name!r}.")
+        return path
+
+    def __repr__(self) -> str:
+        t = self.scene.t
+        return f"Animation({self.scene.title}: {len(t)} frames from {t[0]:g} to {t[-1]:g} s)"
+
+
+def _compact(scene: Scene, speed: float) -> dict[str, Any]:
+    """The scene for the page: orientations in 16 bits, places in 32."""
+
+    def encode(x: np.ndarray, dtype: str) -> str:
+        return base64.b64encode(np.ascontiguousarray(x, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()).decode()
+
+    view = scene.view
+    return {
+        "title": scene.title,
+        "speed": speed,
+        "parts": scene.position.shape[1],
+        "turning": scene.rotation.shape[1],
+        "t": encode(scene.t - scene.t[0], "f4"),
+        "start": float(scene.t[0]),
+        "position": encode(scene.position, "f4"),
+        "rotation": encode(np.round(scene.rotation * 32767), "i2"),
+        "leader": encode(scene.leader, "f4"),
+        "vertex": encode(scene.vertex, "f4"),
+        "owner": encode(scene.owner, "i2"),
+        "shapes": [dataclasses.asdict(shape) for shape in scene.shapes],
+        "ground": scene.ground,
+        "view": {
+            "center": view.center.tolist(),
+            "span": view.span,
+            "spanFollowing": view.span_following,
+            "azimuth": view.azimuth,
+            "elevation": view.elevation,
+            "follow": view.follow,
+        },
+        "colors": COLORS,
+    }
