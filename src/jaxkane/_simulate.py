@@ -137,7 +137,7 @@ class Settings(eqx.Module):
     rtol: float = eqx.field(static=True)
     atol: float = eqx.field(static=True)
     solver: diffrax.AbstractSolver
-    step: float | None = eqx.field(static=True)
+    step: Any  # a number, or an array where it may change without another compilation
     adjoint: diffrax.AbstractAdjoint
     max_steps: int = eqx.field(static=True)
     progress: bool = eqx.field(static=True)

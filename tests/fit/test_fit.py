@@ -52,7 +52,7 @@ def test_jacobian_against_central_differences(swings):
     @jax.jit
     def residuals(unknowns):
         z, b, x = jnp.split(unknowns, (4, 6))
-        return problem.residuals(window, problem.consistent(window, z, x), z, b, x)[0]
+        return problem.model.residuals(window, problem.model.consistent(window, z, x), z, b, x)[0]
 
     x = 0.05 * jnp.arange(1.0, 10.0)
     exact = jax.jacfwd(residuals)(x)
@@ -76,11 +76,11 @@ def test_elimination_is_the_dense_solution():
     tolerance = 1e-9
     rng = np.random.default_rng(0)
     W, n_z, n_b, n_x = 5, 3, 2, 2
-    trial = jnp.array([0, 0, 1, 1, 1])
+    trial = np.array([0, 0, 1, 1, 1])
     windows = jnp.array([[0, 1, W], [2, 3, 4]])
     k = n_z + n_b + n_x + 1
     A = rng.normal(size=(W, 20, k))
-    blocks = Blocks(jnp.linalg.qr(jnp.asarray(A), mode="r"), trial, windows, n_z, n_b)
+    blocks = Blocks(jnp.linalg.qr(jnp.asarray(A), mode="r"), windows, n_z, 0, n_b)
     eliminated = eliminate(blocks, 0.0)
     x, least = eliminated.step(1e-14)
     z, b = eliminated.others(x)

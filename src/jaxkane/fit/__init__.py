@@ -1,16 +1,31 @@
-"""Parameters from measured motion: trials, residuals with exact derivatives, two optimizers, and what can be told."""
+"""Parameters from measured motion: trials, residuals with exact derivatives, optimizers, and what can be told."""
 
+from ._bfgs import bfgs as bfgs
+from ._bijections import Interval as Interval
+from ._bijections import PossibleBody as PossibleBody
+from ._density import log_density as log_density
 from ._fit import fit as fit
 from ._gradient_descent import gradient_descent as gradient_descent
 from ._identifiability import Direction as Direction
 from ._identifiability import Identifiability as Identifiability
 from ._identifiability import identifiability as identifiability
+from ._least_squares import gauss_newton as gauss_newton
 from ._least_squares import least_squares as least_squares
+from ._model import Model as Model
+from ._model import Point as Point
+from ._parameters import Delay as Delay
 from ._parameters import Free as Free
 from ._parameters import Gain as Gain
-from ._problem import Point as Point
+from ._parameters import Inertia as Inertia
 from ._problem import Problem as Problem
 from ._read import read_trials as read_trials
+from ._residual_tests import ResidualTest as ResidualTest
 from ._result import Fit as Fit
 from ._trial import Trial as Trial
+from ._uncertainty import CrossValidation as CrossValidation
+from ._uncertainty import Laplace as Laplace
+from ._uncertainty import Profile as Profile
+from ._uncertainty import cross_validate as cross_validate
+from ._uncertainty import laplace as laplace
+from ._uncertainty import profile as profile
 from .bicycle import fit_bicycle as fit_bicycle

@@ -1,9 +1,10 @@
 """Least squares with a block structure, by orthogonal elimination. Knows matrices; knows nothing of what they mean.
 
-The unknowns of a window (z), of a trial (b) and of all (x) meet in residuals that are kept, window by window, as a
-triangle: |J d + r|^2 = |R [d; 1]|^2 with columns [z, b, x, r]. Eliminating z in every window, then b in every trial,
-leaves one small problem in x: what a Schur complement of J^T J gives, without squaring its condition number
-(square-root information form: Bierman, Factorization Methods for Discrete Sequential Estimation, 1977).
+The unknowns of a window (z), of the window after it (z_next), of a trial (b) and of all (x) meet in residuals that are
+kept, window by window, as a triangle: |J d + r|^2 = |R [d; 1]|^2 with columns [z, z_next, b, x, r]. Eliminating z from
+window to window, then b in every trial, leaves one small problem in x: what a Schur complement of J^T J gives, without
+squaring its condition number. Where windows are chained (z_next), that is the square-root information filter, and the
+way back its smoother (Bierman, Factorization Methods for Discrete Sequential Estimation, 1977).
 """
 
 from __future__ import annotations
@@ -16,14 +17,18 @@ from jaxtyping import Array, Float, Int
 
 
 class Blocks(eqx.Module):
-    """Linearized residuals: `R` (W, k, k) with k = n_z + n_b + n_x + 1; `trial` (W,), and the windows of every trial
-    (T, m), filled up with W."""
+    """Linearized residuals: `R` (W, k, k) with k = n_z + n_next + n_b + n_x + 1, where n_next is n_z or, without
+    chains, 0; and the windows of every trial in their order (T, m), filled up with W."""
 
     R: Float[Array, "W k k"]
-    trial: Int[Array, " W"]
     windows: Int[Array, "T m"]
     n_z: int = eqx.field(static=True)
+    n_next: int = eqx.field(static=True)
     n_b: int = eqx.field(static=True)
+
+    @property
+    def n_x(self) -> int:
+        return self.R.shape[-1] - self.n_z - self.n_next - self.n_b - 1
 
     @property
     def cost(self) -> Array:
@@ -33,7 +38,7 @@ class Blocks(eqx.Module):
     @property
     def column_norms(self) -> Array:
         """Norms (n_x,) of the sensitivity's columns before anything is eliminated."""
-        return jnp.sqrt(jnp.sum(self.R[:, :, self.n_z + self.n_b : -1] ** 2, axis=(0, 1)))
+        return jnp.sqrt(jnp.sum(self.R[:, :, -1 - self.n_x : -1] ** 2, axis=(0, 1)))
 
     @property
     def silent(self) -> Array:
@@ -41,15 +46,26 @@ class Blocks(eqx.Module):
         norms = self.column_norms
         return norms <= 1e4 * jnp.finfo(norms.dtype).eps * jnp.max(norms)
 
+    @property
+    def gradient(self) -> tuple[Array, Array, Array]:
+        """Of half the sum of squares by z (W, n_z), b (T, n_b) and x (n_x,)."""
+        products = _by_trial(jnp.einsum("wij,wi->wj", self.R, self.R[:, :, -1]), self.windows)  # (T, m, k)
+        z = products[:, :, : self.n_z]
+        if self.n_next:
+            z = z.at[:, 1:].add(products[:, :-1, self.n_z : 2 * self.n_z])
+        shared = products[:, :, self.n_z + self.n_next : -1]
+        b, x = shared[:, :, : self.n_b], shared[:, :, self.n_b :]
+        return _of_windows(z, self.windows, self.R.shape[0]), jnp.sum(b, axis=1), jnp.sum(x, axis=(0, 1))
+
 
 class Eliminated(eqx.Module):
     """What is left: `R` (T, n_x + 1, n_x + 1) with columns [x, r], and the rows that give z and b back."""
 
     R: Float[Array, "T n n"]
-    z_rows: Float[Array, "W n_z k"]
+    z_rows: Float[Array, "T m n_z k"]
     b_rows: Float[Array, "T n_b kb"]
     scale: Float[Array, " n_x"]
-    trial: Int[Array, " W"]
+    blocks: Blocks
 
     @property
     def rows(self) -> tuple[Array, Array]:
@@ -57,6 +73,16 @@ class Eliminated(eqx.Module):
         flat = self.R.reshape(-1, self.R.shape[-1])
         return flat[:, :-1], flat[:, -1]
 
+    @property
+    def log_determinant(self) -> Array:
+        """log det of the information about z and b, those without any left out."""
+        n_z, n_b = self.z_rows.shape[2], self.b_rows.shape[1]
+        diagonals = [jnp.diagonal(self.z_rows[..., :n_z], axis1=-2, axis2=-1).ravel()]
+        diagonals.append(jnp.diagonal(self.b_rows[..., :n_b], axis1=-2, axis2=-1).ravel())
+        d = jnp.abs(jnp.concatenate(diagonals))
+        return 2 * jnp.sum(jnp.where(d > jnp.finfo(d.dtype).tiny ** 0.25, jnp.log(jnp.maximum(d, 1e-300)), 0.0))
+
+    @jax.jit
     def step(self, damping: Array | float) -> tuple[Array, Array]:
         """The x (n_x,) that minimizes the sum of squares with `damping` * |column| * x added, and that minimum."""
         A, r = self.rows
@@ -65,29 +91,65 @@ class Eliminated(eqx.Module):
         R = jnp.linalg.qr(jnp.column_stack([A, jnp.append(r, jnp.zeros(n, r.dtype))]), mode="r")
         return solve_triangular(R[:n, :n], -R[:n, n]), R[n, n] ** 2
 
+    @jax.jit
     def others(self, x: Array) -> tuple[Array, Array]:
         """z (W, n_z) and b (T, n_b) that go with a step x."""
-        b = _back(self.b_rows, jnp.broadcast_to(x, (self.b_rows.shape[0], x.shape[0])))
-        shared = jnp.concatenate([b[self.trial], jnp.broadcast_to(x, (self.trial.shape[0], x.shape[0]))], axis=1)
-        return _back(self.z_rows, shared), b
+        n_z = self.z_rows.shape[2]
+
+        def of_trial(z_rows, b_rows):
+            b = _back(b_rows, x)
+
+            def of_window(z_next, rows):
+                z = _back(rows, jnp.concatenate([z_next[: self.blocks.n_next], b, x]))
+                return z, z
+
+            return jax.lax.scan(of_window, jnp.zeros(n_z, x.dtype), z_rows, reverse=True)[1], b
+
+        z, b = jax.vmap(of_trial)(self.z_rows, self.b_rows)
+        return _of_windows(z, self.blocks.windows, self.blocks.R.shape[0]), b
 
 
 @jax.jit
 def eliminate(blocks: Blocks, damping: Array | float) -> Eliminated:
     """z and b eliminated, each with `damping` * |column| * unknown added to the residuals (Levenberg-Marquardt)."""
-    R, n_z, n_b = blocks.R, blocks.n_z, blocks.n_b
+    R, n_z, n_next, n_b, n_x = blocks.R, blocks.n_z, blocks.n_next, blocks.n_b, blocks.n_x
     # What has no influence has rounding errors; a step along them would lead anywhere.
-    silent = jnp.zeros(R.shape[-1], bool).at[n_z + n_b : -1].set(blocks.silent)
+    silent = jnp.zeros(R.shape[-1], bool).at[-1 - n_x : -1].set(blocks.silent)
     R = jnp.where(silent[None, None, :], 0.0, R)
-    squares = jnp.sum(R**2, axis=1)  # (W, k)
-    by_trial = jnp.zeros((blocks.windows.shape[0], R.shape[-1]), R.dtype).at[blocks.trial].add(squares)
+    squares = _by_trial(jnp.sum(R**2, axis=1), blocks.windows)  # (T, m, k)
+    of_z = squares[:, :, :n_z]
+    if n_next:
+        of_z = of_z.at[:, 1:].add(squares[:, :-1, n_z : 2 * n_z])
     # Never quite zero: an unknown without influence then stays where it is, instead of becoming NaN.
     damping = jnp.maximum(jnp.asarray(damping, R.dtype), 1e3 * jnp.finfo(R.dtype).eps)
-    z_rows, rest = _triangle(R, n_z, damping * _safe(squares[:, :n_z]))
-    rest = jnp.concatenate([rest, jnp.zeros_like(rest[:1])])[blocks.windows]  # (T, m, k', k')
-    rest = rest.reshape(rest.shape[0], -1, rest.shape[-1])
-    b_rows, rest = _triangle(rest, n_b, damping * _safe(by_trial[:, n_z : n_z + n_b]))
-    return Eliminated(rest, z_rows, b_rows, _safe(jnp.sum(squares, axis=0)[n_z + n_b : -1]), blocks.trial)
+    c = n_next + n_b + n_x + 1
+
+    def of_trial(rows, z_damping):
+        def of_window(known, now):  # known (c, c): what earlier windows say about [z if chained, b, x, r]
+            rows, damping = now
+            split = n_z if n_next else 0
+            known = jnp.concatenate([known[:, :split], jnp.zeros((c, n_z), R.dtype), known[:, split:]], axis=1)
+            z_rows, rest = _triangle(jnp.concatenate([known, rows]), n_z, damping)
+            return rest, z_rows
+
+        rest, z_rows = jax.lax.scan(of_window, jnp.zeros((c, c), R.dtype), (rows, z_damping))
+        return rest[:, n_next:], z_rows  # after a trial's last window there is no next
+
+    rest, z_rows = jax.vmap(of_trial)(_by_trial(R, blocks.windows), damping * _safe(of_z))
+    of_b = jnp.sum(squares, axis=1)[:, n_z + n_next : n_z + n_next + n_b]
+    b_rows, rest = jax.vmap(lambda rows, d: _triangle(rows, n_b, d))(rest, damping * _safe(of_b))
+    scale = _safe(jnp.sum(squares, axis=(0, 1))[-1 - n_x : -1])
+    return Eliminated(rest, z_rows, b_rows, scale, blocks)
+
+
+def _by_trial(x: Array, windows: Array) -> Array:
+    """(W, ...) to (T, m, ...), zero where there is no window."""
+    return jnp.concatenate([x, jnp.zeros_like(x[:1])])[windows]
+
+
+def _of_windows(x: Array, windows: Array, W: int) -> Array:
+    """(T, m, n) to (W, n)."""
+    return jnp.zeros((W + 1, x.shape[-1]), x.dtype).at[windows].set(x)[:W]
 
 
 def _safe(squares: Array) -> Array:
@@ -99,20 +161,17 @@ def _safe(squares: Array) -> Array:
 
 
 def _triangle(R: Array, n: int, damping: Array) -> tuple[Array, Array]:
-    """Rows (batch, n, k) that hold the first n unknowns, and the triangle (batch, k-n, k-n) without them."""
-    batch, _, k = R.shape
-    rows = jnp.zeros((batch, n, k), R.dtype).at[:, jnp.arange(n), jnp.arange(n)].set(damping)
-    R = jnp.concatenate([R, rows], axis=1)
-    if R.shape[1] < k:
-        R = jnp.concatenate([R, jnp.zeros((batch, k - R.shape[1], k), R.dtype)], axis=1)
+    """Rows (n, k) that hold the first n unknowns, and the triangle (k-n, k-n) without them."""
+    k = R.shape[1]
+    rows = jnp.zeros((n, k), R.dtype).at[jnp.arange(n), jnp.arange(n)].set(damping)
+    R = jnp.concatenate([R, rows, jnp.zeros((max(k - R.shape[0] - n, 0), k), R.dtype)])
     R = jnp.linalg.qr(R, mode="r")
-    return R[:, :n, :], R[:, n:k, n:]
+    return R[:n, :], R[n:k, n:]
 
 
 def _back(rows: Array, known: Array) -> Array:
-    """Unknowns (batch, n) from rows (batch, n, n + m + 1) and the m that are known."""
-    n, m = rows.shape[1], known.shape[1]
+    """Unknowns (n,) from rows (n, n + m + 1) and the m that are known."""
+    n = rows.shape[0]
     if n == 0:
-        return jnp.zeros((rows.shape[0], 0), rows.dtype)
-    right = jnp.einsum("bnm,bm->bn", rows[:, :, n : n + m], known) + rows[:, :, -1]
-    return solve_triangular(rows[:, :, :n], -right[:, :, None])[:, :, 0]
+        return jnp.zeros(0, rows.dtype)
+    return solve_triangular(rows[:, :n], -(rows[:, n:-1] @ known + rows[:, -1]))

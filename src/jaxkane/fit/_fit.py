@@ -10,13 +10,20 @@ from jaxtyping import Array
 
 from .._system import System
 from .._trajectory import Trajectory
+from ._bfgs import bfgs
 from ._gradient_descent import gradient_descent
-from ._least_squares import least_squares
-from ._problem import Problem
+from ._least_squares import gauss_newton, least_squares
+from ._parameters import Prior
+from ._problem import Names, Problem
 from ._result import Fit
 from ._trial import Trial
 
-METHODS = {"gradient_descent": gradient_descent, "least_squares": least_squares}
+METHODS = {
+    "gradient_descent": gradient_descent,
+    "least_squares": least_squares,
+    "gauss_newton": gauss_newton,
+    "bfgs": bfgs,
+}
 
 
 def fit(
@@ -24,13 +31,18 @@ def fit(
     trials: Sequence[Trial] | Trial,
     free: Any,
     *,
-    unknown: Sequence[str] | Mapping[str, float | None] = (),
-    sensor_bias: Sequence[str] | Mapping[str, float | None] = (),
-    input_bias: Sequence[str] | Mapping[str, float | None] = (),
+    unknown: Names = (),
+    sensor_bias: Names = (),
+    sensor_gain: Names = (),
+    input_bias: Names = (),
+    input_gain: Names = (),
+    input_delay: Names = (),
+    priors: Mapping[str, Prior] | None = None,
     hold: Sequence[str] = (),
     window: float | None = None,
+    continuity: Mapping[str, float] | None = None,
     outputs: Mapping[str, Callable[[Trajectory], Array]] | None = None,
-    method: Literal["gradient_descent", "least_squares"] = "gradient_descent",
+    method: Literal["gradient_descent", "least_squares", "gauss_newton", "bfgs"] = "gradient_descent",
     rtol: float | None = None,
     atol: float | None = None,
     step: float | None = None,
@@ -40,25 +52,33 @@ def fit(
 ) -> Fit:
     """The parameters of a system with which its motion is nearest to what was measured.
 
-        minimize  sum ((simulated + bias - measured) / sigma)^2
+        minimize  sum ((gain * simulated + bias - measured) / sigma)^2
 
     **Arguments:**
 
     - `system`: with first guesses of its parameters. `trials`: one `Trial` or several.
-    - `free`: what to find: names, paths, functions to leaves, `Free` and `Gain`.
+    - `free`: what to find: names, paths, functions to leaves, `Free`, `Gain`, `Delay` and `Inertia`.
     - `unknown`: coordinates and independent speeds whose value at the start of every window is to be found too;
         dependent ones follow from them (`assemble`).
-    - `sensor_bias`: channels with an unknown constant offset in every trial. `input_bias`: inputs with one.
-    - `unknown`, `sensor_bias` and `input_bias` are names, or a dict from names to the standard deviation of a Gaussian
-        prior around the first guess (None: no prior).
+    - `sensor_bias`, `sensor_gain`: channels with an unknown constant offset and factor in every trial. `input_bias`,
+        `input_gain`, `input_delay` [s]: inputs with an offset, a factor and a delay of every trial's own.
+    - These are names, or a dict from names to the standard deviation of a Gaussian prior around the first guess (None:
+        no prior).
+    - `priors`: (mean, standard deviation) by name, of parameters that were measured elsewhere; names that are not free
+        are passed over.
     - `hold`: inputs that keep each sample until the next, as a digital controller's commands do; the others are linear
         between their samples.
     - `window` [s]: cut the trials into windows of this length, each with its own unknown start (multiple shooting), as
-        unstable motions need. By default a trial is one window.
+        unstable motions need. By default a trial is one window (single shooting).
+    - `continuity`: by name, the standard deviation of the jump from a window's end to the next one's start, for what is
+        `unknown`; names left out jump freely. Small ones ask for one motion through all windows; with windows as short
+        as the samples they are a process noise, and the sum of squares is that of a Kalman filter's prediction errors.
     - `outputs`: channels that are functions of the `Trajectory`, by name: values (n_t,).
-    - `method`: "gradient_descent" or "least_squares"; `options` go to it (`steps`, `progress`, ...).
+    - `method`: "gradient_descent", "least_squares" (Levenberg-Marquardt), "gauss_newton" or "bfgs"; `options` go to it
+        (`steps`, `start`, `checkpoint`, `progress`, ...).
     - `rtol`, `atol`, `step`, `solver`, `max_steps`: of the simulation. By default one step of Bosh3 between
-        neighbouring samples where inputs are sampled at a steady rate, and Tsit5 with a tolerance of 1e-6 elsewhere.
+        neighbouring samples where there are inputs, or two or four where that changes what is simulated; and Tsit5
+        with a tolerance of 1e-6 elsewhere.
 
     **Returns:** a `Fit`.
 
@@ -72,9 +92,14 @@ def fit(
         free,
         unknown=unknown,
         sensor_bias=sensor_bias,
+        sensor_gain=sensor_gain,
         input_bias=input_bias,
+        input_gain=input_gain,
+        input_delay=input_delay,
+        priors=priors,
         hold=hold,
         window=window,
+        continuity=continuity,
         outputs=outputs,
         rtol=rtol,
         atol=atol,

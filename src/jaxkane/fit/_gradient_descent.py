@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import os
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 from jaxtyping import Array
 from tqdm import tqdm
 
 from ._blocks import Eliminated, eliminate
-from ._problem import Linearization, Point, Problem, linearize
+from ._checkpoint import Checkpoint
+from ._model import Point
+from ._problem import Linearization, Problem, linearize
 from ._result import Fit
 from ._steps import moved, settle, usable
 
@@ -22,6 +28,8 @@ def gradient_descent(
     refresh: int | None = 10,
     rtol: float = 1e-6,
     start: Point | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    callback: Callable[[Point, float], None] | None = None,
     progress: bool = False,
 ) -> Fit:
     """Minimize half the sum of squares by gradient descent.
@@ -39,16 +47,18 @@ def gradient_descent(
         along a cosine. The unit of y is the way that there seems to be to go, so rates about 0.1 suit Adam.
     - `refresh`: how many steps until the coordinates are made round anew; None for the plainly scaled
         parameters (`Free.scale`) throughout.
-    - `start`: a `Point` to go on from, such as `fit.point`. `progress`: show a progress bar.
+    - `start`: a `Point` to go on from, such as `fit.point`.
+    - `checkpoint`: a file in which the state is kept after every step; where it exists the fit goes on from there.
+    - `callback`: called with the point and its cost at the start and after every step. `progress`: a progress bar.
 
     A step whose simulation fails, or which multiplies the cost, is halved until it does not.
 
     **Returns:** a `Fit` at the best point seen, with the history of the cost; after an interruption (Ctrl-C) too, and
     `status` says so.
 
-    **Raises:** `ValueError` where a window cannot be simulated with the first guess.
+    **Raises:** `ValueError` where a window cannot be simulated with the first guess, or a checkpoint is of another fit.
     """
-    point, at = settle(problem, problem.start if start is None else start)
+    start = problem.start if start is None else start
     descent = optimizer
     if descent is None:
         descent = optax.sgd(optax.cosine_decay_schedule(0.3, max(steps, 1), 0.1), momentum=0.6, nesterov=True)
@@ -60,13 +70,29 @@ def gradient_descent(
             updates, memory = descent.update(directions.T @ gradient / unit, memory, y)
         return unit * directions @ updates, y + updates, memory
 
-    y = jnp.zeros_like(point.x)
+    p = start.x.shape[0]
+    # What one step hands to the next: the way gone in the round coordinates, those coordinates, and their unit.
+    y, directions, unit = jnp.zeros_like(start.x), jnp.eye(p, dtype=start.x.dtype), jnp.zeros((), start.x.dtype)
     memory = descent.init(y)
-    unit = None
-    history, best, status = [at.cost], (point, at), "steps"
-    bar = tqdm(total=steps, disable=not progress, desc="gradient descent")
+    file = Checkpoint(checkpoint, problem, "gradient descent")
+    like = {"y": y, "directions": directions, "unit": unit, "memory": memory, "best": start}
+    saved = file.read(start, **like)
+    if saved is None:
+        point, at = settle(problem, start)
+        history, best = [at.cost], (point, at)
+    else:
+        point, (y, directions, unit, memory, _) = saved["point"], (saved[name] for name in like)
+        history = [float(c) for c in saved["history"]]
+        at, at_best = linearize(problem, point), linearize(problem, saved["best"])
+        if at is None or at_best is None:
+            raise ValueError(f"{checkpoint}: the residuals are not finite where this fit was left; delete the file.")
+        best = saved["best"], at_best
+    status = "steps"
+    bar = tqdm(total=steps, initial=len(history) - 1, disable=not progress, desc="gradient descent")
     try:
-        for i in range(steps):
+        if callback:
+            callback(point, at.cost)
+        for i in range(len(history) - 1, steps):
             eliminated = eliminate(at.blocks, 0.0)
             if _is_minimum(at, eliminated, rtol):
                 status = "converged"
@@ -74,7 +100,7 @@ def gradient_descent(
             if i % (refresh or steps) == 0:
                 directions = _directions(eliminated, at.cost / problem.size[0] if refresh else None)
             gradient = _gradient(eliminated)
-            unit = jnp.linalg.norm(directions.T @ gradient) if unit is None else unit
+            unit = unit if unit > 0 else jnp.linalg.norm(directions.T @ gradient)
             step, y, memory = descend(directions, unit, gradient, memory, y)
             after = _guarded(problem, point, at, step, eliminated)
             if after is None:
@@ -84,6 +110,10 @@ def gradient_descent(
             history.append(at.cost)
             if at.cost < best[1].cost:
                 best = point, at
+            now = {"point": point, "y": y, "directions": directions, "unit": unit, "memory": memory, "best": best[0]}
+            file.write(**now, history=np.array(history))
+            if callback:
+                callback(point, at.cost)
             bar.update()
             bar.set_postfix(cost=f"{at.cost:.6g}")
         settled = settle(problem, best[0], steps=3, rtol=1e-9)

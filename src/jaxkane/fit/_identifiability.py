@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._blocks import eliminate
-from ._problem import Linearization, Point, Problem
+from ._model import Point
+from ._problem import Linearization, Problem
 from ._steps import settle
 
 
@@ -20,7 +21,7 @@ class Direction:
 
     Attributes: `singular_value`: by how many standard deviations of one measurement all residuals together move for a
     step of one along it; `deviation`: its own standard deviation, in scaled units (1 is a change by the whole scale,
-    for a positive parameter by a factor of e); `parts`: the parameters in it with their shares; `text`: in words.
+    for a positive parameter by all of itself); `parts`: the parameters in it with their shares; `text`: in words.
     """
 
     singular_value: float
@@ -33,20 +34,25 @@ class Direction:
 class Identifiability:
     """The sensitivity of all residuals to the free parameters, nuisance values eliminated.
 
-    - `names` (p,); `singular_values` (p,), largest first; `vectors` (p, p), a row for each, in scaled parameters.
+    - `names`, `units` (p,); `scales` (p,): what parameters are counted in, each in its unit.
+    - `singular_values` (p,), largest first; `vectors` (p, p), a row for each, in scaled parameters.
     - `deviations` (p,): standard deviation along each row, in scaled units.
     - `without_influence`: names of the parameters that change no residual at all.
     - `undetermined`: the directions that the data do not tell, weakest first.
-    - `covariance` (p, p) of the scaled parameters, infinite for those without influence.
+    - `covariance` (p, p) of the parameters in their units, infinite for those without influence.
+    - `covariance_of_x` (p, p) of the free numbers behind them.
     """
 
     names: tuple[str, ...]
+    units: tuple[str, ...]
+    scales: np.ndarray
     singular_values: np.ndarray
     vectors: np.ndarray
     deviations: np.ndarray
     without_influence: tuple[str, ...]
     undetermined: tuple[Direction, ...]
     covariance: np.ndarray
+    covariance_of_x: np.ndarray
 
     @property
     def ok(self) -> bool:
@@ -56,6 +62,11 @@ class Identifiability:
     @property
     def messages(self) -> tuple[str, ...]:
         return tuple(direction.text for direction in self.undetermined)
+
+    @property
+    def information(self) -> np.ndarray:
+        """Fisher information (p, p) of the scaled parameters, for residuals of variance one."""
+        return (self.vectors.T * self.singular_values**2) @ self.vectors
 
     def __str__(self) -> str:
         lines = ["singular value   deviation   direction (scaled parameters)"]
@@ -82,68 +93,82 @@ def identifiability(
     **Returns:** an `Identifiability`; print it for a table.
     """
     if hasattr(problem, "identifiability"):
-        return look(problem.problem, problem.linearization, flat)
+        return look(problem.problem, problem.point, problem.linearization, flat)
     if not isinstance(problem, Problem):
         problem = Problem.of(problem, trials, free, **options)
-    _, linearization = settle(problem, problem.start if at is None else at)
-    return look(problem, linearization, flat)
+    point, linearization = settle(problem, problem.start if at is None else at)
+    return look(problem, point, linearization, flat)
 
 
-def look(problem: Problem, at: Linearization, flat: float = 0.5) -> Identifiability:
+def look(problem: Problem, point: Point, at: Linearization, flat: float = 0.5) -> Identifiability:
     """Identifiability at a point where the problem has been linearized."""
-    names = problem.parameters.names
+    parameters = problem.parameters
+    names, p = parameters.names, len(parameters.names)
+    to_values = np.asarray(parameters.slopes(point.x))
+    scales = np.linalg.norm(to_values, axis=1)  # what a step of one in the free numbers does
+    to_x = np.linalg.solve(to_values, np.diag(scales))  # from scaled parameters
     eliminated = eliminate(at.blocks, 0.0)
-    A = np.asarray(eliminated.rows[0])
+    A = np.asarray(eliminated.rows[0]) @ to_x
+    before = np.linalg.norm(np.asarray(at.blocks.R)[:, :, -1 - p : -1] @ to_x, axis=(0, 1))
+    eps = float(jnp.finfo(eliminated.R.dtype).eps)
+    silent = before <= 1e4 * eps * before.max()
     n_r, n_unknown = problem.size
     variance = at.cost / max(n_r - n_unknown, 1)  # of a residual; one where `sigma` is right
-    before = np.asarray(at.blocks.column_norms)
-    silent = np.asarray(at.blocks.silent)
-    # Elimination leaves rounding errors of what it removed: less than this is nothing.
-    floor = 1e3 * float(jnp.finfo(eliminated.R.dtype).eps) * before.max()
     heard = np.flatnonzero(~silent)
-    s, V = np.zeros(len(names)), np.zeros((len(names), len(names)))
+    s, V = np.zeros(p), np.zeros((p, p))
     if heard.size:
+        # Columns that belong to silent free numbers are left out of the elimination: nothing is lost.
         _, s[: heard.size], V[: heard.size, heard] = np.linalg.svd(A[:, heard], full_matrices=False)
     # Each silent parameter is a direction of its own.
-    V[np.arange(heard.size, len(names)), np.flatnonzero(silent)] = 1.0
-    s = np.where(s <= floor, 0.0, s)
+    V[np.arange(heard.size, p), np.flatnonzero(silent)] = 1.0
+    s = np.where(s <= 1e3 * eps * before.max(), 0.0, s)  # elimination leaves rounding errors of what it removed
     with np.errstate(divide="ignore"):
         deviations = np.sqrt(variance) / s
-    signs = np.sign(V[np.arange(len(V)), np.abs(V).argmax(axis=1)])
-    V = V * signs[:, None]
-    directions = [
-        _direction(names, s[i], deviations[i], V[i], silent) for i in range(len(s)) if not deviations[i] <= flat
-    ]
-    told = ~silent & np.all((np.abs(V) < 1e-6) | (s[:, None] > 0), axis=0)
-    with np.errstate(divide="ignore"):
         inverse = np.where(s > 0, 1 / s, 0.0)
-    covariance = variance * (V.T * inverse**2) @ V
+    V = V * np.sign(V[np.arange(p), np.abs(V).argmax(axis=1)])[:, None]
+    told = ~silent & np.all((np.abs(V) < 1e-6) | (s[:, None] > 0), axis=0)
+    scaled = variance * (V.T * inverse**2) @ V
+    of_x = to_x @ scaled @ to_x.T
+    covariance = scaled * np.outer(scales, scales)
     covariance[~told, :] = covariance[:, ~told] = np.nan
     covariance[~told, ~told] = np.inf
-    return Identifiability(
-        names,
-        s,
-        V,
-        deviations,
-        tuple(name for name, quiet in zip(names, silent, strict=True) if quiet),
-        tuple(reversed(directions)),
-        covariance,
+    seen = Identifiability(
+        names=names,
+        units=parameters.units,
+        scales=scales,
+        singular_values=s,
+        vectors=V,
+        deviations=deviations,
+        without_influence=tuple(name for name, quiet in zip(names, silent, strict=True) if quiet),
+        undetermined=(),
+        covariance=covariance,
+        covariance_of_x=of_x,
     )
+    weak = [i for i in reversed(range(p)) if not deviations[i] <= flat]
+    return dataclasses.replace(seen, undetermined=tuple(_direction(seen, i) for i in weak))
 
 
-def _direction(names: tuple[str, ...], s: float, deviation: float, row: np.ndarray, silent: np.ndarray) -> Direction:
-    main = np.abs(row) > 0.1
-    parts = tuple((names[i], float(row[i])) for i in np.argsort(-np.abs(row)) if main[i])
-    alone = len(parts) == 1
-    if alone and silent[names.index(parts[0][0])]:
-        text = f"{parts[0][0]} has no influence on these data; it stays at its start."
-    elif alone and s == 0:
-        text = f"{parts[0][0]} cannot be told from the unknown starts and biases."
-    elif alone:
-        text = f"{parts[0][0]} is undetermined: its standard deviation is {deviation:.2g} of its scale."
+def _direction(seen: Identifiability, i: int) -> Direction:
+    s, deviation, row = seen.singular_values[i], seen.deviations[i], seen.vectors[i]
+    order = [j for j in np.argsort(-np.abs(row), kind="stable") if abs(row[j]) > 0.1]
+    parts = tuple((seen.names[j], float(row[j])) for j in order)
+    first = parts[0][0]
+    if len(parts) == 1 and first in seen.without_influence:
+        text = f"{first} has no influence on these data; it stays at its start."
+    elif len(parts) == 1 and s == 0:
+        text = f"{first} cannot be told from the unknown starts and biases."
+    elif len(parts) == 1:
+        unit = f" {seen.units[order[0]]}" * bool(seen.units[order[0]])
+        error = deviation * seen.scales[order[0]]
+        text = f"{first} is undetermined: its standard deviation is {error:.2g}{unit}, {deviation:.2g} of its scale."
     else:
-        known = "not at all" if s == 0 else f"only to {deviation:.2g}"
-        text = f"{', '.join(n for n, _ in parts)} trade off: along {_combination(names, row)} they are known {known}."
+        size = min(deviation, 1.0)
+        together = ", ".join(
+            f"{name} by {share * size * seen.scales[j]:+.2g}{' ' * bool(seen.units[j])}{seen.units[j]}"
+            for j, (name, share) in zip(order, parts, strict=True)
+        )
+        how = "changes nothing" if s == 0 else f"changes the residuals by no more than {size / deviation:.2g} deviations"
+        text = f"{', '.join(name for name, _ in parts)} trade off: moving {together} together {how}."
     return Direction(float(s), float(deviation), parts, text)
 
 

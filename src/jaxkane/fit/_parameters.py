@@ -1,4 +1,4 @@
-"""What a fit may move, and how: bijections from free numbers to parameters. Knows systems' leaves and no dynamics."""
+"""What a fit may move, and how: free numbers to parameters and back. Knows systems' leaves and no dynamics."""
 
 from __future__ import annotations
 
@@ -14,6 +14,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._system import System
+from ._bijections import Interval, PossibleBody
+
+Prior = tuple[float, float]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,15 +34,18 @@ class Free:
         scale, where the parameter is declared positive, and none elsewhere.
     - `scale`: how much is a lot, in the parameter's unit; by default the start's magnitude, or 1 for zero.
     - `prior`: (mean, standard deviation) of what was measured elsewhere.
-    - `name`: for tables.
+    - `tied`: other parameters that follow it: their name and factor, `Free("rR", tied={"rF": 1.0})`.
+    - `name`, `unit`: for tables.
     """
 
     where: str | Callable[[Any], Any]
     start: float | None = None
     bounds: tuple[float | None, float | None] | None = None
     scale: float | None = None
-    prior: tuple[float, float] | None = None
+    prior: Prior | None = None
+    tied: Mapping[str, float] = dataclasses.field(default_factory=dict, hash=False)
     name: str | None = None
+    unit: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -53,155 +59,304 @@ class Gain:
     start: float = 1.0
     bounds: tuple[float | None, float | None] | None = None
     scale: float | None = None
-    prior: tuple[float, float] | None = None
+    prior: Prior | None = None
     name: str | None = None
+    unit: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Delay:
+    """The delay [s] with which an input acts, common to all trials: the system receives samples(t - delay).
+
+    Of samples that are taken as linear in between; earlier than `LONGEST_DELAY` the first sample stands. The rest as
+    in `Free`.
+    """
+
+    input: str
+    start: float = 0.0
+    bounds: tuple[float | None, float | None] | None = None
+    scale: float | None = 0.02
+    prior: Prior | None = None
+    name: str | None = None
+    unit: str = "s"
+
+
+@dataclasses.dataclass(frozen=True)
+class Inertia:
+    """A rigid body's inertia, and with it mass and mass centre, that stays what a body can have.
+
+        Inertia(mass="mB", center=("xB", None, "zB"), moments=("IBxx", "IByy", "IBzz"), products=(None, "IBxz", None))
+
+    **Arguments:** names or paths of the system's parameters, as in `Free`.
+
+    - `moments`: Ixx, Iyy, Izz about the mass centre. Two equal names are a wheel's.
+    - `products`: Ixy, Ixz, Iyz as matrix entries; None for what symmetry makes zero: one alone is a body with a plane
+        of symmetry, none at all a body with principal axes.
+    - `matrix`: instead of these, a parameter of the shape (3, 3).
+    - `mass`, `center`: parameters, or None where the system has none that moves. `fixed`: those of them that stay.
+    - `prior`: (mean, standard deviation) by name.
+
+    The free numbers are logarithmic Cholesky factors of the pseudo-inertia (see `PossibleBody`).
+    """
+
+    moments: tuple[str, str, str] | None = None
+    products: tuple[str | None, str | None, str | None] = (None, None, None)
+    mass: str | None = None
+    center: tuple[str | None, str | None, str | None] = (None, None, None)
+    matrix: str | None = None
+    fixed: Sequence[str] = ()
+    prior: Mapping[str, Prior] = dataclasses.field(default_factory=dict, hash=False)
+    unit: str = "kg m^2"
 
 
 @dataclasses.dataclass(frozen=True)
 class _Entry:
-    """One free number: entry `place` of leaf `leaf` of the system, or the gain of `input`; bounds and scale settled."""
+    """One value: what it is called, and where it goes: (leaf, place, factor) of the system, or an input's role."""
 
     name: str
-    leaf: int
-    place: int
-    input: str | None
-    start: float
-    lower: float | None
-    upper: float | None
-    scale: float
-    prior: tuple[float, float] | None
+    unit: str
+    targets: tuple[tuple[int, int, float], ...] = ()
+    role: tuple[str, str] | None = None  # ("gain" or "delay", input)
 
 
 class Parameters(eqx.Module):
     """The free parameters of a fit: x (p,), zero at the start and about one where much has changed, to values (p,).
 
-        p = p0 + s x,   lower + (p0 - lower) exp(c x),   lower + (upper - lower) logistic(c x + d)
-
-    with c such that dp/dx is the scale at the start: a positive parameter moves as p0 exp(x).
+    The maps are bijections, each from its own part of x to as many values: see `Interval` and `PossibleBody`.
     """
 
     entries: tuple[_Entry, ...] = eqx.field(static=True)
+    bijections: tuple[Interval | PossibleBody, ...]
+    sizes: tuple[int, ...] = eqx.field(static=True)
+    start: Float[Array, " p"]
+    scale: Float[Array, " p"]
+    prior_mean: Float[Array, " p"]
+    prior_deviation: Float[Array, " p"]
 
     @property
     def names(self) -> tuple[str, ...]:
         return tuple(e.name for e in self.entries)
 
     @property
-    def start(self) -> np.ndarray:
-        """Values (p,) at x = 0."""
-        return np.array([e.start for e in self.entries])
+    def units(self) -> tuple[str, ...]:
+        return tuple(e.unit for e in self.entries)
 
     def values(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
         """Parameters in their own units."""
-        return jnp.stack([_value(e, x[i]) for i, e in enumerate(self.entries)])
+        return jnp.concatenate([f(part) for f, part in zip(self.bijections, self._parts(x), strict=True)])
 
-    def apply(self, system: System, x: Float[Array, " p"]) -> tuple[System, dict[str, Array]]:
-        """The system with these parameters, and the gains of the inputs by name."""
+    def inverse(self, values: Float[Array, " p"]) -> Float[Array, " p"]:
+        """The x (p,) of parameters in their own units; NaN outside their bounds."""
+        parts = self._parts(values)
+        return jnp.concatenate([f.inverse(part) for f, part in zip(self.bijections, parts, strict=True)])
+
+    def slopes(self, x: Float[Array, " p"]) -> Float[Array, "p p"]:
+        """d values / d x."""
+        return jax.jacfwd(self.values)(x)
+
+    def log_determinant(self, x: Float[Array, " p"]) -> Array:
+        """log |det d values / d x|: what a density over the values is multiplied by to be one over x."""
+        pairs = zip(self.bijections, self._parts(x), strict=True)
+        return sum((jnp.linalg.slogdet(jax.jacfwd(f)(part))[1] for f, part in pairs), jnp.zeros((), x.dtype))
+
+    def _parts(self, x: Array) -> list[Array]:
+        return jnp.split(x, np.cumsum(self.sizes)[:-1])
+
+    def apply(self, system: System, x: Float[Array, " p"]) -> tuple[System, dict[tuple[str, str], Array]]:
+        """The system with these parameters, and gains and delays by ("gain", input)."""
         leaves, structure = jax.tree.flatten(system)
-        gains = {}
-        for entry, value in zip(self.entries, self.values(x), strict=True):
-            if entry.input is not None:
-                gains[entry.input] = value
-                continue
-            leaf = leaves[entry.leaf]
-            flat = jnp.ravel(leaf).at[entry.place].set(value.astype(leaf.dtype))
-            leaves[entry.leaf] = flat.reshape(leaf.shape)
-        return jax.tree.unflatten(structure, leaves), gains
-
-    def prior_residuals(self, x: Float[Array, " p"]) -> Float[Array, " n"]:
-        """(p - mean) / deviation of those with a prior."""
+        roles = {}
         values = self.values(x)
-        terms = [(values[i] - e.prior[0]) / e.prior[1] for i, e in enumerate(self.entries) if e.prior]
-        return jnp.stack(terms) if terms else jnp.zeros(0, x.dtype)
+        for i, entry in enumerate(self.entries):
+            value = values[i]
+            if entry.role is not None:
+                roles[entry.role] = value
+            for number, place, factor in entry.targets:
+                leaf = leaves[number]
+                flat = jnp.ravel(leaf).at[place].set((factor * value).astype(leaf.dtype))
+                leaves[number] = flat.reshape(leaf.shape)
+        return jax.tree.unflatten(structure, leaves), roles
+
+    def prior_residuals(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
+        """(value - mean) / deviation; zero without a prior."""
+        return (self.values(x) - self.prior_mean) / self.prior_deviation
+
+    def with_priors(self, priors: Mapping[str, Prior]) -> Parameters:
+        """The same parameters with priors (mean, standard deviation) by name; names that are not free are left out."""
+        mean, deviation = np.array(self.prior_mean), np.array(self.prior_deviation)
+        for i, name in enumerate(self.names):
+            if name in priors:
+                mean[i], deviation[i] = _checked_prior(name, priors[name])
+        new = (jnp.asarray(mean, self.start.dtype), jnp.asarray(deviation, self.start.dtype))
+        return eqx.tree_at(lambda p: (p.prior_mean, p.prior_deviation), self, new)
 
 
-def _value(e: _Entry, x: Array) -> Array:
-    if e.lower is None:
-        if e.upper is None:
-            return e.start + e.scale * x
-        span = e.upper - e.start
-        return e.upper - span * jnp.exp(-e.scale / span * x)
-    if e.upper is None:
-        span = e.start - e.lower
-        return e.lower + span * jnp.exp(e.scale / span * x)
-    width = e.upper - e.lower
-    share = (e.start - e.lower) / width
-    return e.lower + width * jax.nn.sigmoid(math.log(share / (1 - share)) + e.scale / (width * share * (1 - share)) * x)
+def _checked_prior(name: str, prior: Any) -> Prior:
+    if not (len(prior) == 2 and math.isfinite(prior[0]) and prior[1] > 0):
+        raise ValueError(f"{name}: a prior is (mean, standard deviation > 0), got {prior}.")
+    return float(prior[0]), float(prior[1])
 
 
 def parameters_of(system: System, free: Sequence[Any] | Any) -> Parameters:
     """The free parameters of a system.
 
-    **Raises:** `ValueError` that names a parameter or input that does not exist, is named twice, or starts outside its
-    bounds.
+    **Raises:** `ValueError` that names a parameter or input that does not exist, is named twice, starts outside its
+    bounds, or as a body that cannot be.
     """
-    free = [free] if isinstance(free, (str, Free, Gain)) or callable(free) else list(free)
-    entries: list[_Entry] = []
+    free = [free] if isinstance(free, (str, Free, Gain, Delay, Inertia)) or callable(free) else list(free)
+    parts: list[tuple[list[_Entry], Any, list[float], list[float], list[Prior | None]]] = []
     for item in free:
-        if isinstance(item, Gain):
-            entries.append(_gain(system, item))
+        if isinstance(item, (Gain, Delay)):
+            parts.append(_of_input(system, item))
+        elif isinstance(item, Inertia):
+            parts.append(_of_body(system, item))
         else:
-            entries.extend(_leaf_entries(system, item if isinstance(item, Free) else Free(item)))
-    if not entries:
+            parts.extend(_of_leaves(system, item if isinstance(item, Free) else Free(item)))
+    if not parts:
         raise ValueError("`free` names no parameter: give names such as ('IBxx', 'steer_damping').")
+    entries = [e for part in parts for e in part[0]]
     names = [e.name for e in entries]
-    places = [(e.leaf, e.place, e.input) for e in entries]
-    repeated = sorted({names[i] for i, place in enumerate(places) if place in places[:i]})
-    if repeated or len(set(names)) < len(names):
-        raise ValueError(f"`free` names {', '.join(repeated) or 'a parameter'} twice: {', '.join(names)}.")
-    return Parameters(tuple(entries))
+    places = [place for e in entries for place in [*[t[:2] for t in e.targets], *([e.role] if e.role else [])]]
+    twice = [e.name for e in entries if any(places.count(t[:2]) > 1 for t in e.targets) or places.count(e.role) > 1]
+    if twice or len(set(names)) < len(names):
+        repeated = ", ".join(sorted(set(twice))) or "a parameter"
+        raise ValueError(f"`free` names {repeated} twice: {', '.join(names)}.")
+    priors = [prior if prior else (0.0, math.inf) for part in parts for prior in part[4]]
+    array = lambda numbers: jnp.asarray(np.array(numbers, float), jnp.result_type(float))  # noqa: E731
+    return Parameters(
+        entries=tuple(entries),
+        bijections=tuple(part[1] for part in parts),
+        sizes=tuple(len(part[0]) for part in parts),
+        start=array([s for part in parts for s in part[2]]),
+        scale=array([s for part in parts for s in part[3]]),
+        prior_mean=array([mean for mean, _ in priors]),
+        prior_deviation=array([deviation for _, deviation in priors]),
+    )
 
 
-def _gain(system: System, item: Gain) -> _Entry:
+def _of_input(system: System, item: Gain | Delay):
+    role = type(item).__name__.lower()
     if item.input not in system.inputs:
         raise ValueError(
             f"{type(system).__name__} has no input {item.input!r}; it has {', '.join(system.inputs) or 'none'}."
         )
-    return _entry(item.name or f"gain of {item.input}", item, item.start, False, leaf=-1, place=0, input=item.input)
+    entry = _Entry(item.name or f"{role} of {item.input}", item.unit, role=(role, item.input))
+    return _scalar(entry, item, item.start, positive=False)
 
 
-def _leaf_entries(system: System, item: Free) -> list[_Entry]:
-    title = type(system).__name__
-    leaves, structure = jax.tree_util.tree_flatten_with_path(system)
-    numbered = jax.tree.unflatten(structure, range(len(leaves)))  # where a leaf stands, its place in the list
-    try:
-        chosen = jax.tree.leaves(_follow(numbered, item.where) if isinstance(item.where, str) else item.where(numbered))
-    except (AttributeError, IndexError, KeyError, TypeError):
-        chosen = []
-    if not chosen or not all(isinstance(i, int) and 0 <= i < len(leaves) for i in chosen):
-        known = ", ".join(_path_name(path) for path, _ in leaves)
-        raise ValueError(f"{title} has no parameter {item.where!r}; it has {known}.")
-    entries = []
+def _of_leaves(system: System, item: Free):
+    chosen, leaves = _find(system, item.where)
+    followers = [(name, factor, *_find(system, name)[0]) for name, factor in item.tied.items()]
+    parts = []
     for i in chosen:
         path, leaf = leaves[i]
-        if not (eqx.is_inexact_array(leaf) and not jnp.issubdtype(leaf.dtype, jnp.complexfloating)):
-            raise ValueError(f"{title}.{_path_name(path)} is no real number and cannot be fitted.")
         many = leaf.size > 1 or len(chosen) > 1
+        if followers and many:
+            raise ValueError(f"{_path_name(path)} has several entries; only a number can have others tied to it.")
         for place, index in enumerate(np.ndindex(leaf.shape)):
-            label = (item.name if item.name and not many else _path_name(path)) + (
-                str(list(index)) if leaf.ndim else ""
-            )
+            label = item.name if item.name and not many else _path_name(path)
+            label += str(list(index)) if leaf.ndim else ""
             start = float(leaf[index]) if item.start is None else float(item.start)
-            entries.append(
-                _entry(label, item, start, _declared_positive(system, path), leaf=i, place=place, input=None)
-            )
-    return entries
+            targets = [(i, place, 1.0), *((j, 0, float(factor)) for _, factor, j in followers)]
+            entry = _Entry(label, item.unit, tuple(targets))
+            parts.append(_scalar(entry, item, start, _declared_positive(system, path)))
+    return parts
 
 
-def _entry(name: str, item: Free | Gain, start: float, positive: bool, **where: Any) -> _Entry:
+def _scalar(entry: _Entry, item: Free | Gain | Delay, start: float, positive: bool):
+    name = entry.name
     lower, upper = item.bounds if item.bounds is not None else ((0.0, None) if positive else (None, None))
     if not math.isfinite(start):
         raise ValueError(f"{name} starts at {start}.")
     if (lower is not None and not start > lower) or (upper is not None and not start < upper):
         raise ValueError(f"{name} starts at {start:.6g}, which is not inside its bounds ({lower}, {upper}).")
-    if item.prior is not None and not (len(item.prior) == 2 and item.prior[1] > 0):
-        raise ValueError(f"{name}: a prior is (mean, standard deviation > 0), got {item.prior}.")
     scale = abs(start) or 1.0
     if item.scale is not None:
         if not item.scale > 0:
             raise ValueError(f"{name}: the scale must be positive, got {item.scale}.")
         scale = float(item.scale)
-    return _Entry(name=name, start=start, lower=lower, upper=upper, scale=scale, prior=item.prior, **where)
+    ends = (-math.inf if lower is None else lower, math.inf if upper is None else upper)
+    numbers = [jnp.asarray(float(x), jnp.result_type(float)) for x in (start, *ends, scale)]
+    prior = _checked_prior(name, item.prior) if item.prior is not None else None
+    return [entry], Interval(*numbers, bounded=(lower is not None, upper is not None)), [start], [scale], [prior]
+
+
+_PRODUCTS = ((0, 1), (0, 2), (1, 2))
+
+
+def _of_body(system: System, item: Inertia):
+    """One `PossibleBody` and its entries. A value is found by (leaf, places)."""
+    if (item.matrix is None) == (item.moments is None):
+        raise ValueError("Inertia: give `moments` (and `products`), or `matrix`.")
+    names: list[str | None] = [item.mass, *item.center]
+    spots: list[Any] = [None if name is None else (_one(system, name), (0,)) for name in names]
+    wheel = None
+    if item.matrix is not None:
+        leaf = _one(system, item.matrix, (3, 3))
+        pairs = [(0, 0), (1, 1), (2, 2), *_PRODUCTS]
+        names += [f"{item.matrix}[{a}, {b}]" for a, b in pairs]
+        spots += [(leaf, tuple({3 * a + b, 3 * b + a})) for a, b in pairs]
+    else:
+        moments = item.moments or ("", "", "")
+        given = sum(name is not None for name in item.products)
+        if given == 2 or (given and len(set(moments)) < 3):
+            raise ValueError(
+                "Inertia: name all three `products`, or the one that a plane of symmetry leaves, or none where the "
+                "axes are principal, as a wheel's are."
+            )
+        if len(set(moments)) < 3:
+            a, b = next((a, b) for a, b in _PRODUCTS if moments[a] == moments[b])
+            wheel = (a, b)
+        names += [*moments, *item.products]
+        spots += [None if name is None else (_one(system, name), (0,)) for name in (*moments, *item.products)]
+    leaves = jax.tree.leaves(system)
+    values = [0.0 if s is None else float(np.ravel(leaves[s[0]])[s[1][0]]) for s in spots]
+    values[0] = values[0] if spots[0] is not None else 1.0
+    unknown = sorted(set(item.fixed) - {name for name in names[:4] if name})
+    if unknown:
+        raise ValueError(f"Inertia: `fixed` may name the mass and the place of its centre, not {', '.join(unknown)}.")
+    still = {i for i in range(4) if names[i] is None or names[i] in item.fixed} | ({4 + wheel[1]} if wheel else set())
+    moves = tuple(i for i in range(10) if spots[i] is not None and i not in still)
+    try:
+        body = PossibleBody.of(values, moves, wheel)
+    except ValueError as error:
+        raise ValueError(f"Inertia of {', '.join(n for n in names[4:7] if n)}: {error}") from None
+    units = ["kg", "m", "m", "m", *[item.unit] * 6]
+    entries, start, scale, priors = [], [], [], []
+    for i in moves:
+        name, (leaf, places) = str(names[i]), spots[i]
+        entries.append(_Entry(name, units[i], tuple((leaf, place, 1.0) for place in places)))
+        start.append(values[i])
+        scale.append(abs(values[i]) or float(body.scale[i]) if i < 4 else abs(values[i]) or max(values[4:7]))
+        priors.append(_checked_prior(name, item.prior[name]) if name in item.prior else None)
+    return entries, body, start, scale, priors
+
+
+def _one(system: System, name: str, shape: tuple[int, ...] = ()) -> int:
+    """The leaf of this name, which has this shape."""
+    (chosen, leaves) = _find(system, name)
+    if len(chosen) != 1 or leaves[chosen[0]][1].shape != shape:
+        raise ValueError(f"{type(system).__name__}.{name} must have the shape {shape}.")
+    return chosen[0]
+
+
+def _find(system: System, where: str | Callable[[Any], Any]) -> tuple[list[int], list[Any]]:
+    """Numbers of the leaves that are meant, and all (path, leaf)."""
+    title = type(system).__name__
+    leaves, structure = jax.tree_util.tree_flatten_with_path(system)
+    numbered = jax.tree.unflatten(structure, range(len(leaves)))  # where a leaf stands, its place in the list
+    try:
+        chosen = jax.tree.leaves(_follow(numbered, where) if isinstance(where, str) else where(numbered))
+    except (AttributeError, IndexError, KeyError, TypeError):
+        chosen = []
+    if not chosen or not all(isinstance(i, int) and 0 <= i < len(leaves) for i in chosen):
+        known = ", ".join(_path_name(path) for path, _ in leaves)
+        raise ValueError(f"{title} has no parameter {where!r}; it has {known}.")
+    for i in chosen:
+        path, leaf = leaves[i]
+        if not (eqx.is_inexact_array(leaf) and not jnp.issubdtype(leaf.dtype, jnp.complexfloating)):
+            raise ValueError(f"{title}.{_path_name(path)} is no real number and cannot be fitted.")
+    return chosen, leaves
 
 
 def _follow(tree: Any, path: str) -> Any:

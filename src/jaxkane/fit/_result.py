@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from .._check import check_system
 from .._system import System
 from .._trajectory import Trajectory
-from ._blocks import eliminate
+from . import _suspicions as suspicions
 from ._identifiability import Identifiability, look
+from ._model import Point
 from ._parameters import Parameters
-from ._problem import Linearization, Point, Problem
+from ._problem import Linearization, Problem
+from ._residual_tests import ResidualTest, residual_test
+from ._uncertainty import clustered_covariance, t_quantile
 
 STATUS = {
     "converged": "converged",
@@ -28,18 +31,19 @@ STATUS = {
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Fit:
-    """The result of a fit; print it for a table.
+    """The result of a fit; print it for a table, `report()` for more, `save_report(path)` for a page with pictures.
 
-    - `system`: with the estimates in it. `estimates`, `start`: values by name. `gains` are among them.
+    - `system`: with the estimates in it. `estimates`, `start`: values by name. Gains and delays are among them.
     - `standard_errors`: by name, formal: from the inverse of J^T J with the nuisance values eliminated, times the
         residuals' variance. They hold for independent residuals of equal scaled size, and a right model.
     - `clustered_errors`: by name, robust to residuals that are correlated within a trial (sandwich, one cluster a
         trial); NaN with fewer trials than parameters plus two.
-    - `correlation` (p, p) of the estimates, in the order of `names`.
+    - `intervals(level)`: by name. `correlation` (p, p) of the estimates, in the order of `names`.
     - `cost`: sum of squared residuals; `history`: of the cost. `status`, `message`: how it ended, in a word and in
         words.
     - `identifiability`: singular values and directions of the sensitivity, and what the data do not tell.
     - `residuals`: by trial and channel, (simulated - measured) / sigma (n_t,), NaN in gaps; `fitted`: simulated (n_t,).
+        `tests`: by trial and channel, a `ResidualTest`. `variance_accounted_for`: by channel, over all trials.
     - `nuisance`: by trial, values of the biases and of the windows' starts by name.
     - `notes`: what a reader should know, in words.
     """
@@ -50,8 +54,6 @@ class Fit:
     history: tuple[float, ...]
     status: str
     method: str
-    identifiability: Identifiability
-    notes: tuple[str, ...]
 
     @classmethod
     def of(
@@ -64,9 +66,7 @@ class Fit:
         method: str,
     ) -> Fit:
         """The result at a point."""
-        seen = look(problem, at)
-        fit = cls(problem, point, at, tuple(history), status, method, seen, ())
-        return dataclasses.replace(fit, notes=(*seen.messages, *_notes(fit)))
+        return cls(problem, point, at, tuple(history), status, method)
 
     @property
     def parameters(self) -> Parameters:
@@ -81,16 +81,26 @@ class Fit:
         return self.linearization.cost
 
     @property
+    def variance(self) -> float:
+        """Of a residual: the sum of squares by the degrees of freedom; one where `sigma` and the model are right."""
+        n_r, n_unknown = self.problem.size
+        return self.cost / max(n_r - n_unknown, 1)
+
+    @property
     def system(self) -> System:
         return self.parameters.apply(self.problem.system, self.point.x)[0]
 
     @property
     def start(self) -> dict[str, float]:
-        return dict(zip(self.names, self.parameters.start.tolist(), strict=True))
+        return dict(zip(self.names, np.asarray(self.parameters.start).tolist(), strict=True))
 
     @property
     def estimates(self) -> dict[str, float]:
         return dict(zip(self.names, np.asarray(self.parameters.values(self.point.x)).tolist(), strict=True))
+
+    @functools.cached_property
+    def identifiability(self) -> Identifiability:
+        return look(self.problem, self.point, self.linearization)
 
     @property
     def message(self) -> str:
@@ -111,38 +121,66 @@ class Fit:
     @property
     def covariance(self) -> np.ndarray:
         """(p, p), in the parameters' units."""
-        slope = np.asarray(jax.jacfwd(self.parameters.values)(self.point.x)).diagonal()
-        return self.identifiability.covariance * np.outer(slope, slope)
+        return self.identifiability.covariance
 
     @property
     def standard_errors(self) -> dict[str, float]:
         return dict(zip(self.names, np.sqrt(self.covariance.diagonal()).tolist(), strict=True))
 
+    @functools.cached_property
+    def clustered_covariance(self) -> np.ndarray:
+        """(p, p), in the parameters' units, robust to residuals that are correlated within a trial."""
+        slopes = np.asarray(self.parameters.slopes(self.point.x))
+        return slopes @ clustered_covariance(self) @ slopes.T
+
     @property
     def clustered_errors(self) -> dict[str, float]:
-        blocks = np.asarray(eliminate(self.linearization.blocks, 0.0).R)  # (T, p+1, p+1)
-        T, p = len(blocks), len(self.names)
-        if p + 2 > T or not np.all(np.isfinite(self.identifiability.covariance)):
-            return dict.fromkeys(self.names, float("nan"))
-        A, r = blocks[:, :, :-1], blocks[:, :, -1]
-        scores = np.einsum("tmi,tm->ti", A, r)
-        bread = np.linalg.inv(np.einsum("tmi,tmj->ij", A, A))
-        sandwich = T / (T - 1) * bread @ (scores.T @ scores) @ bread
-        slope = np.asarray(jax.jacfwd(self.parameters.values)(self.point.x)).diagonal()
-        return dict(zip(self.names, (np.sqrt(sandwich.diagonal()) * slope).tolist(), strict=True))
+        return dict(zip(self.names, np.sqrt(self.clustered_covariance.diagonal()).tolist(), strict=True))
+
+    @property
+    def robust(self) -> bool:
+        """Whether `intervals` are built on the clustered errors: residuals are not noise, and there are trials enough."""
+        known = np.all(np.isfinite(self.clustered_covariance.diagonal()))
+        return bool(known and abs(self.autocorrelation) > 0.2)
+
+    def quantile(self, level: float = 0.95) -> float:
+        """Of Student's distribution, two-sided, with the degrees of freedom of all residuals."""
+        n_r, n_unknown = self.problem.size
+        return t_quantile(level, n_r - n_unknown)
+
+    def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Confidence intervals by name, inside a parameter's bounds: symmetric in the free numbers.
+
+        From the clustered errors where `robust`, with as many degrees of freedom as there are trials less one; from
+        the formal ones else.
+        """
+        errors = self.clustered_errors if self.robust else self.standard_errors
+        T = len(self.problem.trials)
+        quantile = t_quantile(level, T - 1) if self.robust else self.quantile(level)
+        values = np.asarray(self.parameters.values(self.point.x))
+        slopes = np.asarray(self.parameters.slopes(self.point.x))
+        found = {}
+        for i, name in enumerate(self.names):
+            alone = np.count_nonzero(slopes[i]) == 1
+            if alone and np.isfinite(errors[name]):
+                x = [self.point.x.at[i].add(side * quantile * errors[name] / abs(slopes[i, i])) for side in (-1, 1)]
+                low, high = sorted(float(self.parameters.values(at)[i]) for at in x)
+            else:
+                low, high = values[i] - quantile * errors[name], values[i] + quantile * errors[name]
+            found[name] = (float(low), float(high))
+        return found
 
     @property
     def correlation(self) -> np.ndarray:
-        covariance = self.identifiability.covariance
-        deviation = np.sqrt(covariance.diagonal())
+        deviation = np.sqrt(self.covariance.diagonal())
         with np.errstate(invalid="ignore"):
-            return covariance / np.outer(deviation, deviation)
+            return self.covariance / np.outer(deviation, deviation)
 
-    @property
+    @functools.cached_property
     def fitted(self) -> dict[str, dict[str, np.ndarray]]:
         return self._by_trial(lambda simulated, measured, sigma: simulated)
 
-    @property
+    @functools.cached_property
     def residuals(self) -> dict[str, dict[str, np.ndarray]]:
         return self._by_trial(lambda simulated, measured, sigma: (simulated - measured) / sigma)
 
@@ -161,6 +199,38 @@ class Fit:
                 found[name][channel] = value(y, trial.measured[channel], trial.sigma[channel])
         return found
 
+    @functools.cached_property
+    def tests(self) -> dict[str, dict[str, ResidualTest]]:
+        return {
+            name: {
+                channel: residual_test(trial.measured[channel], self.fitted[name][channel], r)
+                for channel, r in self.residuals[name].items()
+            }
+            for name, trial in zip(self.trial_names, self.problem.trials, strict=True)
+        }
+
+    @property
+    def variance_accounted_for(self) -> dict[str, float]:
+        found = {}
+        for channel in self.problem.channels:
+            left = total = 0.0
+            for name, trial in zip(self.trial_names, self.problem.trials, strict=True):
+                if channel in trial.measured:
+                    y, f = trial.measured[channel], self.fitted[name][channel]
+                    left, total = left + np.nansum((f - y) ** 2), total + np.nansum((y - np.nanmean(y)) ** 2)
+            found[channel] = float(1 - left / total) if total > 0 else float("nan")
+        return found
+
+    @functools.cached_property
+    def autocorrelation(self) -> float:
+        """Of neighbouring residuals, over all channels, each weighted by its size."""
+        above = below = 0.0
+        for channels in self.residuals.values():
+            for r in channels.values():
+                above += float(np.nansum(r[1:] * r[:-1]))
+                below += float(np.nansum(r**2))
+        return above / below if below > 0 else 0.0
+
     @property
     def trial_names(self) -> tuple[str, ...]:
         """Names of the trials, numbered where they repeat."""
@@ -169,17 +239,30 @@ class Fit:
 
     @property
     def nuisance(self) -> dict[str, dict[str, Any]]:
-        problem, n = self.problem, self.problem.nuisance
-        names = (*problem.system.coordinates, *problem.system.speeds)
-        guess = np.concatenate([np.asarray(problem.windows.q), np.asarray(problem.windows.u)], axis=1)
-        starts = guess[:, [names.index(s) for s in n.start]] + np.asarray(self.point.z)
+        problem, n = self.problem, self.problem.model.nuisance
+        starts = np.asarray(problem.windows.start)[:, problem.model.unknown_places] + np.asarray(self.point.z)
         owner = np.array([k for k, _, _ in problem.places])
         found = {}
         for k, name in enumerate(self.trial_names):
-            labels = [f"bias of {c}" for c in (*n.sensors, *n.inputs)]
-            found[name] = dict(zip(labels, np.asarray(self.point.b[k]).tolist(), strict=True))
+            found[name] = {}
+            for j, (kind, what) in enumerate(n.trial):
+                value = float(self.point.b[k, j]) + (1.0 if kind.startswith("gain") else 0.0)
+                found[name][f"{kind.split()[0]} of {what}"] = value
             found[name] |= {f"start of {s}": starts[owner == k, j] for j, s in enumerate(n.start)}
         return found
+
+    @functools.cached_property
+    def notes(self) -> tuple[str, ...]:
+        notes = [*self.identifiability.messages, *suspicions.trade_offs(self)]
+        lag = self.autocorrelation
+        if lag > 0.3:
+            notes.append(
+                f"The residuals are not noise: neighbours correlate by {lag:.2f}. The formal standard errors are too "
+                f"small by a factor of about {((1 + lag) / max(1 - lag, 0.01)) ** 0.5:.1f}; compare `clustered_errors`."
+            )
+        notes += [*suspicions.impossible_bodies(self), *suspicions.far_from_start(self), *suspicions.only_priors(self)]
+        notes += [*suspicions.empty_columns(self.problem), *suspicions.contrary_rates(self.problem)]
+        return (*notes, *suspicions.contrary_signs(self))
 
     def trajectories(self) -> list[tuple[str, Trajectory]]:
         """The fitted motion of every window, with its trial's name."""
@@ -193,23 +276,38 @@ class Fit:
         head = f"{'parameter':<22}{'start':>12}{'estimate':>12}{'std. error':>12}"
         lines = [head + (f"{'truth':>12}{'error':>9}" if known else "")]
         errors, start = self.standard_errors, self.start
-        for name, value in self.estimates.items():
+        for name, unit, value in zip(self.names, self.parameters.units, self.estimates.values(), strict=True):
             line = f"{name:<22}{start[name]:>12.5g}{value:>12.5g}{errors[name]:>12.2g}"
             if name in known:
                 right = known[name]
                 line += f"{right:>12.5g}{(value / right - 1 if right else value):>9.2{'%' if right else 'g'}}"
-            lines.append(line)
+            lines.append(f"{line}  {unit}".rstrip())
         return "\n".join(lines)
 
+    def report(self, truth: Mapping[str, float] | System | None = None) -> str:
+        """All that is known about this fit, as a text: estimates, intervals, directions, residuals, notes."""
+        from ._report import text
+
+        return text(self, truth)
+
+    def save_report(self, path: Any, **options: Any) -> Any:
+        """The same as one HTML page with pictures, which needs nothing else; see `jaxkane.fit.save_report`."""
+        from ._report import save_report
+
+        return save_report(self, path, **options)
+
     def __str__(self) -> str:
+        end = f"sum of squares {self.history[0]:.6g} -> {self.cost:.6g} by {self.method}: {STATUS[self.status]}"
+        return "\n".join([self.title, self.table(), end, *self.notes])
+
+    @property
+    def title(self) -> str:
         n_r, n_unknown = self.problem.size
-        title = (
+        return (
             f"{type(self.problem.system).__name__}: {len(self.problem.trials)} trials, "
             f"{len(self.problem.places)} windows, {n_r} residuals, {len(self.names)} parameters, "
             f"{n_unknown - len(self.names)} nuisance values"
         )
-        end = f"sum of squares {self.history[0]:.6g} -> {self.cost:.6g} by {self.method}: {STATUS[self.status]}"
-        return "\n".join([title, self.table(), end, *self.notes])
 
     __repr__ = __str__
 
@@ -218,42 +316,5 @@ def _truth(fit: Fit, truth: Any) -> dict[str, float]:
     if truth is None or isinstance(truth, Mapping):
         return dict(truth or {})
     leaves = jax.tree.leaves(truth)
-    entries = fit.parameters.entries
-    return {e.name: float(np.ravel(leaves[e.leaf])[e.place]) for e in entries if e.input is None}
-
-
-def _notes(fit: Fit) -> list[str]:
-    """Warnings, in words: trade-offs, correlated residuals, bodies that cannot be."""
-    notes = []
-    correlation = fit.correlation
-    for i, name in enumerate(fit.names):
-        for j in range(i):
-            if abs(correlation[i, j]) > 0.95:
-                notes.append(f"{fit.names[j]} and {name} trade off: their correlation is {correlation[i, j]:.3f}.")
-    lag = _autocorrelation(fit.residuals)
-    if lag > 0.3:
-        notes.append(
-            f"The residuals are not noise: neighbours correlate by {lag:.2f}. The formal standard errors are too "
-            f"small by a factor of about {((1 + lag) / max(1 - lag, 0.01)) ** 0.5:.1f}; compare `clustered_errors`."
-        )
-    problem = fit.problem
-    window = jax.tree.map(lambda x: x[0], problem.windows)
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        try:
-            check_system(fit.system, window.t[0], window.q, window.u)
-        except ValueError as error:
-            notes.append(f"Not a possible body: {error}")
-    notes.extend(f"Not a possible body: {warning.message}" for warning in caught)
-    return notes
-
-
-def _autocorrelation(residuals: Mapping[str, Mapping[str, np.ndarray]]) -> float:
-    """Of neighbours, over all channels, each weighted by its size."""
-    above = below = 0.0
-    for channels in residuals.values():
-        for r in channels.values():
-            pairs = np.isfinite(r[1:]) & np.isfinite(r[:-1])
-            above += float(np.sum(r[1:][pairs] * r[:-1][pairs]))
-            below += float(np.sum(r[np.isfinite(r)] ** 2))
-    return above / below if below > 0 else 0.0
+    targets = {e.name: e.targets[0] for e in fit.parameters.entries if e.targets}
+    return {name: float(jnp.ravel(leaves[leaf])[place]) for name, (leaf, place, _) in targets.items()}

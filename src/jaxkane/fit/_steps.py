@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._trajectory import reason
+from .._trajectory import Status, reason
 from ._blocks import Eliminated, eliminate
-from ._problem import Linearization, Point, Problem, linearize
+from ._model import Point
+from ._problem import Linearization, Problem, linearize
 
 
 def moved(point: Point, x: Array, eliminated: Eliminated) -> Point:
@@ -86,7 +87,7 @@ def _cannot_start(problem: Problem, at: Linearization | None, bad: np.ndarray) -
     why = "no consistent start"
     if at is not None:
         status = int(at.status[i])
-        why = "not finite" if status == 0 else reason(status, _event_names(problem))
+        why = "not finite" if status == Status.COMPLETED else reason(status, _event_names(problem))
     return (
         f"{trial.name}: from {trial.t[first]:g} to {trial.t[first + n - 1]:g} s the first guess gives no finite "
         f"residuals ({why}; {int(bad.sum())} of {len(bad)} windows). Choose shorter windows or other starting values, "
@@ -95,10 +96,6 @@ def _cannot_start(problem: Problem, at: Linearization | None, bad: np.ndarray) -
 
 
 def _event_names(problem: Problem) -> tuple[str, ...]:
-    rides = jax.eval_shape(lambda p: p.simulate(jax.tree.map(lambda x: x[0], p.windows), *_first(p)), problem)
-    return rides.events
-
-
-def _first(problem: Problem):
+    first = jax.tree.map(lambda x: x[0], problem.windows)
     start = problem.start
-    return jnp.concatenate([problem.windows.q[0], problem.windows.u[0]]), start.b[0], start.x
+    return jax.eval_shape(problem.model.simulate, first, first.start, start.b[0], start.x).events

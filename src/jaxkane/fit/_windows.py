@@ -12,70 +12,99 @@ from jaxtyping import Array, Bool, Float, Int
 from .._system import System
 from ._trial import Trial
 
+LONGEST_DELAY = 0.5
+"""How far before and after a window samples of its inputs are kept where there are delays [s]."""
+
+Place = tuple[int, int, int]
+"""Of a window: trial, first sample, number of samples."""
+
 
 class Windows(eqx.Module):
     """All windows of all trials, stacked; a short one repeats its last time with weight zero.
 
-    - `t` (W, n_t) [s]; `t_input` (W, n_t) [s]: the same, but increasing where it is filled up.
-    - `measured`, `weight` (W, n_c, n_t): samples, and 1/sigma or zero. `inputs` (W, n_in, n_t).
-    - `q`, `u` (W, n_q), (W, n_u): the start as far as it is known or measured.
+    - `t` (W, n_t) [s]; where windows are chained, the last is the next window's first.
+    - `measured`, `weight` (W, n_c, n_t): samples, and 1/sigma or zero.
+    - `t_input` (W, n_in) [s], `inputs` (W, inputs, n_in): samples of the inputs, from before and after too.
+    - `step` (W,) [s]: of the integration. `start`, `next_start` (W, n_q + n_u): the start as far as it is known or
+        measured, and that of the next window.
+    - `linked` (W,): one where the next window goes on from this one, else zero.
     - `trial` (W,): whose window it is; `first` (W,): whether it is its trial's first, `very_first` of all.
     """
 
     t: Float[Array, "W n_t"]
-    t_input: Float[Array, "W n_t"]
     measured: Float[Array, "W n_c n_t"]
     weight: Float[Array, "W n_c n_t"]
-    inputs: Float[Array, "W n_in n_t"]
-    q: Float[Array, "W n_q"]
-    u: Float[Array, "W n_u"]
+    t_input: Float[Array, "W n_in"]
+    inputs: Float[Array, "W inputs n_in"]
+    step: Float[Array, " W"]
+    start: Float[Array, "W n"]
+    next_start: Float[Array, "W n"]
+    linked: Float[Array, " W"]
     trial: Int[Array, " W"]
     first: Bool[Array, " W"]
     very_first: Bool[Array, " W"]
 
+    @property
+    def by_trial(self) -> Array:
+        """The windows of every trial (T, m), filled up with W."""
+        owner = np.asarray(self.trial)
+        own = [np.flatnonzero(owner == k) for k in range(owner.max() + 1)]
+        most = max(map(len, own))
+        return jnp.asarray([np.append(i, np.full(most - len(i), len(owner))) for i in own], dtype=jnp.int32)
+
 
 def cut(
-    system: System, trials: Sequence[Trial], window: float | None, channels: Sequence[str], dtype: np.dtype
-) -> tuple[Windows, tuple[tuple[int, int, int], ...]]:
-    """Windows of `window` [s], or one a trial; and for each (trial, first sample, number of samples).
+    system: System,
+    trials: Sequence[Trial],
+    window: float | None,
+    channels: Sequence[str],
+    *,
+    chained: bool = False,
+    delayed: bool = False,
+) -> tuple[Windows, tuple[Place, ...]]:
+    """Windows of `window` [s], or one a trial; and the place of each.
 
     A last piece shorter than half a window is joined to the one before.
     """
-    places = [(k, start, n) for k, trial in enumerate(trials) for start, n in _pieces(trial.t, window)]
-    # A window without one measurement would only add unknowns.
-    places = [place for place in places if any(np.isfinite(_take(trials, place, c)).any() for c in channels)]
-    n_t = max(n for _, _, n in places)
-    stacked: dict[str, list[np.ndarray]] = {key: [] for key in ("t", "t_input", "measured", "weight", "inputs")}
-    starts = []
-    for k, i, n in places:
-        trial, inside, more = trials[k], slice(i, i + n), n_t - n
-        t = trial.t[inside]
-        step = t[-1] - t[-2]
-        stacked["t"].append(np.append(t, np.full(more, t[-1])))
-        stacked["t_input"].append(np.append(t, t[-1] + step * np.arange(1, more + 1)))
+    places = [(k, i, n) for k, trial in enumerate(trials) for i, n in _pieces(trial.t, window, chained)]
+    if not chained:  # a window without one measurement would only add unknowns
+        places = [place for place in places if any(np.isfinite(_take(trials, place, c)).any() for c in channels)]
+    linked = [chained and place[0] == after[0] for place, after in zip(places, [*places[1:], (-1, 0, 0)], strict=True)]
+    n_t = max(n + more for (_, _, n), more in zip(places, linked, strict=True))
+    lead = _lead(trials) if delayed else 0
+    found: dict[str, list[np.ndarray]] = {key: [] for key in ("t", "measured", "weight", "t_input", "inputs", "step")}
+    for (k, i, n), more in zip(places, linked, strict=True):
+        trial, last = trials[k], i + n - 1 + more
+        found["t"].append(trial.t[np.minimum(np.arange(i, i + n_t), last)])
+        found["step"].append(np.median(np.diff(trial.t[i : last + 1])))
         y = np.stack([_take(trials, (k, i, n), c) for c in channels])  # (n_c, n)
-        sigma = np.stack([trial.sigma.get(c, np.ones_like(trial.t))[inside] for c in channels])
+        sigma = np.stack([trial.sigma.get(c, np.ones_like(trial.t))[i : i + n] for c in channels])
         seen = np.isfinite(y)
-        stacked["measured"].append(_fill(np.where(seen, y, 0.0), more))
-        stacked["weight"].append(_fill(np.where(seen, 1.0 / sigma, 0.0), more, last=False))
-        rows = [trial.inputs.get(name, np.zeros_like(trial.t))[inside] for name in system.inputs]
-        stacked["inputs"].append(_fill(np.array(rows).reshape(len(system.inputs), n), more))
-        starts.append([[_start(trial, i, n, name) for name in group] for group in (system.coordinates, system.speeds)])
+        found["measured"].append(_fill(np.where(seen, y, 0.0), n_t))
+        found["weight"].append(_fill(np.where(seen, 1.0 / sigma, 0.0), n_t))
+        wanted = np.arange(i - lead, i + n_t + lead)
+        there = np.clip(wanted, 0, len(trial.t) - 1)
+        # What lies outside is never far, and takes the trial's first or last sample.
+        found["t_input"].append(trial.t[there] + found["step"][-1] * (wanted - there))
+        rows = [trial.inputs.get(name, np.zeros_like(trial.t))[there] for name in system.inputs]
+        found["inputs"].append(np.array(rows).reshape(len(system.inputs), len(wanted)))
+    names = (*system.coordinates, *system.speeds)
+    start = np.array([[_start(trials[k], i, n, name) for name in names] for k, i, n in places])
     owner = np.array([k for k, _, _ in places])
-    first = np.append(True, owner[1:] != owner[:-1])
-    array = lambda x: jnp.asarray(np.array(x), dtype=dtype)  # noqa: E731
+    array = lambda x: jnp.asarray(np.array(x), dtype=jnp.result_type(float))  # noqa: E731
     windows = Windows(
-        **{key: array(value) for key, value in stacked.items()},
-        q=array([q for q, _ in starts]),
-        u=array([u for _, u in starts]),
+        **{key: array(value) for key, value in found.items()},
+        start=array(start),
+        next_start=array(np.append(start[1:], start[-1:], axis=0)),
+        linked=array(np.array(linked, float)),
         trial=jnp.asarray(owner, dtype=jnp.int32),
-        first=jnp.asarray(first),
+        first=jnp.asarray(np.append(True, owner[1:] != owner[:-1])),
         very_first=jnp.asarray(np.arange(len(owner)) == 0),
     )
     return windows, tuple(places)
 
 
-def _pieces(t: np.ndarray, window: float | None) -> list[tuple[int, int]]:
+def _pieces(t: np.ndarray, window: float | None, chained: bool) -> list[tuple[int, int]]:
     """First sample and number of samples of every window of a trial."""
     if window is None:
         return [(0, len(t))]
@@ -87,19 +116,23 @@ def _pieces(t: np.ndarray, window: float | None) -> list[tuple[int, int]]:
     if len(pieces) > 1 and (t[-1] - t[pieces[-1][0]] < 0.5 * window or pieces[-1][1] < 2):
         (i, n), (_, m) = pieces[-2:]
         pieces[-2:] = [(i, n + m)]
-    # One sample tells nothing about motion.
-    return [(i, n) for i, n in pieces if n > 1]
+    # One sample tells nothing about motion, unless the next window goes on from it.
+    return [(i, n) for i, n in pieces if n > 1 or chained]
 
 
-def _take(trials: Sequence[Trial], place: tuple[int, int, int], channel: str) -> np.ndarray:
+def _lead(trials: Sequence[Trial]) -> int:
+    return max(int(np.ceil(LONGEST_DELAY / np.median(np.diff(trial.t)))) for trial in trials)
+
+
+def _take(trials: Sequence[Trial], place: Place, channel: str) -> np.ndarray:
     """Samples (n,) of one window, NaN where the trial has no such channel."""
     k, i, n = place
     return trials[k].measured.get(channel, np.full_like(trials[k].t, np.nan))[i : i + n]
 
 
-def _fill(rows: np.ndarray, more: int, last: bool = True) -> np.ndarray:
-    """(n, n_t - more) to (n, n_t), by the last value or by zeros."""
-    return np.pad(rows, ((0, 0), (0, more)), mode="edge" if last else "constant") if more else rows
+def _fill(rows: np.ndarray, n_t: int) -> np.ndarray:
+    """(n, some) to (n, n_t) by zeros."""
+    return np.pad(rows, ((0, 0), (0, n_t - rows.shape[1])))
 
 
 def _start(trial: Trial, i: int, n: int, name: str) -> float:

@@ -1,0 +1,66 @@
+"""BFGS by optimistix, on all unknowns at once."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax.flatten_util import ravel_pytree
+
+from ._density import half_cost
+from ._model import Point
+from ._problem import Problem, linearize
+from ._result import Fit
+from ._steps import settle, usable
+
+
+def bfgs(
+    problem: Problem,
+    *,
+    steps: int = 300,
+    rtol: float = 1e-6,
+    solver: optx.AbstractMinimiser | None = None,
+    start: Point | None = None,
+) -> Fit:
+    """Minimize half the sum of squares by BFGS, or by another of optimistix's minimisers.
+
+    Parameters, starts and biases are moved together, each in the unit in which the cost is equally curved at the start.
+    It knows nothing of squares or blocks and takes many more steps than `least_squares`, which is to be preferred: this
+    one is for comparison, and for costs that are no sums of squares.
+
+    **Arguments:** `steps`: at most. `rtol`: stop where a step changes the cost and the unknowns by less than this part.
+    `solver`: by default `optimistix.BFGS`. `start`: a `Point`.
+
+    **Returns:** a `Fit`, whose history is the cost at its two ends.
+
+    **Raises:** `ValueError` where a window cannot be simulated with the first guess.
+    """
+    point, at = settle(problem, problem.start if start is None else start)
+    squares = jnp.sum(at.blocks.R**2, axis=(0, 1))
+    n_z, n_x = at.blocks.n_z, at.blocks.n_x
+    # Of each kind of unknown the mean curvature: what has no influence keeps a unit of its own.
+    kinds = Point(squares[-1 - n_x : -1], squares[-1 - n_x - at.blocks.n_b : -1 - n_x] / len(problem.trials),
+                  squares[:n_z] / len(problem.places))  # fmt: skip
+    units = jax.tree.map(lambda u, c: jnp.broadcast_to(jnp.where(c > 0, jax.lax.rsqrt(c), 1.0), u.shape), point, kinds)
+    origin, unravel = ravel_pytree(point)
+    unit, _ = ravel_pytree(units)
+    solver = optx.BFGS(rtol=rtol, atol=rtol) if solver is None else solver
+    solution = _minimise(half_cost(problem), solver, origin, unit, unravel, steps)
+    end = unravel(origin + unit * cast(Any, solution.value))
+    there = linearize(problem, end)
+    status = "converged" if solution.result == optx.RESULTS.successful else "steps"
+    if not usable(there) or there is None or there.cost > at.cost:
+        end, there, status = point, at, "stuck"
+    history = (at.cost, *np.full(int(solution.stats["num_steps"]) - 1, np.nan), there.cost)
+    return Fit.of(problem, end, there, history, status, type(solver).__name__)
+
+
+@eqx.filter_jit
+def _minimise(f, solver, origin, unit, unravel, steps):
+    return optx.minimise(
+        lambda y, _: f(unravel(origin + unit * y)), solver, jnp.zeros_like(origin), max_steps=steps, throw=False
+    )

@@ -1,0 +1,140 @@
+"""Maps from free numbers to what is physically possible, and back. Knows mathematics; knows no system.
+
+Each takes x (n,), which is zero at the start and about one where much has changed, to n values, and has `inverse`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+
+class Interval(eqx.Module):
+    """One number on a line, a half-line or an interval:
+
+        start + s x,   lower + (start - lower) exp(c x),   lower + (upper - lower) logistic(c x + d)
+
+    with c such that the slope at the start is `scale`: a positive parameter moves as start exp(x).
+    """
+
+    start: Float[Array, ""]
+    lower: Float[Array, ""]
+    upper: Float[Array, ""]
+    scale: Float[Array, ""]
+    bounded: tuple[bool, bool] = eqx.field(static=True)
+
+    def __call__(self, x: Float[Array, " 1"]) -> Float[Array, " 1"]:
+        start, scale = self.start, self.scale
+        if self.bounded == (False, False):
+            return start + scale * x
+        if self.bounded == (False, True):
+            return self.upper - (self.upper - start) * jnp.exp(-scale / (self.upper - start) * x)
+        if self.bounded == (True, False):
+            return self.lower + (start - self.lower) * jnp.exp(scale / (start - self.lower) * x)
+        width, share = self._share(start)
+        return self.lower + width * jax.nn.sigmoid(_logit(share) + scale / (width * share * (1 - share)) * x)
+
+    def inverse(self, value: Float[Array, " 1"]) -> Float[Array, " 1"]:
+        start, scale = self.start, self.scale
+        if self.bounded == (False, False):
+            return (value - start) / scale
+        if self.bounded == (False, True):
+            return -jnp.log((self.upper - value) / (self.upper - start)) * (self.upper - start) / scale
+        if self.bounded == (True, False):
+            return jnp.log((value - self.lower) / (start - self.lower)) * (start - self.lower) / scale
+        width, share = self._share(start)
+        return (_logit(self._share(value)[1]) - _logit(share)) * width * share * (1 - share) / scale
+
+    def _share(self, value: Array) -> tuple[Array, Array]:
+        width = self.upper - self.lower
+        return width, (value - self.lower) / width
+
+
+def _logit(share: Array) -> Array:
+    return jnp.log(share) - jnp.log1p(-share)
+
+
+class PossibleBody(eqx.Module):
+    """Mass, mass centre and central inertia of a rigid body that can be: its pseudo-inertia stays positive definite.
+
+        m = exp(2 a),   c = t,   Sigma = m S S^T,   I = tr(Sigma) 1 - Sigma
+
+    with S upper triangular and a positive diagonal exp(d): the logarithmic Cholesky factors of the pseudo-inertia
+    (Rucker and Wensing, Smooth parameterization of rigid-body inertia, IEEE Robotics and Automation Letters, 2022).
+    Sigma is the matrix of central second moments, which is positive definite where no principal moment of inertia
+    reaches the sum of the two others. Factors that a symmetry sets to zero or makes equal are left out.
+
+    Values: those of mass, c and I that move, in the order [m, cx, cy, cz, Ixx, Iyy, Izz, Ixy, Ixz, Iyz] (products as
+    matrix entries); for a wheel, whose moments about x and z are equal, Izz is left out.
+    """
+
+    start: Float[Array, " 10"]  # [a, t1, t2, t3, d1, d2, d3, s12, s13, s23]
+    scale: Float[Array, " 10"]
+    moves: tuple[int, ...] = eqx.field(static=True)  # places of the values that move
+    wheel: tuple[int, int] | None = eqx.field(static=True)  # the two axes that are equal
+
+    @classmethod
+    def of(cls, values: Any, moves: tuple[int, ...], wheel: tuple[int, int] | None = None) -> PossibleBody:
+        """From all ten values. **Raises:** `ValueError` where no body has them."""
+        values = np.asarray(values, float)
+        start = np.asarray(_factors(jnp.asarray(values)))
+        if not np.all(np.isfinite(start)):
+            I = _matrix(values[4:])
+            moments = ", ".join(f"{x:.5g}" for x in np.linalg.eigvalsh(I)) if np.all(np.isfinite(I)) else "not finite"
+            raise ValueError(
+                f"mass {values[0]:.5g} kg with principal moments of inertia {moments} kg m^2: no body has them (each "
+                "must be below the sum of the other two). Give values inside, if only by a per cent."
+            )
+        size = float(np.exp(2 * start[4:7]).sum() ** 0.5)  # a length: radius of gyration
+        place = np.where(values[1:4] != 0, np.abs(values[1:4]), size)
+        scale = np.concatenate([[0.5], place, [0.5] * 3, [size / 2] * 3])
+        dtype = jnp.result_type(float)
+        return cls(jnp.asarray(start, dtype), jnp.asarray(scale, dtype), moves, wheel)
+
+    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        factors = self.start.at[np.array(self.moves)].add(self.scale[np.array(self.moves)] * x)
+        if self.wheel:
+            a, b = self.wheel
+            factors = factors.at[4 + b].set(factors[4 + a])
+        return self.all_values(factors)[np.array(self.moves)]
+
+    def inverse(self, values: Float[Array, " n"]) -> Float[Array, " n"]:
+        full = self.all_values(self.start).at[np.array(self.moves)].set(values)
+        if self.wheel:
+            a, b = self.wheel
+            full = full.at[4 + b].set(full[4 + a])
+        return ((_factors(full) - self.start) / self.scale)[np.array(self.moves)]
+
+    @staticmethod
+    def all_values(factors: Float[Array, " 10"]) -> Float[Array, " 10"]:
+        """[m, c, Ixx, Iyy, Izz, Ixy, Ixz, Iyz] of all ten factors."""
+        m = jnp.exp(2 * factors[0])
+        d1, d2, d3 = jnp.exp(factors[4:7])
+        s12, s13, s23 = factors[7:]
+        xx, yy, zz = d1**2 + s12**2 + s13**2, d2**2 + s23**2, d3**2
+        xy, xz, yz = s12 * d2 + s13 * s23, s13 * d3, s23 * d3
+        return jnp.concatenate([m[None], factors[1:4], m * jnp.stack([yy + zz, xx + zz, xx + yy, -xy, -xz, -yz])])
+
+
+def _matrix(six: Any) -> np.ndarray:
+    xx, yy, zz, xy, xz, yz = (float(a) for a in six)
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def _factors(values: Float[Array, " 10"]) -> Float[Array, " 10"]:
+    """The inverse of `all_values`; NaN where no body is so."""
+    m, (Ixx, Iyy, Izz, Ixy, Ixz, Iyz) = values[0], values[4:]
+    half = 0.5 * (Ixx + Iyy + Izz)  # tr Sigma
+    xx, yy, zz, xy, xz, yz = (x / m for x in (half - Ixx, half - Iyy, half - Izz, -Ixy, -Ixz, -Iyz))
+    # Sigma / m = S S^T with S upper triangular, from the last row upwards.
+    d3 = jnp.sqrt(zz)
+    s13, s23 = xz / d3, yz / d3
+    d2 = jnp.sqrt(yy - s23**2)
+    s12 = (xy - s13 * s23) / d2
+    d1 = jnp.sqrt(xx - s12**2 - s13**2)
+    return jnp.stack([0.5 * jnp.log(m), *values[1:4], jnp.log(d1), jnp.log(d2), jnp.log(d3), s12, s13, s23])

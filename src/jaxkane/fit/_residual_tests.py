@@ -1,0 +1,74 @@
+"""Whether residuals are noise, and how much of a measurement they leave. Knows numbers; knows no fit."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+from scipy import stats
+
+
+@dataclasses.dataclass(frozen=True)
+class ResidualTest:
+    """One channel of one trial.
+
+    - `n`: samples; `mean`, `rms`: of the residuals, in their standard deviation `sigma`.
+    - `accounted`: the variance accounted for, 1 - sum (y - fit)^2 / sum (y - mean y)^2; below zero is worse than a
+        constant.
+    - `autocorrelation`: of neighbours. `ljung_box`: the probability that white noise has autocorrelations as large
+        (Ljung and Box 1978, ten lags, or a fifth of the samples). `runs`: that it changes sign so seldom or so often
+        (Wald and Wolfowitz 1940).
+    """
+
+    n: int
+    mean: float
+    rms: float
+    accounted: float
+    autocorrelation: float
+    ljung_box: float
+    runs: float
+
+    @property
+    def is_white(self) -> bool:
+        """Whether neither test says otherwise at one per cent."""
+        return self.ljung_box > 0.01 and self.runs > 0.01
+
+
+def residual_test(measured: np.ndarray, fitted: np.ndarray, residual: np.ndarray) -> ResidualTest:
+    """Tests of one channel (n_t,); NaN is a gap."""
+    seen = np.isfinite(residual)
+    r, y = residual[seen], measured[seen]
+    nothing = float("nan")
+    if r.size < 2:
+        return ResidualTest(int(r.size), nothing, nothing, nothing, nothing, nothing, nothing)
+    spread = float(np.sum((y - y.mean()) ** 2))
+    accounted = 1 - float(np.sum((fitted[seen] - y) ** 2)) / spread if spread > 0 else nothing
+    lags = autocorrelations(residual, max(1, min(10, r.size // 5)))
+    box = r.size * (r.size + 2) * np.sum(lags**2 / (r.size - np.arange(1, lags.size + 1)))
+    return ResidualTest(
+        n=int(r.size),
+        mean=float(r.mean()),
+        rms=float(np.sqrt(np.mean(r**2))),
+        accounted=accounted,
+        autocorrelation=float(lags[0]),
+        ljung_box=float(stats.chi2.sf(box, lags.size)),
+        runs=_runs(r),
+    )
+
+
+def autocorrelations(r: np.ndarray, n: int) -> np.ndarray:
+    """Of the lags 1 to n, pairs with a gap left out."""
+    below = np.nansum(r**2)
+    return np.array([np.nansum(r[lag:] * r[:-lag]) for lag in range(1, n + 1)]) / max(below, 1e-300)
+
+
+def _runs(r: np.ndarray) -> float:
+    """Probability, two-sided, of as few or as many runs of one sign."""
+    up = r > 0
+    n1, n2 = int(up.sum()), int((~up).sum())
+    if min(n1, n2) == 0:
+        return 0.0 if r.size > 10 else 1.0
+    n, runs = n1 + n2, 1 + int(np.sum(up[1:] != up[:-1]))
+    mean = 1 + 2 * n1 * n2 / n
+    variance = (mean - 1) * (mean - 2) / (n - 1)
+    return float(2 * stats.norm.sf(abs(runs - mean) / np.sqrt(variance))) if variance > 0 else 1.0

@@ -1,0 +1,221 @@
+"""How far estimates can be trusted: robust errors, profiles of the likelihood, trials left out, a Gaussian posterior."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import jax.numpy as jnp
+import numpy as np
+from scipy import stats
+
+from ._blocks import eliminate
+from ._model import Point
+from ._problem import Problem
+from ._steps import settle
+
+if TYPE_CHECKING:
+    from ._result import Fit
+
+
+def clustered_covariance(fit: Fit) -> np.ndarray:
+    """Covariance (p, p) of the free numbers, robust to residuals that are correlated within a trial.
+
+        T / (T - 1)  (A^T A)^-1  sum_t (A_t^T r_t) (A_t^T r_t)^T  (A^T A)^-1
+
+    (Liang and Zeger 1986; White's sandwich with a trial as the unit.) NaN with fewer trials than parameters plus two.
+    """
+    blocks = np.asarray(eliminate(fit.linearization.blocks, 0.0).R)  # (T, p+1, p+1)
+    blocks = blocks[np.any(blocks != 0, axis=(1, 2))]
+    T, p = len(blocks), len(fit.names)
+    A, r = blocks[:, :, :-1], blocks[:, :, -1]
+    information = np.einsum("tmi,tmj->ij", A, A)
+    if p + 2 > T or not np.all(np.isfinite(fit.covariance)):
+        return np.full((p, p), np.nan)
+    scores = np.einsum("tmi,tm->ti", A, r)
+    bread = np.linalg.inv(information)
+    return T / (T - 1) * bread @ (scores.T @ scores) @ bread
+
+
+@dataclasses.dataclass(frozen=True)
+class Profile:
+    """The sum of squares with one parameter held at values (n,), all others found anew.
+
+    `interval`: where `costs` exceed their minimum by no more than chance does at `level`; infinite on a side where they
+    do not come so far.
+    """
+
+    name: str
+    values: np.ndarray
+    costs: np.ndarray
+    level: float
+    interval: tuple[float, float]
+    estimates: tuple[dict[str, float], ...]
+
+
+def profile(fit: Fit, name: str, *, n: int = 9, span: float = 3.0, level: float = 0.95) -> Profile:
+    """The profile likelihood of one parameter: no assumption that the problem is linear between the ends.
+
+    **Arguments:** `name`; `n`: values, half on either side of the estimate; `span`: how many standard errors to either
+    side; `level` of the interval.
+
+    **Raises:** `ValueError` for a name that is not free, or a parameter that the data do not tell.
+    """
+    from ._least_squares import least_squares
+
+    if name not in fit.names:
+        raise ValueError(f"{name} is not free; {', '.join(fit.names)} are.")
+    error, best = fit.standard_errors[name], fit.estimates[name]
+    if not np.isfinite(error):
+        raise ValueError(f"{name} has no influence on these data: its likelihood is the same everywhere.")
+    i = fit.names.index(name)
+    prior = float(fit.parameters.prior_mean[i]), float(fit.parameters.prior_deviation[i])
+    values, found = best + span * error * np.linspace(-1, 1, n | 1), {}
+    for side in (values[values >= best], values[values < best][::-1]):
+        point = fit.point
+        for value in side:
+            pinned = fit.problem.with_priors({name: (float(value), 1e-4 * error)})
+            try:
+                there = least_squares(pinned, start=pinned.at({name: float(value)}, point), rtol=1e-5)
+            except ValueError:  # outside its bounds, or nothing that can be simulated
+                break
+            pin = (there.estimates[name] - value) / (1e-4 * error)
+            cost = there.cost - pin**2 + ((there.estimates[name] - prior[0]) / prior[1]) ** 2
+            found[float(value)], point = (cost, there.estimates), there.point
+    values = np.array(sorted(found))
+    costs = np.array([found[v][0] for v in values])
+    limit = costs.min() + fit.variance * fit.quantile(level) ** 2
+    return Profile(name, values, costs, level, _crossings(values, costs, limit), tuple(found[v][1] for v in values))
+
+
+def _crossings(values: np.ndarray, costs: np.ndarray, limit: float) -> tuple[float, float]:
+    """Where the costs rise above the limit on both sides of their minimum, linear in between."""
+    least, ends = int(np.argmin(costs)), []
+    for beyond, infinite in ((range(least, -1, -1), -np.inf), (range(least, len(values)), np.inf)):
+        order = list(beyond)
+        above = next((k for k in order if costs[k] > limit), None)
+        if above is None:
+            ends.append(infinite)
+            continue
+        inside = order[order.index(above) - 1]
+        share = (limit - costs[inside]) / (costs[above] - costs[inside])
+        ends.append(float(values[inside] + share * (values[above] - values[inside])))
+    return ends[0], ends[1]
+
+
+@dataclasses.dataclass(frozen=True)
+class CrossValidation:
+    """Trials left out in turn: sums of squares of each, its own starts and biases found with the parameters held.
+
+    - `trials`: their names; `n`: numbers of residuals; `at_start`, `fitted`, `held_out` (T,): with the parameters of
+        the start, of the fit of all, and of the fit of the others.
+    - `estimates`: by parameter, of each fold.
+    """
+
+    trials: tuple[str, ...]
+    n: np.ndarray
+    at_start: np.ndarray
+    fitted: np.ndarray
+    held_out: np.ndarray
+    estimates: dict[str, np.ndarray]
+
+    @property
+    def score(self) -> float:
+        """The share of the sum of squares at the start that the fit takes away from trials it has not seen."""
+        return float(1 - self.held_out.sum() / self.at_start.sum())
+
+    def __str__(self) -> str:
+        lines = [f"{'trial':<28}{'residuals':>10}{'start':>12}{'fitted':>12}{'held out':>12}"]
+        rows = zip(self.trials, self.n, self.at_start, self.fitted, self.held_out, strict=True)
+        lines += [f"{name:<28}{n:>10}{a:>12.5g}{b:>12.5g}{c:>12.5g}" for name, n, a, b, c in rows]
+        total = (self.n.sum(), self.at_start.sum(), self.fitted.sum(), self.held_out.sum())
+        lines.append("{:<28}{:>10}{:>12.5g}{:>12.5g}{:>12.5g}".format("all", *total))
+        lines.append(f"held-out score: {100 * self.score:.1f} % of the start's sum of squares is taken away.")
+        return "\n".join(lines)
+
+
+def cross_validate(fit: Fit, folds: int | Sequence[Sequence[int]] | None = None) -> CrossValidation:
+    """Fit some trials and look at the others: does what was found hold where it was not looked for?
+
+    **Arguments:** `folds`: how many, or the numbers of the trials that are left out together; by default each trial
+    alone, and five folds from eleven trials on.
+
+    **Raises:** `ValueError` with fewer than two trials.
+    """
+    from ._least_squares import least_squares
+
+    T = len(fit.problem.trials)
+    if T < 2:
+        raise ValueError("Leaving trials out needs two at least: cut a long one with `Trial.between`.")
+    if folds is None:
+        folds = T if T <= 10 else 5
+    groups = [list(g) for g in folds] if not isinstance(folds, int) else [list(range(k, T, folds)) for k in range(folds)]
+    held, estimates = np.full(T, np.nan), {name: [] for name in fit.names}
+    for group in groups:
+        others = fit.problem.only(set(range(T)) - set(group))
+        found = least_squares(others, start=fit.point)
+        held[group] = costs_by_trial(fit.problem, found.point)[group]
+        for name, value in found.estimates.items():
+            estimates[name].append(value)
+    owner = np.asarray(fit.problem.windows.trial)
+    counts = np.asarray(jnp.sum(fit.problem.windows.weight > 0, axis=(1, 2)))
+    return CrossValidation(
+        trials=fit.trial_names,
+        n=np.array([counts[owner == k].sum() for k in range(T)]),
+        at_start=costs_by_trial(fit.problem, fit.problem.start),
+        fitted=costs_by_trial(fit.problem, fit.point),
+        held_out=held,
+        estimates={name: np.array(values) for name, values in estimates.items()},
+    )
+
+
+def costs_by_trial(problem: Problem, point: Point) -> np.ndarray:
+    """Sums of squares (T,) with these parameters, starts and biases found for them."""
+    _, at = settle(problem, point, rtol=1e-5)
+    costs = np.sum(np.asarray(at.blocks.R)[:, :, -1] ** 2, axis=1)
+    return np.bincount(np.asarray(problem.windows.trial), costs, minlength=len(problem.trials))
+
+
+@dataclasses.dataclass(frozen=True)
+class Laplace:
+    """A Gaussian for the posterior of the free numbers x, at its mode.
+
+    `mean` (p,), `covariance` (p, p); `log_evidence` up to a constant that is the same for the same data: for comparing
+    models whose parameters have priors.
+    """
+
+    fit: Fit
+    mean: np.ndarray
+    covariance: np.ndarray
+    log_evidence: float
+
+    def sample(self, n: int, seed: int = 0) -> dict[str, np.ndarray]:
+        """Parameters (n,) by name, in their units: never outside their bounds."""
+        rng = np.random.default_rng(seed)
+        x = rng.multivariate_normal(self.mean, self.covariance, size=n)
+        values = np.stack([np.asarray(self.fit.parameters.values(jnp.asarray(row))) for row in x])
+        return dict(zip(self.fit.names, values.T, strict=True))
+
+
+def laplace(fit: Fit) -> Laplace:
+    """The Laplace approximation: `sigma` is taken as it was given, priors count, nuisance values are integrated out.
+
+        log evidence = -cost / 2 - 1/2 log det(information of all unknowns) + constant
+
+    **Raises:** `ValueError` where a parameter has no influence: nothing bounds its posterior.
+    """
+    if fit.identifiability.without_influence:
+        names = ", ".join(fit.identifiability.without_influence)
+        raise ValueError(f"{names} has no influence on these data: give it a prior, or leave it out.")
+    eliminated = eliminate(fit.linearization.blocks, 0.0)
+    A = np.asarray(eliminated.rows[0])
+    information = A.T @ A
+    sign, log_det = np.linalg.slogdet(information)
+    evidence = -0.5 * fit.cost - 0.5 * (float(log_det) + float(eliminated.log_determinant))
+    return Laplace(fit, np.asarray(fit.point.x), np.linalg.inv(information), evidence if sign > 0 else float("nan"))
+
+
+def t_quantile(level: float, freedom: int) -> float:
+    """Two-sided, of Student's distribution."""
+    return float(stats.t.ppf(0.5 * (1 + level), max(freedom, 1)))
