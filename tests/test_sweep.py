@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
+import jaxkane.sweep._solve as solving
 from jaxkane.catalog import DoublePendulum, WhippleBicycle
 
 BIKE = WhippleBicycle.benchmark()
@@ -85,7 +86,7 @@ def test_what_is_refused():
 
 def test_an_interrupted_sweep_keeps_what_is_done(monkeypatch):
     calls = []
-    original = jk.sweep._solve_chunk
+    original = solving._solve
 
     def interrupted(*args):
         calls.append(1)
@@ -93,7 +94,7 @@ def test_an_interrupted_sweep_keeps_what_is_done(monkeypatch):
             raise KeyboardInterrupt
         return original(*args)
 
-    monkeypatch.setattr(jk.sweep, "_solve_chunk", interrupted)
+    monkeypatch.setattr(solving, "_solve", interrupted)
     rides = jk.sweep.sweep(BIKE, starts(70), TS, chunk=32)
     assert rides.reason[0] == "completed"
     assert rides.reason[-1] == "interrupted"

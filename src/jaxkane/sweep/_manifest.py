@@ -1,0 +1,57 @@
+"""What a folder's sweep is, in words that tell two of them apart. Knows systems and their parameters."""
+
+from __future__ import annotations
+
+import dataclasses
+from importlib.metadata import version
+from platform import python_version_tuple
+from typing import Any
+
+import jax
+import numpy as np
+
+from .._simulate import Settings
+from .._system import State, System
+from ._fingerprint import digest
+from ._table import Table
+
+
+def manifest_of(
+    system: Any, state: Any, inputs: Any, table: Table | None, ts: Any, settings: Settings, reduce: Any, layout: Any
+) -> dict[str, Any]:
+    """All that the results follow from, by name."""
+    kind: dict[str, Any]
+    if isinstance(system, System):
+        kind = {"class": type(system).__qualname__, "description": digest(type(system))}
+        parameters = {field.name: _shown(getattr(system, field.name)) for field in dataclasses.fields(system)}
+    else:
+        kind, parameters = {"function": digest(system)}, {}
+    places = {"q": _shown(state.q), "u": _shown(state.u)} if isinstance(state, State) else {"function": digest(state)}
+    signals = {name: _shown(x) for name, x in (inputs or {}).items()} if not callable(inputs) else _shown(inputs)
+    return {
+        "system": kind,
+        "parameter": parameters,
+        "state": places,
+        "input": signals,
+        "table": {name: _shown(column) for name, column in table.columns.items()} if table else {},
+        "shape": dict(zip(table.dims, table.shape, strict=True)) if table else {},
+        "times": _shown(ts),
+        "option": {f.name: _shown(getattr(settings, f.name)) for f in dataclasses.fields(settings)},
+        "reduce": _shown(reduce),
+        "layout": dict(layout),
+        "device": jax.default_backend(),
+        "version": {name: version(name) for name in ("jaxkane", "jax", "jaxlib", "diffrax", "equinox")}
+        | {"python": ".".join(python_version_tuple()[:2])},
+    }
+
+
+def _shown(value: Any) -> Any:
+    """Numbers as they are, everything else by a digest."""
+    if value is None or isinstance(value, (bool, int, float, str)):
+        return value
+    if isinstance(value, (jax.Array, np.ndarray, np.generic)):
+        array = np.asarray(value)
+        if array.ndim == 0:
+            return array.item()
+        return f"{array.dtype}{list(array.shape)} {digest(array)}"
+    return f"{getattr(value, '__qualname__', type(value).__qualname__)} {digest(value)}"

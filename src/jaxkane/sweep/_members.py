@@ -1,0 +1,162 @@
+"""How a member is made: what it has of its own, what all share. Knows systems, states and signals by name."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._assembly import assemble
+from .._signals import Samples, as_signals
+from .._simulate import checked_state
+from .._system import State, System, parameter_info
+from .._types import Inputs
+from ._table import Table
+
+Tree = Any
+
+
+class Row(dict):
+    """One member's numbers by name, for the functions that a user gives; it keeps account of what was read."""
+
+    def __init__(self, values: dict[str, Any]):
+        super().__init__(values)
+        self.read: set[str] = set()
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self:
+            raise KeyError(f"The sweep's table has no column {name!r}; it has {', '.join(self) or 'no numbers'}.")
+        self.read.add(name)
+        return super().__getitem__(name)
+
+
+def members_of(system: Any, state: Any, inputs: Inputs, table: Table | None, ts: Any) -> tuple[Tree, Tree, int]:
+    """What differs from member to member (b, ...), what is shared, and how many members there are.
+
+    **Raises:** `ValueError` when nothing is a batch, when batches differ in length, or for a column that nothing reads.
+    """
+    columns = {name: np.asarray(x, dtype=ts.dtype) for name, x in table.numbers.items()} if table else {}
+    signals = inputs if callable(inputs) else _signals(inputs, system, columns, ts)
+    tree = (system, state, signals, columns)
+    is_member = _batches(tree, None if table is None else len(table))
+    members, shared = eqx.partition(tree, jax.tree.map(lambda x: id(x) in is_member, tree))
+    lengths = {is_member[id(x)]: x.shape[0] for x in jax.tree.leaves(members)}
+    if table is not None and not columns:
+        lengths["table"] = len(table)
+    if not jax.tree.leaves(members):
+        raise ValueError(
+            "sweep: nothing here is a batch. Give a `table`, or a parameter, state.q, state.u or an input a leading "
+            "axis; for one motion call jaxkane.simulate."
+        )
+    if len(set(lengths.values())) > 1:
+        listed = ", ".join(f"{name} ({n})" for name, n in lengths.items())
+        raise ValueError(f"sweep: the batches differ in length: {listed}.")
+    _check(members, shared)
+    return members, shared, next(iter(lengths.values()))
+
+
+def member(own: Tree, shared: Tree) -> tuple[System, State, Any]:
+    """System, state and signals of one member."""
+    return _member(*eqx.combine(own, shared))[:3]
+
+
+def _member(system: Any, state: Any, signals: Any, columns: dict[str, Any]):
+    row = Row(columns)
+    if not isinstance(system, System):
+        system = system(row)
+    parameters = {name: columns[name] for name in parameter_info(system) if name in columns}
+    system = replace(system, **parameters)
+    state = state(system, row) if not isinstance(state, State) else state
+    q, u = ({name: columns[name] for name in names if name in columns} for names in (system.coordinates, system.speeds))
+    state = State(_set(state.q, q, system.coordinates), _set(state.u, u, system.speeds))
+    if system.dependent_coordinates and (q or parameters):  # they follow from the others
+        state = assemble(system, state.q, state.u)
+    constants = {name: columns[name] for name in system.inputs if name in columns}
+    if not callable(signals):
+        signals = {**signals, **constants}
+    return system, state, signals, (row, {*parameters, *q, *u, *constants})
+
+
+def _set(values: Any, given: dict[str, Any], names: tuple[str, ...]) -> Any:
+    for name, value in given.items():
+        values = values.at[names.index(name)].set(value)
+    return values
+
+
+def _check(members: Tree, shared: Tree) -> None:
+    """Make one member in the abstract, and refuse what does not fit."""
+
+    def trial(own):
+        system, state, signals, account = _member(*eqx.combine(own, shared))
+        seen.append((system, signals, account))
+        return checked_state(system, state)
+
+    seen: list[Any] = []
+    jax.eval_shape(trial, jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), members))
+    system, signals, (row, applied) = seen[0]
+    name = type(system).__name__
+    if callable(signals) and applied & set(system.inputs):
+        listed = ", ".join(sorted(applied & set(system.inputs)))
+        raise ValueError(f"sweep: {listed} is a column of the table, and `inputs` is a function that gives it too.")
+    follow = {*system.dependent_coordinates, *system.dependent_speeds} & set(row) - row.read
+    if follow:
+        raise ValueError(f"sweep: {name}: {', '.join(sorted(follow))} follows from the others; it cannot be a column.")
+    unused = [column for column in row if column not in applied | row.read]
+    if unused:
+        raise ValueError(
+            f"sweep: the table's {', '.join(unused)} changes nothing: {name} has no parameter, independent coordinate, "
+            "independent speed or input of that name. Give `state` as a function of (system, row), or `system` as a "
+            f"function of (row), which reads row[{unused[0]!r}]."
+        )
+
+
+def _signals(inputs: Inputs, system: Any, columns: dict[str, Any], ts: Any) -> Any:
+    """Signals as `simulate` takes them; samples may have a leading axis of members."""
+    if not isinstance(system, System):  # a function of the row: only to know the names
+        system = jax.eval_shape(lambda row: system(Row(row)), {k: jnp.zeros(x.shape[1:]) for k, x in columns.items()})
+    assert not callable(inputs)
+    single, batches = {}, {}
+    for name, value in (inputs or {}).items():
+        array = None if callable(value) else jnp.asarray(value, dtype=ts.dtype)
+        if array is None or array.ndim < 2:
+            single[name] = value
+        elif array.ndim == 2 and array.shape[1] in (1, ts.shape[0]):
+            batches[name] = array
+        else:
+            raise ValueError(
+                f"The input {name!r} of a sweep is a number, samples (n_t,), or a batch (b, n_t) or (b, 1) with n_t = "
+                f"{ts.shape[0]}; got the shape {array.shape}."
+            )
+    known = as_signals(single | dict.fromkeys(batches, 0.0), system.inputs, ts, type(system).__name__)
+    for name, array in batches.items():
+        known[name] = array[:, 0] if array.shape[1] == 1 else Samples(ts, array)
+    return known
+
+
+def _batches(tree: Tree, n: int | None) -> dict[int, str]:
+    """Name of every leaf that has a leading axis of members, by its identity."""
+    system, state, signals, columns = tree
+    found = {id(column): name for name, column in columns.items()}
+    if isinstance(system, System):
+        for name, info in parameter_info(system).items():
+            value = getattr(system, name)
+            if np.ndim(value) == len(info.shape) + 1:
+                found[id(value)] = name
+    if isinstance(state, State):
+        for name, value in (("q", state.q), ("u", state.u)):
+            if value.ndim == 2:
+                found[id(value)] = f"state.{name}"
+    if isinstance(signals, dict):
+        for name, signal in signals.items():
+            values = signal.values if isinstance(signal, Samples) else signal
+            if isinstance(values, jax.Array) and values.ndim == (2 if isinstance(signal, Samples) else 1):
+                found[id(values)] = name
+    return found
+
+
+StateOf = Callable[[System, Row], State]

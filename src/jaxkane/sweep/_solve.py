@@ -1,0 +1,96 @@
+"""One chunk as one compiled program. Knows groups of lanes and devices; knows no mechanism and no files.
+
+On the CPU the members of a chunk are solved in small groups, one group after the other: as many as the vector units
+can use, and few enough that one that needs many steps keeps few others waiting. One that falls or is nonsense stops
+where it is. On other devices a chunk goes in step (`vmap`). Several devices share a chunk, each by a loop of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import AxisType, Mesh
+from jax.sharding import PartitionSpec as P
+
+from .._simulate import Settings, solve
+from .._trajectory import Trajectory
+from ._members import member
+
+GROUP = 32
+
+
+class Part(eqx.Module):
+    """What comes back of some members: `values` are what `reduce` made of a ride, or its (q, u, u_dep, inputs)."""
+
+    values: Any
+    status: Any
+    t_end: Any
+    stats: dict[str, Any]
+    names: tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]] = eqx.field(static=True)
+    events: tuple[str, ...] = eqx.field(static=True)
+    adjoint: str = eqx.field(static=True)
+
+
+class Job(eqx.Module):
+    """What all members of a sweep have in common."""
+
+    shared: Any
+    ts: Any
+    settings: Settings
+    reduce: Callable[[Trajectory], Any] | None
+    mesh: Mesh | None = eqx.field(static=True)
+
+    def one(self, own: Any) -> Part:
+        """The motion of one member."""
+        system, state, signals = member(own, self.shared)
+        ride = solve(system, state, self.ts, signals, self.settings)
+        if self.reduce is None:
+            values = (ride.q, ride.u, ride.u_dep, ride.inputs)
+        else:
+            values = jax.tree.map(jnp.asarray, self.reduce(ride))
+        return Part(values, ride.status, ride.t_end, ride.stats, ride.names, ride.events, ride.adjoint)
+
+    def solve(self, members: Any, size: int) -> Part:
+        """The motions of a chunk (n, ...), n at most `size`: one program serves every chunk of a size."""
+        n = jax.tree.leaves(members)[0].shape[0]
+        # What is missing to whole groups on every device is filled up with copies of the last member.
+        unit = GROUP * (1 if self.mesh is None else self.mesh.size)
+        lanes = size if size <= GROUP and self.mesh is None else unit * -(-size // unit)
+        places = np.minimum(np.arange(lanes), n - 1)
+        members = jax.tree.map(lambda x: jnp.asarray(x if lanes == n else x[places]), members)
+        part = _solve(members, self)
+        return part if lanes == n else jax.tree.map(lambda x: x[:n], part)
+
+
+def mesh_of(devices: Sequence[Any] | None) -> Mesh | None:
+    """The devices of this process as one axis; None for a single one."""
+    devices = jax.local_devices() if devices is None else list(devices)
+    if len(devices) < 2:
+        return None
+    return jax.make_mesh((len(devices),), ("members",), axis_types=(AxisType.Auto,), devices=devices)
+
+
+@eqx.filter_jit
+def _solve(members: Any, job: Job) -> Part:
+    arrays, static = eqx.partition(job, eqx.is_array)
+
+    def on_one_device(members, arrays):
+        job = eqx.combine(arrays, static)
+        n = jax.tree.leaves(members)[0].shape[0]
+        if jax.default_backend() != "cpu":
+            return jax.vmap(job.one)(members)
+        group = min(n, GROUP)  # n is a multiple of it
+        groups = jax.tree.map(lambda x: x.reshape(n // group, group, *x.shape[1:]), members)
+        return jax.tree.map(lambda x: x.reshape(n, *x.shape[2:]), jax.lax.map(jax.vmap(job.one), groups))
+
+    if job.mesh is None:
+        return on_one_device(members, arrays)
+    across = jax.shard_map(
+        on_one_device, mesh=job.mesh, in_specs=(P("members"), P()), out_specs=P("members"), check_vma=False
+    )
+    return across(members, arrays)

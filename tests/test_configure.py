@@ -1,0 +1,120 @@
+"""One call at the top of a script: precision, kept programs, devices. Each in a process of its own."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+HEAD = "import jaxkane as jk, numpy as np, jax\n"
+RIDE = """
+hits, misses = [], []
+jax.monitoring.register_event_listener(
+    lambda event, **_: (hits if event.endswith("cache_hits") else misses if event.endswith("cache_misses") else []
+                        ).append(event))
+P = jk.catalog.DoublePendulum(mass=1.0, length=1.0)
+start = jk.State(np.array([0.5, -0.2]), np.zeros(2))
+ride = jk.simulate(P, start, np.linspace(0.0, 1.0, 6))
+rides = jk.sweep.sweep(P, start, np.linspace(0.0, 1.0, 6), table={"length": [1.0, 2.0, np.nan]})
+assert rides.reason == ["completed", "completed", "invalid"]
+print(len(hits), len(misses), ride.q.dtype, np.asarray(ride.q).tobytes().hex(), rides.q.tobytes().hex())
+"""
+REFUSALS = """
+import pytest
+def refused(message, f, *args):
+    with pytest.raises(ValueError, match=message):
+        f(*args)
+ts = np.linspace(0.0, 1.0, 6)
+bicycle = jk.catalog.WhippleBicycle.benchmark()
+refused("violate the configuration constraints", jk.simulate, bicycle,
+        jk.State(np.array([0, 0, 0, 0, 0.3, 0, 0, 0]), np.zeros(3)), ts)
+refused("no pitch satisfies", jk.assemble, bicycle, {"roll": 1.5, "steer": 1.5}, {})
+class Light(jk.System):
+    mass: jk.Scalar = jk.parameter(0.0)
+    coordinates = ("x",)
+    speeds = ("v",)
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(self.mass, 0.0, O.moving(q[0] * N.x, u[0] * N.x))])
+refused("Light", jk.simulate, Light(), jk.State(np.zeros(1), np.zeros(1)), ts)
+"""
+
+
+def python(code, *, status=0, env=None):
+    clean = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "EQX_", "XLA_"))}
+    run = subprocess.run(
+        [sys.executable, "-c", HEAD + code], env=clean | (env or {}), capture_output=True, text=True, timeout=120
+    )
+    assert run.returncode == status, run.stderr
+    return run
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("programs") / "cache"
+
+
+@pytest.fixture(scope="module")
+def first(cache):
+    return python(f"jk.configure(cache={str(cache)!r})\n" + RIDE).stdout.splitlines()
+
+
+def test_it_says_what_it_did(first, cache):
+    assert first[0] == "jaxkane: float64"
+    assert first[1].startswith(f"  compiled programs are kept in {cache} (none there yet;")
+    assert first[2].startswith("  numerical checks inside programs give NaN")
+
+
+def test_programs_of_simulations_are_kept_for_the_next_process(first, cache):
+    assert {"jit_solve", "jit__solve"} <= {path.name.rsplit("-", 2)[0] for path in cache.iterdir()}
+    hits, misses, dtype, *bytes_of_first = first[-1].split()
+    assert int(misses) > 10
+    second = python(f"jk.configure(cache={str(cache)!r}, verbose=False)\n" + RIDE).stdout.splitlines()
+    hits, misses, dtype, *bytes_of_second = second[-1].split()
+    assert (int(misses), dtype) == (0, "float64")
+    assert int(hits) > 10
+    assert bytes_of_second == bytes_of_first
+    assert len(second) == 1  # and nothing else was printed
+
+
+def test_errors_are_errors_with_a_cache(cache):
+    python(f"jk.configure(cache={str(cache)!r}, verbose=False)\n" + REFUSALS)
+
+
+def test_child_processes_inherit_it_and_nothing_is_said_twice(cache):
+    code = (
+        f"import os, subprocess, sys\nfor _ in range(2): jk.configure(cache={str(cache)!r}, devices=3)\n"
+        "print(len(jax.local_devices()))\n"
+        "c = 'import jax, equinox._config as e; print(jax.config.jax_enable_x64, jax.config.jax_compilation_cache_dir, "
+        "e.EQX_ON_ERROR)'\nprint(subprocess.check_output([sys.executable, '-c', c], text=True).strip())"
+    )
+    lines = python(code).stdout.splitlines()
+    assert lines[0] == "jaxkane: float64, 3 CPU devices"
+    assert lines[3:] == ["3", f"True {cache} nan"]
+
+
+def test_without_a_cache_nothing_but_the_precision_changes():
+    code = (
+        "print(jk.configure(cache=False))\nimport equinox._errors as e\nprint(e.EQX_ON_ERROR, jax.numpy.ones(1).dtype)"
+    )
+    assert python(code).stdout.splitlines() == [
+        "jaxkane: float64; compiled programs are not kept.",
+        "Configuration(float64=True, cache=None, devices=None)",
+        "raise float64",
+    ]
+
+
+def test_it_warns_when_it_comes_too_late():
+    code = (
+        "x = jax.numpy.ones(3)\nimport warnings\nwith warnings.catch_warnings(record=True) as told:\n"
+        "    warnings.simplefilter('always')\n    jk.configure(cache=False, devices=2, verbose=False)\n"
+        "print(*[w.message for w in told], sep='\\n'); print(told[0].filename)"
+    )
+    late, devices, where = python(code).stdout.splitlines()
+    assert "came late: 1 float32 array had been made before" in late
+    assert "too late for devices=2: JAX has started with 1" in devices
+    assert where == "<string>"
+
+
+def test_what_is_refused():
+    assert "`devices` is a number of CPU devices" in python("jk.configure(devices=0)", status=1).stderr

@@ -1,0 +1,132 @@
+"""Grids and tables: members by name, results with an axis for every name."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane.catalog import DoublePendulum, WhippleBicycle
+
+PENDULUM = DoublePendulum(mass=1.0, length=1.0)
+REST = jk.State(np.zeros(2), np.zeros(2))
+TS = np.linspace(0.0, 1.0, 6)
+GRID = jk.sweep.grid(theta1=np.linspace(0.1, 1.0, 12), mass=[1.0, 2.0, 3.0], elbow_torque=[0.0, 0.5])
+
+
+def largest(ride):
+    return {"largest": jnp.max(jnp.abs(ride["theta2"])), "end": ride.q[-1]}
+
+
+@pytest.fixture(scope="module")
+def rides():
+    return jk.sweep.sweep(PENDULUM, REST, TS, table=GRID, chunk=32)
+
+
+def test_a_grid_has_an_axis_for_every_name(rides):
+    assert GRID.dims == rides.dims == ("theta1", "mass", "elbow_torque")
+    assert rides.shape == rides.status.shape == (12, 3, 2)
+    assert rides["theta2"].shape == rides.t.shape == (12, 3, 2, 6)
+    np.testing.assert_array_equal(rides["mass"][0, :, 0], [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(rides["theta1"][..., 0], rides.table["theta1"].reshape(12, 3, 2))
+    assert repr(rides) == "Sweep(72 members: theta1 (12) x mass (3) x elbow_torque (2); 72 completed)"
+
+
+def test_members_of_a_grid_move_as_if_alone(rides):
+    state = jk.State(np.array([GRID.axis("theta1")[7], 0.0]), np.zeros(2))
+    alone = jk.simulate(DoublePendulum(mass=3.0, length=1.0), state, TS, {"elbow_torque": 0.5})
+    np.testing.assert_allclose(rides.member(7, 2, 1).q, alone.q, atol=1e-12)
+    np.testing.assert_allclose(rides["elbow_torque"][7, 2, 1], 0.5)
+    with pytest.raises(ValueError, match="3 places"):
+        rides.member(7)
+
+
+def test_what_reduce_keeps_is_what_it_would_make_of_the_motions(rides):
+    kept = jk.sweep.sweep(PENDULUM, REST, TS, table=GRID, chunk=32, reduce=largest)
+    np.testing.assert_array_equal(kept["largest"], np.abs(rides["theta2"]).max(axis=-1))
+    np.testing.assert_array_equal(kept["end"], rides.q[..., -1, :])
+    np.testing.assert_array_equal(kept.status, rides.status)
+    with pytest.raises(AttributeError, match="kept what `reduce` made"):
+        _ = kept.q
+    with pytest.raises(KeyError, match="there are end, largest, theta1, mass, elbow_torque"):
+        _ = kept["theta2"]
+
+
+def test_xarray(rides):
+    pytest.importorskip("xarray")
+    data = rides.to_xarray()
+    assert dict(data.sizes) == {"initial theta1": 12, "mass": 3, "elbow_torque": 2, "t": 6}
+    np.testing.assert_array_equal(
+        data["theta2"].sel(mass=2.0, elbow_torque=0.5).isel({"initial theta1": 4}), rides["theta2"][4, 1, 1]
+    )
+    np.testing.assert_array_equal(data["t"], TS)
+    assert (data["status"] == jk.Status.COMPLETED).all()
+
+
+def test_a_table_with_labels_and_a_function_of_its_own():
+    table = {"rider": ["a", "b", "c"], "push": [0.1, 0.2, 0.3], "length": [1, 2, 3]}
+
+    def start(system, row):  # pushed the harder, the longer it is
+        return jk.assemble(system, {"theta1": row["push"] * system.length})
+
+    swept = jk.sweep.sweep(PENDULUM, start, TS, table=table)
+    assert swept.dims == ("member",)
+    assert list(swept["rider"]) == ["a", "b", "c"]
+    np.testing.assert_allclose(swept["theta1"][:, 0], [0.1, 0.4, 0.9])
+    alone = jk.simulate(dataclasses.replace(PENDULUM, length=3.0), jk.State(np.array([0.9, 0.0]), np.zeros(2)), TS)
+    np.testing.assert_allclose(swept.q[2], alone.q, atol=1e-12)
+    by_system = jk.sweep.sweep(lambda row: DoublePendulum(1.0, row["length"]), start, TS, table=table)
+    np.testing.assert_allclose(by_system.q, swept.q, atol=1e-12)
+    pandas = pytest.importorskip("pandas")
+    np.testing.assert_array_equal(jk.sweep.sweep(PENDULUM, start, TS, table=pandas.DataFrame(table)).q, swept.q)
+
+
+def test_coordinates_that_follow_are_found_anew():
+    bicycle = WhippleBicycle.benchmark()
+    upright = jk.State(np.zeros(8), np.array([0.0, -15.0, 0.0]))
+    leant = jk.sweep.sweep(bicycle, upright, [0.0, 0.01], table=jk.sweep.grid(roll=[0.0, 0.2], steer=[0.1, 0.4]))
+    assert leant.ok.all()
+    right = jk.assemble(bicycle, {"roll": 0.2, "steer": 0.4}, {"rear_wheel_rate": -15.0})
+    np.testing.assert_allclose(leant["pitch"][1, 1, 0], right.q[4], atol=1e-12)
+    with pytest.raises(ValueError, match="WhippleBicycle: pitch follows from the others"):
+        jk.sweep.sweep(bicycle, upright, [0.0, 0.01], table={"pitch": [0.0, 0.1]})
+
+
+def test_sweeps_have_derivatives():
+    rtol = 1e-6
+
+    def ends(length):
+        state = jk.State(np.ones(2), np.zeros(2))
+        return jk.sweep.sweep(DoublePendulum(1.0, length), state, TS, adjoint="forward").u[:, -1]
+
+    length, step = jnp.array([1.0, 2.0]), 1e-5
+    _, exact = jax.jvp(ends, (length,), (jnp.ones(2),))
+    np.testing.assert_allclose(exact, (ends(length + step) - ends(length - step)) / (2 * step), rtol=rtol)
+
+
+@pytest.mark.parametrize(
+    ("table", "error", "message"),
+    [
+        ({"speed": [1.0, 2.0]}, ValueError, r"speed changes nothing: DoublePendulum .* reads row\['speed'\]"),
+        ({"mass": [1.0, 2.0], "length": [1.0]}, ValueError, r"differ in length: mass \(2\), length \(1\)"),
+        ({"mass": [None, 2.0]}, ValueError, "'mass' must hold a row of numbers"),
+        ({"mass": 3.0}, ValueError, "'mass' must hold a row of numbers"),
+        ({"rider": ["a", "b"]}, ValueError, "nothing here is a batch"),
+        ([1.0, 2.0], TypeError, "a dict of columns or a DataFrame, got list"),
+        ({}, ValueError, "no columns"),
+    ],
+)
+def test_tables_that_are_refused(table, error, message):
+    with pytest.raises(error, match=message):
+        jk.sweep.sweep(PENDULUM, REST, TS, table=table)
+
+
+def test_grids_that_are_refused():
+    with pytest.raises(ValueError, match="give values by name"):
+        jk.sweep.grid()
+    with pytest.raises(ValueError, match="lam must be a row of numbers"):
+        jk.sweep.grid(lam=[[1.0], [2.0]])
+    with pytest.raises(ValueError, match="elbow_torque is a column"):
+        jk.sweep.sweep(PENDULUM, REST, TS, lambda t, state: {"elbow_torque": t}, table={"elbow_torque": [1.0, 2.0]})
