@@ -8,6 +8,7 @@ from pathlib import Path
 import jaxkane as jk
 import jaxkane.catalog
 import jaxkane.fit
+import jaxkane.stability
 import jaxkane.sweep
 
 SOURCE = Path(jk.__file__).parent
@@ -27,7 +28,10 @@ FLOORS = [
     ["_simulate"],
     ["_reactions"],
     ["sweep", "_audit", "_configure"],
+    ["plot"],
     ["fit"],
+    ["stability"],
+    ["_animate"],
 ]
 WITHIN_A_FLOOR = {
     "_trajectory": {"_system"},
@@ -86,13 +90,15 @@ def test_public_names():
         for n in "Trial fit gradient_descent least_squares identifiability fit_bicycle".split()
         if not hasattr(jk.fit, n)
     ]
+    stability = "linearize equilibrium steady_turn eigenvalues critical_speeds transfer_function bode lqr family"
+    assert not [name for name in stability.split() if not hasattr(jk.stability, name)]
     bicycle = jk.catalog.WhippleBicycle
     assert all(callable(getattr(bicycle, name)) for name in ("benchmark", "from_parameters", "from_file"))
     assert len(jk.catalog.CATALOG) >= 15
 
 
 def test_every_public_function_says_what_it_does():
-    for module in (jk, jk.fit, jk.sweep, jk.catalog, jk.rotations):
+    for module in (jk, jk.fit, jk.sweep, jk.stability, jk.catalog, jk.rotations):
         for name, thing in vars(module).items():
             ours = getattr(thing, "__module__", "").startswith("jaxkane")
             if ours and not name.startswith("_") and thing.__module__ != "jaxkane._components":

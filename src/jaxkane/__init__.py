@@ -3,8 +3,13 @@
 from . import catalog as catalog
 from . import fit as fit
 from . import loads as loads
+from . import plot as plot
 from . import rotations as rotations
+from . import stability as stability
 from . import sweep as sweep
+from ._animate import Animation as Animation
+from ._animate import Sketch as Sketch
+from ._animate import animate as animate
 from ._assembly import assemble as assemble
 from ._audit import Audit as Audit
 from ._audit import audit as audit

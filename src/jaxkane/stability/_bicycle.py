@@ -1,0 +1,86 @@
+"""What the literature does with the bicycle: riding straight ahead, the canonical matrices, the modes' names."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._equations import equations_of_motion
+from .._system import State
+from .._types import Component
+from ..catalog import WhippleBicycle
+from ._solve import jacobian
+
+LATERAL = ("roll", "steer", "roll_rate", "steer_rate")
+"""The states of Meijaard et al. (2007); riding straight, the speed does not notice them to first order."""
+
+
+def straight_ahead(bicycle: WhippleBicycle, speed: Component) -> State:
+    """A bicycle that rolls straight ahead and upright at `speed` [m/s]."""
+    v = jnp.asarray(speed, dtype=jnp.result_type(bicycle.rR))
+    zero = jnp.zeros_like(v)
+    return State(jnp.zeros(len(bicycle.coordinates), v.dtype), jnp.stack([zero, -v / bicycle.rR, zero]))
+
+
+class Canonical(eqx.Module):
+    """M x_ddot + (C0 + v C1) x_dot + (g K0 + v^2 K2) x = f for x = (roll, steer), f the roll and steer torques.
+
+    Attributes: `M`, `C1`, `K0`, `K2` (2, 2) as in Meijaard et al. (2007), eq. (5.3); `C0` (2, 2): the steer damper's.
+    """
+
+    M: Float[Array, "2 2"]
+    C1: Float[Array, "2 2"]
+    K0: Float[Array, "2 2"]
+    K2: Float[Array, "2 2"]
+    C0: Float[Array, "2 2"]
+
+
+def canonical(bicycle: WhippleBicycle) -> Canonical:
+    """The canonical matrices of a bicycle, from the derivatives of its nonlinear equations M u_dot = f.
+
+    -df/dx_dot is linear and -df/dx is quadratic in the speed, so that their values at speeds of -1, 0 and 1 m/s give
+    their derivatives with respect to speed without an error. Pitch has no slope in roll and steer when upright.
+    """
+    lateral = np.array([0, 2])  # of (roll, rear wheel, steer), both coordinates and speeds
+
+    def stiffness_and_damping(v):
+        at = straight_ahead(bicycle, v)
+
+        def f(x):
+            q, u = at.q.at[lateral].add(x[:2]), at.u.at[lateral].add(x[2:])
+            return equations_of_motion(bicycle, 0.0, q, u)[1][lateral]
+
+        J = jacobian(f, jnp.zeros(4, at.q.dtype))
+        return -J[:, :2], -J[:, 2:]
+
+    still = straight_ahead(bicycle, 0.0)
+    M, _ = equations_of_motion(bicycle, 0.0, still.q, still.u)
+    K, C = jax.lax.map(stiffness_and_damping, jnp.array([-1.0, 0.0, 1.0], still.q.dtype))
+    return Canonical(
+        M=M[np.ix_(lateral, lateral)],
+        C1=(C[2] - C[0]) / 2,
+        K0=K[1] / bicycle.g,
+        K2=(K[2] + K[0]) / 2 - K[1],
+        C0=C[1],
+    )
+
+
+MODES = ("weave", "weave", "capsize", "castering")
+"""Names of the modes of `LATERAL`, in the order of `mode_order`."""
+
+
+def mode_order(values: Any) -> np.ndarray:
+    """Columns of tracked eigenvalues (m, 4) along the speed in the order of `MODES`.
+
+    The pair that oscillates is the weave, and of the others castering decays faster. At the lowest speeds nothing
+    oscillates: where nothing ever does, the two largest are those that would become the weave.
+    """
+    oscillating = np.abs(values.imag) > 1e-9
+    pairs = oscillating.sum(axis=1)
+    i = int(np.argmax(pairs == 2)) if (pairs == 2).any() else 0
+    return np.lexsort((-values[i].imag, -values[i].real, ~oscillating[i]))

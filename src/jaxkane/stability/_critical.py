@@ -1,0 +1,152 @@
+"""Values of a parameter at which stability is gained or lost. Knows eigenvalues along a parameter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float, Int
+
+from .._check import is_concrete
+from .._system import System
+from ._eig import eig
+from ._eigenvalues import Eigenvalues, MotionAt, eigenvalues, family_of, matrix
+
+_MOST = 8
+_GRID = np.linspace(0.0, 20.0, 201)  # [m/s]
+
+
+class CriticalSpeeds(eqx.Module):
+    """Values of a parameter where the real part of a mode passes zero, in rising order.
+
+    Attributes: `values` (m,); `frequency` (m,) [rad/s], zero where the mode does not oscillate; `direction` (m,): 1
+    where the mode becomes unstable, -1 where it becomes stable; `mode` (m,): its place in `modes`, the names.
+    `found["weave"]` is the first value of that mode, NaN without one.
+    """
+
+    values: Float[Array, " m"]
+    frequency: Float[Array, " m"]
+    direction: Int[Array, " m"]
+    mode: Int[Array, " m"]
+    modes: tuple[str, ...] = eqx.field(static=True)
+
+    def __getitem__(self, name: str) -> Float[Array, ""]:
+        if name not in self.modes:
+            raise KeyError(f"There is no mode {name!r}; there are {', '.join(dict.fromkeys(self.modes))}.")
+        columns = np.array([i for i, mode in enumerate(self.modes) if mode == name])
+        mine = jnp.any(self.mode[:, None] == columns[None, :], axis=1) & jnp.isfinite(self.values)
+        if not mine.shape[0]:
+            return jnp.asarray(jnp.nan, self.values.dtype)
+        return jnp.where(jnp.any(mine), self.values[jnp.argmax(mine)], jnp.nan)
+
+    def __repr__(self) -> str:
+        if not is_concrete(self.values):
+            return f"CriticalSpeeds({', '.join(dict.fromkeys(self.modes))})"
+        rows = zip(self.values, self.mode, self.direction, self.frequency, strict=True)
+        text = ", ".join(
+            f"{self.modes[int(i)]} {'un' * (int(d) > 0)}stable from {float(v):.10g} ({float(w):.4g} rad/s)"
+            for v, i, d, w in rows
+        )
+        return f"CriticalSpeeds({text or 'none'})"
+
+
+def critical_speeds(
+    system: System,
+    values: Any = None,
+    motion: MotionAt = None,
+    *,
+    states: Sequence[str] | None = None,
+    modes: Sequence[str] | None = None,
+    most: int = _MOST,
+) -> CriticalSpeeds:
+    """Values of a parameter at which a mode becomes stable or unstable: of a bicycle the weave and capsize speeds.
+
+        Re lambda(p) = 0
+
+    Modes are followed along `values`; where the real part of one changes sign it is bisected to rounding.
+
+    **Arguments:** as `eigenvalues`. `values` must be close enough for no mode to pass zero twice between two of them;
+    for the bicycle they are 0 to 20 m/s by 0.1 by default. `most`: how many are kept under a trace, where their number
+    cannot be known; the rest are NaN.
+
+    **Returns:** `CriticalSpeeds`. They are differentiable in the parameters of the system by the implicit function
+    theorem,
+
+        dp = -(d Re lambda / d parameters) / (d Re lambda / dp),
+
+    with NaN where the mode has no derivative because it coalesces with another.
+
+    **Raises:** `ValueError` as `eigenvalues`.
+    """
+    values, at, states, _ = family_of(system, _default_grid(system, values, motion), motion, states)
+    found = eigenvalues(system, values, motion, states=states, modes=modes)
+    row, column, is_one = _sign_changes(found, most)
+    critical, frequency = _refine(system, found, at, states, row, column)
+    direction = jnp.sign(_real(found, row + 1, column) - _real(found, row, column)).astype(int)
+    critical, frequency = (jnp.where(is_one, x, jnp.nan) for x in (critical, frequency))
+    order = jnp.argsort(jax.lax.stop_gradient(critical))
+    return CriticalSpeeds(critical[order], frequency[order], direction[order], column[order], found.modes)
+
+
+def _default_grid(system: System, values: Any, motion: MotionAt) -> Any:
+    return _GRID if values is None and motion is None else values
+
+
+def _real(found: Eigenvalues, row: Any, column: Any) -> Any:
+    return jax.lax.stop_gradient(found.eigenvalues).real[row, column]
+
+
+def _sign_changes(found: Eigenvalues, most: int) -> tuple[Any, Any, Any]:
+    """Rows after which, and columns in which, a real part changes sign; of a conjugate pair only the upper one."""
+    x = jax.lax.stop_gradient(found.eigenvalues)
+    upper = (x.imag[:-1] >= 0) & (x.imag[1:] >= 0)
+    changes = ((x.real[:-1] < 0) != (x.real[1:] < 0)) & upper & jnp.isfinite(x.real[:-1] + x.real[1:])
+    if is_concrete(changes):
+        row, column = map(jnp.asarray, np.nonzero(np.asarray(changes)))
+        return row, column, jnp.ones(row.shape, bool)
+    row, column = jnp.nonzero(changes, size=most, fill_value=-1)
+    is_one = row >= 0
+    # Empty places repeat the first, so that nothing there can spoil a derivative.
+    return jnp.where(is_one, row, row[0]), jnp.where(is_one, column, column[0]), is_one
+
+
+@eqx.filter_jit
+def _refine(system, found: Eigenvalues, motion, states, rows, columns):
+    eps = float(jnp.finfo(found.values.dtype).eps)
+    fixed = jax.lax.stop_gradient(found)
+
+    def selected(p, args):
+        system, near, vector = args
+        A, _ = matrix(system, p, motion, states)
+        decomposed = eig(A)
+        x = jax.lax.stop_gradient(decomposed)
+        far = jnp.abs(x.values - near) / (1.0 + jnp.abs(near)) + 1.0 - jnp.abs(vector.conj() @ x.vectors)
+        return decomposed.values[jnp.argmin(far)]
+
+    def one(place):
+        row, column = place
+        lower, upper = fixed.values[row], fixed.values[row + 1]
+        a, b = fixed.eigenvalues[row, column], fixed.eigenvalues[row + 1, column]
+        s = a.real / (a.real - b.real)
+        near = jax.lax.complex(jnp.zeros_like(s), a.imag + s * (b.imag - a.imag))
+        nearest = jnp.where(s < 0.5, row, row + 1)
+        args = (system, near, fixed.vectors[nearest, :, column])
+        root = optx.root_find(
+            lambda p, args: selected(p, args).real,
+            optx.Bisection(rtol=eps, atol=eps, flip="detect"),
+            lower + s * (upper - lower),
+            args,
+            options={"lower": lower, "upper": upper},
+            max_steps=64,
+            throw=False,
+        )
+        return root.value, jnp.abs(selected(root.value, args).imag)
+
+    if rows.shape[0] == 0:
+        return jnp.zeros(0, found.values.dtype), jnp.zeros(0, found.values.dtype)
+    return jax.lax.map(one, (rows, columns))

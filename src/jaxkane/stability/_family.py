@@ -1,0 +1,234 @@
+"""Families of steady motions, followed through their folds. Knows the equations of a steady motion."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._system import System
+from ._solve import jacobian
+from ._steady import Problem, SteadyMotion, as_motion
+
+
+class Family(eqx.Module):
+    """Steady motions along a curve, by name: `turns["steer"]` (m,).
+
+    Attributes: `q` (m, n_q), `u` (m, n_u), `u_dep` (m, k); `arclength` (m,), in the scaled unknowns; `residual` (m,);
+    `inputs` by name; `reason`: why the family ends here. `turns.motion(i)` is the i-th `SteadyMotion`.
+    """
+
+    q: Float[Array, "m n_q"]
+    u: Float[Array, "m n_u"]
+    u_dep: Float[Array, "m k"]
+    arclength: Float[Array, " m"]
+    residual: Float[Array, " m"]
+    inputs: dict[str, Any]
+    t: Any
+    names: tuple[tuple[str, ...], ...] = eqx.field(static=True)
+    reason: str = eqx.field(static=True)
+
+    def motion(self, i: Any) -> SteadyMotion:
+        inputs = {k: x[i] if jnp.ndim(x) else x for k, x in self.inputs.items()}
+        return SteadyMotion(self.q[i], self.u[i], self.u_dep[i], inputs, self.t, self.residual[i], self.names)
+
+    def __getitem__(self, name: str) -> Float[Array, " m"]:
+        for names, values in zip(self.names, (self.q, self.u, self.u_dep), strict=True):
+            if name in names:
+                return values[:, names.index(name)]
+        if name in self.inputs:
+            return self.inputs[name]
+        known = ", ".join([*(n for names in self.names for n in names), *self.inputs])
+        raise KeyError(f"There is no {name!r} in this family; there are {known}.")
+
+    def __len__(self) -> int:
+        return len(self.arclength)
+
+    def __repr__(self) -> str:
+        return f"Family({len(self)} steady motions over {float(self.arclength[-1]):.4g}: {self.reason})"
+
+
+def family(
+    system: System,
+    start: SteadyMotion,
+    *,
+    towards: Mapping[str, float],
+    until: Mapping[str, float] | None = None,
+    hold: tuple[str, ...] = (),
+    find: tuple[str, ...] = (),
+    step: float = 0.05,
+    max_step: float | None = None,
+    steps: int = 500,
+) -> Family:
+    """The family of steady motions through one of them, by pseudo-arclength continuation.
+
+        F(z) = 0,   tangent . (z - z_predicted) = 0
+
+    z are the non-cyclic coordinates, the independent speeds and the inputs to find, the speeds divided by the largest
+    of the start; F are the equations of `steady_turn`. The step is halved where Newton's method fails and grows where
+    it is quick, so that folds, where no single quantity could lead on, are passed.
+
+    **Arguments:**
+
+    - `start`: from `steady_turn`. `hold`, `find`: as there, but hold one quantity less: the family is a curve.
+    - `towards`: {name: +1 or -1}: the way to set out.
+    - `until`: {name: value}, of coordinates and speeds, dependent ones too: stop exactly where the first of these
+        values is passed.
+    - `step`, `max_step` (by default four times the step): of arclength. `steps`: the largest number of them.
+
+    **Returns:** a `Family`, the start first. Its members are not differentiable; pass one to `steady_turn` for that.
+
+    **Raises:** `ValueError` where the start is not isolated on one curve: it names what moves.
+    """
+    q, t, inputs = start.q, jnp.asarray(start.t, start.q.dtype), dict(start.inputs)
+    problem = Problem(system, tuple(find), tuple(hold))
+    stops = Problem(system, tuple(find), (*hold, *(until or {})))
+    values = [float(problem.quantity(system, t, q, start.u, k)) for k in hold]
+    n_s, n = len(problem.places), len(system.speeds)
+    scale = np.ones(len(problem.names))
+    scale[n_s : n_s + n] = max(1.0, float(jnp.abs(start.u).max(initial=0.0)))
+    limits = np.array(list((until or {}).values()), float)
+
+    def evaluate(y):
+        held = jnp.asarray([*values, *limits * 0.0], q.dtype)
+        F, J = _residual_and_slope(stops, jnp.asarray(y * scale, q.dtype), (system, t, q, inputs, held))
+        F, J = np.asarray(F), np.asarray(J) * scale
+        m = len(F) - len(limits)
+        return F[:m], J[:m], F[m:] - limits, J[m:]
+
+    curve = _Curve(evaluate)
+    y = np.asarray(problem.unknowns(q, start.u, inputs)) / scale
+    tangent = curve.tangent(y, None)
+    tangent = tangent * _side(problem, system, towards, tangent, curve, y)
+    found, arc, reason, h = [y], [0.0], f"{steps} steps", step
+    max_step = 4 * step if max_step is None else max_step
+    while len(found) <= steps:
+        attempt = curve.correct(y + h * tangent, tangent)
+        new = None if attempt is None else curve.tangent(attempt[0], tangent)
+        if attempt is None or new is None or new @ tangent < 0.9:
+            h /= 2
+            if h < 1e-4 * step:
+                reason = "no further motion was found: equations or coordinates become singular"
+                break
+            continue
+        z, quick = attempt
+        before, after = evaluate(y)[2], evaluate(z)[2]
+        passed = np.nonzero((before < 0) != (after < 0))[0]
+        passed = [i for i in passed if abs(before[i]) > 1e-9]
+        if passed:
+            ends = [(curve.land(y, z, tangent, i), i) for i in passed]
+            ends = [(end, i) for end, i in ends if end is not None]
+            if not ends:  # nearer
+                h /= 2
+                continue
+            z, i = min(ends, key=lambda end: np.linalg.norm(end[0] - y))
+            found.append(z)
+            arc.append(arc[-1] + float(np.linalg.norm(z - y)))
+            name, value = list((until or {}).items())[i]
+            reason = f"{name} = {value:g}"
+            break
+        arc.append(arc[-1] + float(np.linalg.norm(z - y)))
+        y, tangent = z, new
+        found.append(y)
+        h = min(max_step, 1.5 * h) if quick else h
+    return _as_family(problem, system, t, q, inputs, values, np.array(found) * scale, arc, reason)
+
+
+class _Curve:
+    """Newton's method on a curve F(y) = 0 of more equations than unknowns, and its tangents."""
+
+    def __init__(self, evaluate: Any):
+        self.evaluate = evaluate
+
+    def tangent(self, y, before: Any) -> Any:
+        J = self.evaluate(y)[1]
+        if not np.all(np.isfinite(J)):
+            return None
+        _, s, Vt = np.linalg.svd(J)
+        if before is None:
+            return Vt[-1]
+        # Where another family crosses, two directions lead on: keep to the one that led here.
+        null = Vt[np.append(s, np.zeros(len(Vt) - len(s))) < 1e-7 * s[0]]
+        null = Vt[-1:] if len(null) == 0 else null
+        ahead = null.T @ (null @ before)
+        return ahead / np.linalg.norm(ahead)
+
+    def correct(self, y, tangent, tries: int = 12):
+        start = y
+        for k in range(tries):
+            F, J, _, _ = self.evaluate(y)
+            if not (np.all(np.isfinite(F)) and np.all(np.isfinite(J))):
+                return None
+            dy = np.linalg.lstsq(np.vstack([J, tangent]), -np.append(F, tangent @ (y - start)), rcond=1e-9)[0]
+            y = y + dy
+            if np.abs(dy).max() < 1e-12:
+                F = self.evaluate(y)[0]
+                return (y, k <= 4) if np.all(np.isfinite(F)) and np.abs(F).max() < 1e-8 else None
+        return None
+
+    def land(self, a, b, tangent, i: Any) -> Any:
+        """The point between a and b at which the i-th limit is met."""
+        y = a
+        for _ in range(20):  # along the curve, which may cross another one just there
+            g, G = self.evaluate(y)[2:]
+            slope = G[i] @ tangent
+            ds = -g[i] / slope if slope else np.inf
+            if abs(ds) < 1e-13:
+                break
+            if not abs(ds) <= 2 * np.linalg.norm(b - a):
+                return None
+            # Not all the way at once: at the crossing itself nothing holds Newton's method on this curve.
+            attempt = self.correct(y + (ds if abs(ds) < 1e-5 else 0.9 * ds) * tangent, tangent)
+            tangent = None if attempt is None else self.tangent(attempt[0], tangent)
+            if attempt is None or tangent is None:
+                return None
+            y = attempt[0]
+        F, J, g, G = self.evaluate(y)
+        bordered = np.vstack([J, G[[i]]])
+        if np.linalg.svd(bordered, compute_uv=False)[-1] > 1e-7:
+            y = y + np.linalg.lstsq(bordered, -np.append(F, g[i]), rcond=None)[0]
+        return y
+
+
+@eqx.filter_jit
+def _residual_and_slope(problem: Problem, z, args):
+    return problem.residual(z, args), jacobian(lambda z: problem.residual(z, args), z)
+
+
+def _side(problem: Problem, system: System, towards, tangent, curve: _Curve, y) -> float:
+    (name, sign), *more = towards.items()
+    if more or name not in problem.names:
+        raise ValueError(f"family: `towards` is one of {', '.join(problem.names)} with +1 or -1, got {dict(towards)}.")
+    s = np.linalg.svd(curve.evaluate(y)[1], compute_uv=False)
+    if s[-1] > 1e-8 * s[0]:
+        raise ValueError(
+            f"{type(system).__name__}: the start does not stand on a curve of steady motions: too much is held "
+            f"({', '.join(problem.held) or 'nothing'})."
+        )
+    if s[-2] < 1e-10 * s[0]:
+        raise ValueError(
+            f"{type(system).__name__}: more than one curve of steady motions passes here. Hold more quantities, or "
+            "start beside a bifurcation."
+        )
+    return float(np.sign(sign * tangent[problem.names.index(name)]) or 1.0)
+
+
+def _as_family(problem: Problem, system: System, t, q, inputs, values, zs, arc, reason) -> Family:
+    held = jnp.asarray(values, q.dtype)
+
+    @jax.jit
+    @jax.vmap
+    def members(z):
+        args = (system, t, q, inputs, held)
+        r = jnp.max(jnp.abs(problem.residual(z, args)))
+        here = as_motion(system, t, *problem.parts(z, q, inputs), r)
+        return here.q, here.u, here.u_dep, here.residual, {k: here.inputs[k] for k in problem.found}
+
+    q_all, u_all, u_dep, residual, found = members(jnp.asarray(zs, q.dtype))
+    names = (tuple(system.coordinates), tuple(system.speeds), tuple(system.dependent_speeds))
+    return Family(q_all, u_all, u_dep, jnp.asarray(arc), residual, {**inputs, **found}, t, names, reason)

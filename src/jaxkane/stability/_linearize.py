@@ -1,0 +1,218 @@
+"""Linear models about steady motions, on the constraint manifold. Knows the method's rates and their derivatives."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from .._check import check_system, configuration_residual, is_concrete
+from .._equations import dependent_speeds, state_rates
+from .._kane import as_array, checked_inputs
+from .._system import State, System, Values
+from .._types import Component
+from ._cyclic import cyclic_coordinates
+from ._eig import Eig, eig
+from ._solve import jacobian
+from ._steady import SteadyMotion
+
+Outputs = Sequence[str] | Mapping[str, Callable[..., Any]] | None
+
+
+class LinearModel(eqx.Module):
+    """x_dot = A x + B w, y = C x + D w for small deviations x, w, y from a motion.
+
+    Attributes: `A` (n, n), `B` (n, m), `C` (p, n), `D` (p, m) in SI units and radians; `states`, `inputs`, `outputs`:
+    their names. `eigenvalues` (n,) of A are differentiable, see `jaxkane.stability.eigenvalues`; a batch has leading
+    axes.
+    """
+
+    A: Float[Array, "*batch n n"]
+    B: Float[Array, "*batch n m"]
+    C: Float[Array, "*batch p n"]
+    D: Float[Array, "*batch p m"]
+    states: tuple[str, ...] = eqx.field(static=True)
+    inputs: tuple[str, ...] = eqx.field(static=True)
+    outputs: tuple[str, ...] = eqx.field(static=True)
+
+    def __iter__(self):
+        return iter((self.A, self.B, self.C, self.D))
+
+    @property
+    def eig(self) -> Eig:
+        """Eigenvalues (n,), right eigenvectors (n, n) in columns, and the condition (n,) of each eigenvalue."""
+        return eig(self.A)
+
+    @property
+    def eigenvalues(self) -> Array:
+        return self.eig.values
+
+    def __repr__(self) -> str:
+        rows = [("states", self.states), ("inputs", self.inputs), ("outputs", self.outputs)]
+        return "LinearModel(" + "; ".join(f"{what}: {', '.join(names) or 'none'}" for what, names in rows) + ")"
+
+
+def linearize(
+    system: System,
+    motion: State | SteadyMotion,
+    inputs: Mapping[str, Component] | None = None,
+    t: Component | None = None,
+    *,
+    states: Sequence[str] | None = None,
+    outputs: Outputs = None,
+    dependent: Sequence[str] | None = None,
+    steady: bool = True,
+) -> LinearModel:
+    """The linear model of a system about an equilibrium or a steady motion, exact to rounding.
+
+        x = (independent coordinates, independent speeds),   h(q) = 0:  dq_dep = -(dh/dq_dep)^-1 dh/dq_ind dq_ind
+
+    Dependent coordinates follow the constraints to first order, dependent speeds follow by the method; derivatives are
+    those of the equations of motion by `jax.jvp`. Differentiable itself, and usable under jit and vmap.
+
+    **Arguments:**
+
+    - `motion`: a `SteadyMotion`, or a `State` as from `assemble`.
+    - `inputs`: values about which to linearize; by default those of the `SteadyMotion`, or zero. `t`: time [s].
+    - `states`: names of coordinates and speeds to keep; by default all independent ones without the cyclic
+        coordinates. The deviations of those left out are taken as zero.
+    - `outputs`: names of coordinates and speeds, dependent ones too, by default the states; or functions by name,
+        `{"lean_rate": lambda t, q, u: ...}`, that read all of them by name.
+    - `dependent`: names of the coordinates that the constraints determine, by default `system.dependent_coordinates`.
+    - `steady`: refuse a state that is not steady. With False the model is that of an instant of any motion.
+
+    **Returns:** a `LinearModel`; `A, B, C, D = linearize(...)` works too.
+
+    **Raises:** `ValueError` for unknown names, a motion that is not steady, coordinates off the constraints, or as many
+    dependent coordinates as there are not constraints.
+    """
+    name = type(system).__name__
+    if isinstance(motion, SteadyMotion):
+        inputs = motion.inputs if inputs is None else inputs
+        t = motion.t if t is None else t
+    q = as_array(motion.q, system.coordinates, f"{name}: q")
+    u = as_array(motion.u, system.speeds, f"{name}: u")
+    t = jnp.asarray(0.0 if t is None else t, q.dtype)
+    w = checked_inputs(system, inputs)
+    w = jnp.stack([jnp.asarray(w[k], q.dtype) for k in system.inputs]) if w else jnp.zeros(0, q.dtype)
+    check_system(system, t, q, u)
+    n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q).shape[0]
+    dependent = tuple(system.dependent_coordinates if dependent is None else dependent)
+    if len(dependent) != n_h:
+        raise ValueError(
+            f"{name}: {n_h} configuration constraints determine as many coordinates, but {len(dependent)} are named "
+            f"({', '.join(dependent) or 'none'}). Give linearize(..., dependent=(...)) {n_h} of "
+            f"{', '.join(system.coordinates)}."
+        )
+    kept = _states(system, states, dependent)
+    rows = tuple(kept) if outputs is None else tuple(outputs)
+    functions = dict(outputs) if isinstance(outputs, Mapping) else {}
+    known = (*system.coordinates, *system.speeds, *system.dependent_speeds)
+    unknown = [k for k in rows if k not in known and k not in functions]
+    if unknown:
+        raise ValueError(f"{name} has no output {', '.join(unknown)}; it has {', '.join(known)}. Or give functions.")
+    if steady and is_concrete(system, t, q, u, w):
+        _check_steady(system, t, q, u, w)
+    A, B, C, D = _derivatives((system, t, q, u, w), dependent, kept, rows, _Functions(functions))
+    return LinearModel(A, B, C, D, kept, tuple(system.inputs), rows)
+
+
+def _states(system: System, states: Sequence[str] | None, dependent: tuple[str, ...]) -> tuple[str, ...]:
+    free = tuple(c for c in system.coordinates if c not in dependent)
+    if states is None:
+        cyclic = cyclic_coordinates(system)
+        return (*(c for c in free if c not in cyclic), *system.speeds)
+    unknown = [k for k in states if k not in (*free, *system.speeds)]
+    if unknown:
+        raise ValueError(
+            f"{type(system).__name__}: {', '.join(unknown)} cannot be a state; independent coordinates and speeds are "
+            f"{', '.join((*free, *system.speeds))}."
+        )
+    return tuple(states)
+
+
+class _Functions(dict):
+    """Output functions by name, as a static argument: known by their identity."""
+
+    def __hash__(self):  # type: ignore[override]
+        return hash(tuple((k, id(f)) for k, f in self.items()))
+
+
+@eqx.filter_jit
+def _derivatives(at, dependent, kept, rows, functions):
+    system, t, q, u, w = at
+    names = system.coordinates
+    T = _tangents(system, t, q, dependent)  # (n_q, n_q), column i: all coordinates when the i-th moves
+    all_names = (*names, *system.speeds, *system.dependent_speeds)
+    in_q = [names.index(k) if k in names else -1 for k in kept]
+
+    def at_deviation(x):
+        dq = sum((x[i] * T[:, j] for i, j in enumerate(in_q) if j >= 0), jnp.zeros_like(q))
+        places = [system.speeds.index(k) for k, j in zip(kept, in_q, strict=True) if j < 0]
+        du = (
+            jnp.zeros_like(u)
+            .at[np.array(places, int)]
+            .add(jnp.stack([x[i] for i, j in enumerate(in_q) if j < 0]) if places else jnp.zeros(0, q.dtype))
+        )
+        q_x, u_x, w_x = q + dq, u + du, w + x[len(kept) :]
+        q_dot, u_dot = state_rates(system, t, q_x, u_x, {k: w_x[i] for i, k in enumerate(system.inputs)})
+        u_dep = dependent_speeds(system, t, q_x, u_x) if _needs(system, rows, functions) else None
+        values = dict(zip(all_names, [*q_x, *u_x, *(u_dep if u_dep is not None else [])], strict=False))
+        x_dot = [q_dot[j] if j >= 0 else u_dot[system.speeds.index(k)] for k, j in zip(kept, in_q, strict=True)]
+        y = []
+        for k in rows:
+            if k in functions:
+                speeds = (*system.speeds, *system.dependent_speeds)
+                value = functions[k](t, Values(q_x, names), Values([values[s] for s in speeds], speeds))
+                y.append(jnp.asarray(value, q.dtype))
+            else:
+                y.append(values[k])
+        return jnp.stack(x_dot), jnp.stack(y) if y else jnp.zeros(0, q.dtype)
+
+    n = len(kept)
+    by_x, by_y = jacobian(at_deviation, jnp.zeros(n + len(system.inputs), q.dtype))
+    return by_x[:, :n], by_x[:, n:], by_y[:, :n], by_y[:, n:]
+
+
+def _needs(system: System, rows: tuple[str, ...], functions: _Functions) -> bool:
+    return bool(system.dependent_speeds) and (bool(functions) or any(k in system.dependent_speeds for k in rows))
+
+
+def _tangents(system: System, t, q, dependent: tuple[str, ...]):
+    n_q = len(system.coordinates)
+    T = jnp.eye(n_q, dtype=q.dtype)
+    if not dependent:
+        return T
+    d = np.array([system.coordinates.index(k) for k in dependent])
+    G = jacobian(lambda q: configuration_residual(system, t, q), q)  # (h, n_q)
+    follow = -jnp.linalg.solve(G[:, d], G)  # (h, n_q)
+    return T.at[d].set(follow).at[:, d].set(0.0)
+
+
+@eqx.filter_jit
+def _rates(system, t, q, u, w):
+    q_dot, u_dot = state_rates(system, t, q, u, {k: w[i] for i, k in enumerate(system.inputs)})
+    return q_dot, u_dot, configuration_residual(system, t, q)
+
+
+def _check_steady(system: System, t, q, u, w) -> None:
+    name = type(system).__name__
+    q_dot, u_dot, h = map(np.asarray, _rates(system, t, q, u, w))
+    cyclic = cyclic_coordinates(system)
+    tol = float(jnp.finfo(q.dtype).eps) ** 0.4
+    if h.size and np.abs(h).max() > tol:
+        raise ValueError(f"{name}: the coordinates violate the configuration constraints by {h}. Use assemble.")
+    rates = {f"{k} is accelerated by": x for k, x in zip(system.speeds, u_dot, strict=True)}
+    rates |= {f"{k} changes with": x for k, x in zip(system.coordinates, q_dot, strict=True) if k not in cyclic}
+    scale = 1.0 + float(np.abs(u).max(initial=0.0))
+    moving = [f"{k} {float(x):.3g}" for k, x in rates.items() if not abs(x) <= tol * scale]
+    if moving:
+        raise ValueError(
+            f"{name}: this motion is not steady: {', '.join(moving)}. Find one with equilibrium or steady_turn; or ask "
+            "for the linear model of an instant with linearize(..., steady=False)."
+        )
