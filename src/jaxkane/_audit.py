@@ -115,7 +115,7 @@ class Audit(eqx.Module):
         energies.plot(self.t, self.kinetic_energy, label="kinetic energy")
         energies.plot(self.t, self.work, label="work of the loads")
         energies.set(ylabel="[J]")
-        errors.plot(self.t, self.energy_error, color="0.2", label="kinetic energy gained, less work")
+        errors.plot(self.t, self.energy_error, color="C3", label="kinetic energy gained, less work")
         errors.set(ylabel="[J]")
         for values, label in (
             (self.configuration_residuals, "configuration constraints"),

@@ -105,7 +105,7 @@ def _scene(found: Record, figure: Any, speed: float, up, follow, ground, title, 
         bodies_and_points(few, build)
     for e in found.elements:
         body = None if e.body is None else found.numbers.index(e.body)
-        build.moving(e.places[kept], body)
+        build.moving(np.asarray(e.places)[kept], body)
         style = {"width": e.width, "closed": e.closed, "fill": e.fill, "label": e.label}
         build.shape(e.kind, e.color, e.places.shape[1], **style)
 

@@ -1,0 +1,115 @@
+"""Motions over time, by name and with units. Knows trajectories and the usual names; knows no system."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from .._trajectory import Status, Trajectory
+from ._axes import SOFT, finish, panels
+
+# The unit that a name tells: of the coordinate, before "_rate" or "_dot".
+_UNITS = {
+    r"roll|pitch|yaw|steer|lean|heading|spin|.*angle\d*|theta\d*|phi\d*|psi\d*|alpha\d*|beta\d*": "rad",
+    r"[xyz]\d*|.*(position|distance|displacement|height)\d*": "m",
+    r"omega\d*": "rad/s",
+    r"v\d*|.*_speed": "m/s",
+    r".*_?torque\d*": "N m",
+    r".*_?force\d*": "N",
+    r"e\d": "",
+}
+_MARKED = 200  # more members of a batch than this are drawn without a mark where they ended
+
+
+def unit_of(name: str) -> str:
+    """The unit that a usual name tells, or "": "roll" rad, "yaw_rate" rad/s, "x" m, "steer_torque" N m."""
+    base, rate = re.fullmatch(r"(.*?)((?:_rate|_dot)?)", name).groups()  # type: ignore[union-attr]
+    unit = next((unit for pattern, unit in _UNITS.items() if re.fullmatch(pattern, base)), "")
+    if base.endswith("wheel") and rate:
+        unit = "rad"
+    return unit + ("/s" if rate and unit else "")
+
+
+def trajectories(
+    trajectory: Trajectory,
+    names: Sequence[str | Sequence[str]] | None = None,
+    *,
+    degrees: bool = False,
+    units: Mapping[str, str] | None = None,
+    label: str | None = None,
+    axes: Any = None,
+    **style: Any,
+) -> np.ndarray:
+    """Coordinates, speeds and inputs over time, a panel for each; and how the simulation ended, if it ended early.
+
+        jk.plot.trajectories(ride, ["roll", "steer", ("roll_rate", "steer_rate")], degrees=True)
+
+    **Arguments:**
+
+    - `trajectory`: a `Trajectory`. Of a batch all members are drawn, faintly.
+    - `names`: of what is drawn; names in a tuple share a panel. By default the coordinates.
+    - `degrees`: angles in degrees instead of radians.
+    - `units`: by name, where the name does not tell it as "roll", "x", "yaw_rate" or "steer_torque" do.
+    - `label`: what this motion is called in the legend, when several are drawn into the same `axes`.
+    - `axes`: as many as there are panels. `style`: passed on to matplotlib's `plot`.
+
+    **Returns:** the axes (n_panels,).
+
+    **Raises:** `KeyError` for a name that the trajectory does not have.
+    """
+    groups = [(group,) if isinstance(group, str) else tuple(group) for group in names or trajectory.names[0]]
+    t = np.asarray(trajectory.t, dtype=float)
+    found = panels(axes, len(groups), size=(7.0, 1.6 if len(groups) > 1 else 3.0), sharex=True)[:, 0]
+    n = int(np.prod(t.shape[:-1]))
+    members: dict[str, Any] = {"alpha": max(0.08, min(1.0, 4.0 / n**0.5)), "linewidth": 0.8} if t.ndim > 1 else {}
+    t = t.reshape(n, -1)
+    for ax, group in zip(found, groups, strict=True):
+        shown = []
+        for name in group:
+            y, unit = _values(trajectory, name, degrees, units or {})
+            told = [part for part in (name if len(group) > 1 else "", label) if part]
+            y = y.reshape(n, -1)
+            line = ax.plot(t[0], y[0], label=", ".join(told) or None, **members | style)[0]
+            ax.plot(t[1:].T, y[1:].T, **members | style | {"color": line.get_color()})
+            _mark_ends(ax, trajectory, t, y, line.get_color())
+            shown.append((name, unit))
+        ax.set_ylabel(_axis_label(shown))
+        finish(ax)
+    if np.ndim(trajectory.status) == 0 and int(trajectory.status) != Status.COMPLETED:
+        _tell_the_end(found, trajectory)
+    found[-1].set_xlabel("time [s]")
+    return found
+
+
+def _values(trajectory: Trajectory, name: str, degrees: bool, units: Mapping[str, str]) -> tuple[np.ndarray, str]:
+    y, unit = np.asarray(trajectory[name], dtype=float), units.get(name, unit_of(name))
+    if degrees and unit in ("rad", "rad/s"):
+        return np.degrees(y), unit.replace("rad", "deg")
+    return y, unit
+
+
+def _axis_label(shown: Sequence[tuple[str, str]]) -> str:
+    units = {unit for _, unit in shown}
+    name = shown[0][0].replace("_", " ") if len(shown) == 1 else ""
+    unit = f"[{units.pop()}]" if len(units) == 1 and units != {""} else ""
+    return f"{name}\n{unit}".strip()
+
+
+def _mark_ends(ax: Any, trajectory: Trajectory, t: np.ndarray, y: np.ndarray, color: Any) -> None:
+    """A cross at the last value of every motion that ended early."""
+    early = np.flatnonzero(np.ravel(np.asarray(trajectory.status)) != Status.COMPLETED)
+    if len(early) > _MARKED:
+        return
+    for k in early:
+        reached = np.flatnonzero(np.isfinite(y[k]))
+        if reached.size:
+            ax.plot(t[k, reached[-1]], y[k, reached[-1]], "x", color=color, markersize=6, markeredgewidth=1.5)
+
+
+def _tell_the_end(axes: np.ndarray, trajectory: Trajectory) -> None:
+    for ax in axes:
+        ax.axvline(float(trajectory.t_end), color=SOFT, linestyle=":", linewidth=1.0)
+    axes[0].set_title(f"{trajectory.reason} at {float(trajectory.t_end):.3g} s", loc="right", fontsize="small")
