@@ -65,27 +65,6 @@ def test_the_published_nonlinear_state_of_basu_mandal():
     np.testing.assert_allclose(u_dep_dot, [expected[n] for n in ("psi_ddot", "theta_ddot", "thetaF_ddot")], atol=1e-11)
 
 
-def test_eigenvalues_of_the_benchmark_at_eleven_speeds():
-    """Meijaard et al. (2007), Table 2: linearized through the library's own derivatives."""
-    atol = 1e-11
-
-    @jax.jit
-    @jax.jacfwd
-    def A(x, v):  # of (roll, steer, roll_rate, steer_rate) about riding straight ahead
-        state = jk.assemble(
-            BIKE,
-            jnp.zeros(8).at[jnp.array([0, 2])].set(x[:2]),
-            jnp.stack([x[2], -v / BIKE.rR, x[3]]),
-        )
-        u_dot = jk.accelerations(BIKE, 0.0, state.q, state.u)
-        return jnp.stack([x[2], x[3], u_dot[0], u_dot[2]])
-
-    for row in load("meijaard2007.json")["table2"]:
-        found = np.linalg.eigvals(np.asarray(A(jnp.zeros(4), jnp.array(row["v"]))))
-        for real, imaginary in row["eig_published"]:
-            assert np.abs(found - complex(real, imaginary)).min() < atol
-
-
 def moving_state():
     state = jk.assemble(
         BIKE, {"roll": 0.2, "steer": -0.3, "yaw": 0.5}, {"roll_rate": -0.4, "rear_wheel_rate": -12.0, "steer_rate": 0.9}

@@ -15,14 +15,15 @@ from ._linearize import LinearModel
 def transfer_function(model: LinearModel, input: str, output: str) -> scipy.signal.TransferFunction:
     """G(s) = C (s - A)^-1 B + D from an input to an output, as a `scipy.signal.TransferFunction`.
 
-    Its coefficients are found through the poles, and zeros at infinity show up as leading coefficients near zero;
-    `bode` does not need them.
+    Leading coefficients of the numerator that are rounding errors (1e-12 of the largest) are left out. `bode` needs no
+    coefficients and is more accurate for many states.
 
     **Raises:** `ValueError` for an unknown name.
     """
     A, B, C, D = _single(model, input, output)
     numerator, denominator = scipy.signal.ss2tf(A, B, C, D)
-    return scipy.signal.TransferFunction(numerator[0], denominator)
+    small = np.abs(numerator[0]) <= 1e-12 * np.abs(numerator[0]).max()
+    return scipy.signal.TransferFunction(numerator[0][np.argmin(small) :], denominator)
 
 
 def bode(model: LinearModel, input: str, output: str, frequencies: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -53,13 +54,16 @@ def lqr(
     names = model.inputs if inputs is None else tuple(inputs)
     A, B = np.asarray(model.A), np.asarray(model.B)[:, [_place(model.inputs, k, "input") for k in names]]
     Q, R = _weights(Q, len(A), "Q", "states"), _weights(R, B.shape[1], "R", "inputs")
-    try:
-        P = scipy.linalg.solve_continuous_are(A, B, Q, R)
-    except np.linalg.LinAlgError as error:
-        raise ValueError(
-            f"lqr: no regulator of {', '.join(model.states)} by {', '.join(names)} exists ({error}). Leave out states "
-            "that these inputs do not reach: linearize(..., states=(...)), or add an input."
-        ) from None
+    size = max(np.abs(A).max(), np.abs(B).max())
+    for root in np.linalg.eigvals(A):  # Popov, Belevitch and Hautus: [root - A, B] must keep its rank where Re >= 0
+        s = np.linalg.svd(np.hstack([root * np.eye(len(A)) - A, B]), compute_uv=False)
+        if root.real > -1e-9 * size and s[-1] < 1e-9 * size:
+            raise ValueError(
+                f"lqr: no regulator of {', '.join(model.states)} by {', '.join(names)} exists: they do not reach the "
+                f"mode with the eigenvalue {root:.4g}, which does not decay. Leave out the states that it moves: "
+                "linearize(..., states=(...)), or add an input."
+            )
+    P = scipy.linalg.solve_continuous_are(A, B, Q, R)
     K = np.linalg.solve(R, B.T @ P)
     return K, P, np.linalg.eigvals(A - B @ K)
 

@@ -105,7 +105,9 @@ def _sign_changes(found: Eigenvalues, most: int) -> tuple[Any, Any, Any]:
     """Rows after which, and columns in which, a real part changes sign; of a conjugate pair only the upper one."""
     x = jax.lax.stop_gradient(found.eigenvalues)
     upper = (x.imag[:-1] >= 0) & (x.imag[1:] >= 0)
-    changes = ((x.real[:-1] < 0) != (x.real[1:] < 0)) & upper & jnp.isfinite(x.real[:-1] + x.real[1:])
+    # What neither grows nor decays (an undamped oscillation) has a real part of rounding errors only.
+    sign = jnp.sign(jnp.where(jnp.abs(x.real) > 1e-10 * jnp.max(jnp.abs(x)), x.real, 0.0))
+    changes = (sign[:-1] * sign[1:] < 0) & upper
     if is_concrete(changes):
         row, column = map(jnp.asarray, np.nonzero(np.asarray(changes)))
         return row, column, jnp.ones(row.shape, bool)

@@ -7,6 +7,7 @@ an order of magnitude faster for a long scalar program than the batch of directi
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -21,29 +22,26 @@ def jacobian(f: Callable[[Array], Any], x: Array) -> Any:
     return jax.tree.map(lambda y: jnp.moveaxis(y, 0, -1), columns)
 
 
-def root(residual: Callable[[Array, Any], Array], guess: Array, args: Any, max_steps: int = 80) -> Array:
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def root(residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
     """z (n,) with residual(z, args) = 0 (m >= n equations), by Levenberg and Marquardt's method from `guess`.
 
     Differentiable in `args`, any number of times, both modes:  dz = -F_z^+ F_args dargs. A solution is not promised:
     look at the residual and at the rank of its derivative.
     """
-
-    @jax.custom_jvp
-    def solved(args):
-        return _levenberg_marquardt(lambda z: residual(z, args), jax.lax.stop_gradient(guess), max_steps)
-
-    @solved.defjvp
-    def _(primals, tangents):
-        (args,), (d_args,) = primals, tangents
-        z = solved(args)
-        _, dF = jax.jvp(lambda args: residual(z, args), (args,), (d_args,))
-        J = jacobian(lambda z: residual(z, args), z)
-        return z, -jnp.linalg.pinv(J) @ dF
-
-    return solved(args)
+    return _levenberg_marquardt(lambda z: residual(z, args), guess)
 
 
-def _levenberg_marquardt(F: Callable[[Array], Array], z: Array, max_steps: int) -> Array:
+@root.defjvp
+def _root_jvp(residual, primals, tangents):
+    guess, args = primals
+    z = root(residual, guess, args)
+    _, dF = jax.jvp(lambda args: residual(z, args), (args,), (tangents[1],))
+    J = jacobian(lambda z: residual(z, args), z)
+    return z, -jnp.linalg.pinv(J) @ dF
+
+
+def _levenberg_marquardt(F: Callable[[Array], Array], z: Array, max_steps: int = 80) -> Array:
     # Steps are kept while the residual falls; the damping vanishes near a solution, where this is Gauss and Newton's.
     eps = float(jnp.finfo(z.dtype).eps)
 

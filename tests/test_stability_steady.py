@@ -1,0 +1,244 @@
+"""Steady motions and their families: closed forms, Basu-Mandal et al. (2007), and derivatives against differences."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_other_systems import RollingDisc
+
+import jaxkane as jk
+from jaxkane import Scalar, parameter
+from jaxkane.stability import cyclic_coordinates, equilibrium, family, steady_turn, straight_ahead, with_speeds
+
+BIKE = jk.catalog.WhippleBicycle.benchmark()
+CAPSIZE = 6.02426201538837  # [m/s] Meijaard et al. (2007), section 5
+
+
+class Top(jk.System):
+    """A symmetric top on a ball joint: precession about the vertical, nutation, spin; moments about the joint."""
+
+    mass: Scalar = parameter(positive=True)  # [kg]
+    distance: Scalar = parameter(positive=True)  # [m]
+    across: Scalar = parameter(positive=True)  # [kg m^2]
+    axial: Scalar = parameter(positive=True)  # [kg m^2]
+    g: Scalar = parameter(9.81)  # [m/s^2]
+
+    coordinates = ("precession", "nutation", "spin")
+    speeds = ("precession_rate", "nutation_rate", "spin_rate")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, q["precession"], u["precession_rate"]).rotate(1, q["nutation"], u["nutation_rate"])
+        G = O.fixed(self.distance * A.z)
+        I = self.across - self.mass * self.distance**2
+        omega = A.angular_velocity + u["spin_rate"] * A.z
+        return jk.Motion([jk.Body(self.mass, (I, I, self.axial), G, A, omega, "top")])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -self.g * motion.N.z)
+
+
+TOP = Top(mass=0.5, distance=0.1, across=0.006, axial=0.0008)
+
+
+def test_cyclic_coordinates():
+    assert cyclic_coordinates(BIKE) == ("rear_wheel_angle", "yaw", "front_wheel_angle", "x", "y")
+    assert cyclic_coordinates(TOP) == ("precession", "spin")
+    assert cyclic_coordinates(jk.catalog.DoublePendulum(mass=1.0, length=1.0)) == ()
+
+
+# -- closed forms
+
+
+def precession(g, nutation, spin):
+    """(A - C) W^2 cos - C s W + m g l = 0, for the spin s relative to the precessing frame; the slow root."""
+    a, b, c = (TOP.across - TOP.axial) * jnp.cos(nutation), -TOP.axial * spin, TOP.mass * g * TOP.distance
+    return (-b - jnp.sqrt(b**2 - 4 * a * c)) / (2 * a)
+
+
+def test_steady_precession_of_the_top_and_its_derivatives():
+    rtol = 1e-11
+
+    @jax.jit
+    def found(g, nutation, spin):
+        top = dataclasses.replace(TOP, g=g)
+        guess = {"precession_rate": 2.0}
+        return steady_turn(top, {}, guess, hold={"nutation": nutation, "spin_rate": spin})["precession_rate"]
+
+    at = (9.81, 0.5, 300.0)
+    np.testing.assert_allclose(found(*at), precession(*at), rtol=rtol)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        slopes, exact = derivative(found, (0, 1, 2))(*at), jax.grad(precession, (0, 1, 2))(*at)
+        np.testing.assert_allclose(slopes, exact, rtol=rtol)
+    curvature = jax.jacfwd(jax.jacrev(found, 2), 1)(*at)
+    np.testing.assert_allclose(curvature, jax.jacfwd(jax.grad(precession, 2), 1)(*at), rtol=1e-8)
+
+
+def test_fast_and_slow_precession_are_one_family():
+    """Followed at one nutation, the spin falls to its least value, where the two meet, and rises again."""
+    rtol = 1e-10
+    slow = steady_turn(TOP, {}, {"precession_rate": 2.0}, hold={"nutation": 0.5, "spin_rate": 300.0})
+    turns = family(TOP, slow, hold=("nutation",), towards={"spin_rate": -1}, until={"spin_rate": 320.0}, max_step=0.1)
+    assert turns.reason == "spin_rate = 320"
+    np.testing.assert_allclose(turns["nutation"], 0.5, atol=1e-12)
+    least = 2 * np.sqrt((TOP.across - TOP.axial) * np.cos(0.5) * TOP.mass * 9.81 * TOP.distance) / TOP.axial
+    assert least <= float(turns["spin_rate"].min()) < 1.01 * least
+    a, c = (TOP.across - TOP.axial) * np.cos(0.5), TOP.mass * 9.81 * TOP.distance
+    fast = (TOP.axial * 320.0 + np.sqrt((TOP.axial * 320.0) ** 2 - 4 * a * c)) / (2 * a)
+    np.testing.assert_allclose(turns["precession_rate"][-1], fast, rtol=rtol)
+
+
+def test_a_disc_rolls_on_a_circle():
+    """r/4 u3^2 tan(lean) - 3/2 r u2 u3 = g sin(lean): moments about the centre of a uniform disc."""
+    atol = 1e-12
+    disc = RollingDisc(m=2.0, r=0.3, g=9.81)
+    assert cyclic_coordinates(disc) == ("q1", "q3")
+    turn = steady_turn(disc, {}, {"u2": 3.0, "u3": -1.0}, hold={"q2": 0.3, "u2": 5.0})
+    u2, u3 = float(turn["u2"]), float(turn["u3"])
+    assert abs(u3) > 0.1
+    assert abs(0.3 / 4 * u3**2 * np.tan(0.3) - 1.5 * 0.3 * u2 * u3 - 9.81 * np.sin(0.3)) < atol
+
+
+def test_equilibria():
+    atol = 1e-13
+    pendulum = jk.catalog.DoublePendulum(mass=2.0, length=1.0)
+    at = equilibrium(pendulum, {"theta1": 0.3, "theta2": -0.2})
+    np.testing.assert_allclose(np.sin(at.q), 0.0, atol=atol)
+    np.testing.assert_array_equal(at.u, 0.0)
+
+
+def test_torques_that_hold_a_lean_are_found():
+    """Trim: turning at 3 m/s with a lean of 0.2 rad and a steer of 0.1 rad needs a roll and a steer torque."""
+    atol = 1e-11
+    hold = {"roll": 0.2, "steer": 0.1, "rear_wheel_rate": -10.0}
+    turn = steady_turn(BIKE, {}, {}, hold=hold, find=("roll_torque", "steer_torque"))
+    u_dot = jk.accelerations(BIKE, 0.0, turn.q, turn.u, turn.inputs)
+    np.testing.assert_allclose(u_dot, 0.0, atol=atol)
+    assert abs(float(turn["roll_torque"])) > 1.0
+    assert float(turn["drive_torque"]) == 0.0
+
+
+def test_what_was_held_too_little_or_wrongly_is_named():
+    with pytest.raises(ValueError, match=r"family of dimension 1, along which roll, steer, .* change\. Hold 1 more"):
+        steady_turn(BIKE, {"roll": 0.1, "steer": 0.05}, {"rear_wheel_rate": -20.0})
+    with pytest.raises(ValueError, match="no steady motion was found from this guess"):
+        steady_turn(TOP, {}, {"precession_rate": 2.0}, hold={"nutation": 0.5, "spin_rate": 100.0})
+    with pytest.raises(ValueError, match="no lean to hold; it has roll"):
+        steady_turn(BIKE, hold={"lean": 0.1})
+    with pytest.raises(ValueError, match="no input torque to find"):
+        steady_turn(BIKE, find=("torque",))
+    none = jax.jit(lambda s: steady_turn(TOP, {}, {"precession_rate": 2.0}, hold={"nutation": 0.5, "spin_rate": s}).u)
+    assert np.isnan(none(100.0)).all()
+
+
+# -- hands-free circular motions of the benchmark bicycle
+
+
+def residuals(turns):
+    """Largest accelerations, by the public functions."""
+    rates = jax.jit(jax.vmap(lambda q, u: jk.accelerations(BIKE, 0.0, q, u)))(turns.q, turns.u)
+    return np.abs(rates).max()
+
+
+@pytest.fixture(scope="module")
+def beside_capsize():
+    return steady_turn(BIKE, {"steer": 0.01}, {"rear_wheel_rate": -20.08}, hold={"roll": 0.05})
+
+
+def test_handlebar_forward_from_capsize_to_rest(beside_capsize):
+    """From the capsize speed, over a largest lean, to rest with the frame upright and the wheel turned by 76.76 deg."""
+    atol = 1e-11
+    turns = family(BIKE, beside_capsize, towards={"roll": 1}, until={"rear_wheel_rate": 0.0}, max_step=0.05)
+    assert residuals(turns) < atol
+    assert turns.reason == "rear_wheel_rate = 0"
+    end = turns.motion(-1)
+    np.testing.assert_allclose(end["roll"], 0.0, atol=atol)
+    assert f"{np.rad2deg(end['steer']):.2f}" == "76.76"
+    assert float(turns["roll"].max()) > 0.41 > float(turns["roll"][0])
+    assert "steady motions over" in repr(turns)
+    start = family(BIKE, beside_capsize, towards={"roll": -1}, until={"roll": 0.0}, step=0.01)
+    assert abs(float(-BIKE.rR * start["rear_wheel_rate"][-1]) - CAPSIZE) < 1e-7  # where two families cross
+    at = [steady_turn(BIKE, beside_capsize.q, beside_capsize.u, hold={"roll": s}) for s in (1e-3, 2e-3)]
+    v = [float(-BIKE.rR * motion["rear_wheel_rate"]) for motion in at]
+    assert abs((4 * v[0] - v[1]) / 3 - CAPSIZE) < 1e-9  # the speed is even in the roll
+
+
+def test_rest_with_a_turned_front_wheel_is_an_equilibrium():
+    atol = 1e-12
+    at = equilibrium(BIKE, {"steer": 1.3})
+    assert f"{np.rad2deg(at['steer']):.2f}" == "76.76"
+    np.testing.assert_allclose(at["roll"], 0.0, atol=atol)
+    assert residuals(jax.tree.map(lambda x: x[None], at)) < 1e-11
+
+
+def test_handlebar_reversed_from_its_capsize_to_spinning_flat():
+    atol = 1e-11
+    q = jk.assemble(BIKE, {"steer": np.pi + 0.01, "roll": 0.02}).q
+    start = steady_turn(BIKE, q, {"rear_wheel_rate": -26.3}, hold=("steer",))
+    turns = family(BIKE, start, towards={"steer": 1}, until={"roll": 1.4}, max_step=0.1)
+    assert residuals(turns) < atol
+    assert turns.reason == "roll = 1.4"
+    fold = np.argmax(np.asarray(turns["steer"]))
+    assert 0 < fold < len(turns) - 1  # steers away from straight back and returns
+    assert float(turns["yaw_rate"][-1]) > 4.0
+
+
+def test_pivoting_about_the_rear_contact_joins_two_limits():
+    """The third family: other speeds are independent, since the rear wheel's does not determine the yaw rate there."""
+    atol = 1e-11
+    bicycle = with_speeds(BIKE, ("roll_rate", "yaw_rate", "steer_rate"))
+    q = jk.assemble(BIKE, {"steer": 1.6}).q
+    pivot = steady_turn(bicycle, q, {"yaw_rate": 2.0}, hold={"rear_wheel_rate": 0.0})
+    assert abs(float(pivot["roll"])) < 0.02
+    assert abs(np.rad2deg(pivot["steer"]) - 90) < 3
+    flat = family(bicycle, pivot, towards={"steer": -1}, until={"roll": 1.2}, max_step=0.2)
+    fast = family(bicycle, pivot, towards={"steer": 1}, until={"yaw_rate": 15.0}, max_step=0.2)
+    assert float(flat.residual.max()) < atol
+    assert float(fast.residual.max()) < atol
+    assert (flat.reason, fast.reason) == ("roll = 1.2", "yaw_rate = 15")
+    assert abs(float(fast["roll"][-1])) < 0.1 < float(fast["rear_wheel_rate"][-1])  # near upright, rolling backwards
+    assert abs(np.rad2deg(fast["steer"][-1]) - 90) < 10
+
+
+def test_other_independent_speeds_move_alike():
+    rtol = 1e-12
+    bicycle = with_speeds(BIKE, ("yaw_rate", "pitch_rate", "roll_rate"))
+    q = jk.assemble(BIKE, {"roll": 0.2, "steer": -0.3}).q
+    u = jnp.array([0.4, -15.0, 0.3])
+    at, torque = (0.0, q, u), {"steer_torque": 2.0}
+    names = (*BIKE.dependent_speeds, *BIKE.speeds)
+    speeds = dict(zip(names, [*jk.dependent_speeds(BIKE, *at), *u], strict=True))
+    rates = [*jk.dependent_accelerations(BIKE, *at, torque), *jk.accelerations(BIKE, *at, torque)]
+    u_dot = jk.accelerations(bicycle, 0.0, q, jnp.stack([speeds[k] for k in bicycle.speeds]), torque)
+    np.testing.assert_allclose(u_dot, [rates[names.index(k)] for k in bicycle.speeds], rtol=rtol)
+    with pytest.raises(ValueError, match="name 3 different ones of roll_rate"):
+        with_speeds(BIKE, ("roll_rate", "speed", "yaw_rate"))
+
+
+def test_a_turn_depends_on_parameters_as_differences_say():
+    rtol = 1e-7
+
+    @jax.jit
+    def steer(bicycle):
+        turn = steady_turn(bicycle, {"steer": 0.3}, {"rear_wheel_rate": -12.0}, hold={"roll": 0.4})
+        return jnp.stack([turn["steer"], turn["yaw_rate"]])
+
+    found = jax.jit(jax.jacfwd(lambda x: steer(dataclasses.replace(BIKE, c=x[0], zB=x[1]))))(jnp.array([0.08, -0.9]))
+    for i, (name, x) in enumerate({"c": 0.08, "zB": -0.9}.items()):
+        h = 1e-4
+        a, b = (steer(dataclasses.replace(BIKE, **{name: x + s * h})) for s in (1, -1))
+        c, d = (steer(dataclasses.replace(BIKE, **{name: x + s * 2 * h})) for s in (1, -1))
+        np.testing.assert_allclose(found[:, i], (8 * (a - b) - (c - d)) / (12 * h), rtol=rtol)
+
+
+def test_faults_of_a_family_are_named(beside_capsize):
+    with pytest.raises(ValueError, match="`towards` is one of roll, steer, pitch"):
+        family(BIKE, beside_capsize, towards={"speed": 1})
+    with pytest.raises(ValueError, match="too much is held"):
+        family(BIKE, beside_capsize, towards={"roll": 1}, hold=("roll",))
+    straight = straight_ahead(BIKE, CAPSIZE)
+    at = steady_turn(BIKE, straight.q, straight.u, hold={"roll": 0.0, "rear_wheel_rate": straight.u[1]})
+    with pytest.raises(ValueError, match="more than one curve of steady motions passes here"):
+        family(BIKE, at, towards={"roll": 1})
