@@ -48,6 +48,7 @@ def fit(
     step: float | None = None,
     solver: diffrax.AbstractSolver | None = None,
     max_steps: int = 4096,
+    processes: bool = False,
     **options: Any,
 ) -> Fit:
     """The parameters of a system with which its motion is nearest to what was measured.
@@ -79,6 +80,9 @@ def fit(
     - `rtol`, `atol`, `step`, `solver`, `max_steps`: of the simulation. By default one step of Bosh3 between
         neighbouring samples where there are inputs, or two or four where that changes what is simulated; and Tsit5
         with a tolerance of 1e-6 elsewhere.
+    - `processes`: let all processes of `jax.distributed` simulate together. Each is started with the same script,
+        calls `jax.distributed.initialize(...)` before anything else, and this with all trials; each simulates a share
+        of the windows, all take the same steps and return the same `Fit`, that of one process alone.
 
     **Returns:** a `Fit`.
 
@@ -106,5 +110,6 @@ def fit(
         step=step,
         solver=solver,
         max_steps=max_steps,
+        processes=processes,
     )
     return METHODS[method](problem, **options)

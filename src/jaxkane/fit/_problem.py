@@ -18,6 +18,7 @@ from .._system import System
 from .._trajectory import Trajectory
 from ._blocks import Blocks
 from ._model import Model, Nuisance, Point, blocks_of, costs_of, rides_of, starts_of
+from ._parallel import blocks_of_all, check_same, costs_of_all
 from ._parameters import Delay, Parameters, Prior, parameters_of
 from ._trial import Trial
 from ._windows import Place, Windows, cut
@@ -43,6 +44,7 @@ class Problem:
     by_trial: Array
     trials: tuple[Trial, ...]
     places: tuple[Place, ...]
+    processes: bool = False
 
     @classmethod
     def of(
@@ -67,6 +69,7 @@ class Problem:
         step: float | None = None,
         solver: diffrax.AbstractSolver | None = None,
         max_steps: int = 4096,
+        processes: bool = False,
     ) -> Problem:
         """Pose a fit. The arguments are those of `jaxkane.fit.fit`."""
         trials = (trials,) if isinstance(trials, Trial) else tuple(trials)
@@ -116,7 +119,9 @@ class Problem:
         )
         if step is not None:
             windows = eqx.tree_at(lambda w: w.step, windows, jnp.full_like(windows.step, step))
-        problem = cls(model, windows, windows.by_trial, trials, places)
+        if processes:
+            check_same(model, windows)
+        problem = cls(model, windows, windows.by_trial, trials, places, processes)
         return problem._finer() if fixed and step is None else problem
 
     def _finer(self) -> Problem:
@@ -259,7 +264,8 @@ def linearize(problem: Problem, point: Point) -> Linearization | None:
     found = _starts(problem, point)
     if found is None:
         return None
-    return Linearization(*blocks_of(problem.model, problem.windows, problem.by_trial, point, *found))
+    blocks = blocks_of_all if problem.processes else blocks_of
+    return Linearization(*blocks(problem.model, problem.windows, problem.by_trial, point, *found))
 
 
 def cost(problem: Problem, point: Point) -> float:
@@ -267,7 +273,7 @@ def cost(problem: Problem, point: Point) -> float:
     found = _starts(problem, point)
     if found is None:
         return float("nan")
-    return float(jnp.sum(costs_of(problem.model, problem.windows, point, found[0])[0]))
+    return float(jnp.sum(_costs(problem, point, found[0])[0]))
 
 
 def simulated(problem: Problem, point: Point) -> np.ndarray:
@@ -275,7 +281,11 @@ def simulated(problem: Problem, point: Point) -> np.ndarray:
     found = _starts(problem, point)
     if found is None:
         return np.full(problem.windows.measured.shape, np.nan)
-    return np.asarray(costs_of(problem.model, problem.windows, point, found[0])[1])
+    return np.asarray(_costs(problem, point, found[0])[1])
+
+
+def _costs(problem: Problem, point: Point, starts: Array) -> tuple[Array, Array]:
+    return (costs_of_all if problem.processes else costs_of)(problem.model, problem.windows, point, starts)
 
 
 def _starts(problem: Problem, point: Point) -> tuple[Array, Array] | None:

@@ -1,0 +1,117 @@
+"""Two processes on the loopback fit as one does."""
+
+import json
+import os
+import socket
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+# Three pushed pendulums, windows of half a second: five a trial, so that the shares differ.
+SCRIPT = """
+import json, sys
+import jax
+import jaxkane as jk
+import numpy as np
+from scipy.integrate import solve_ivp
+
+class Pendulum(jk.System):
+    mass: jk.Scalar = jk.parameter(positive=True)
+    length: jk.Scalar = jk.parameter(positive=True)
+    coordinates, speeds, inputs = ("angle",), ("rate",), ("torque",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        rod = N.rotate(3, q[0], u[0])
+        return jk.Motion([jk.Body(self.mass, 0.0, O.fixed(-self.length * rod.y), rod)])
+
+    def loads(self, t, q, u, motion, inputs):
+        return [*jk.weight(motion, -9.81 * motion.N.y), jk.Torque(inputs["torque"] * motion.N.z, motion.bodies[0])]
+
+jk.configure(cache=sys.argv.pop(), verbose=False)
+process, port, given = (int(x) for x in sys.argv[1:])
+if port:
+    jax.config.update("jax_cpu_collectives_implementation", "gloo")
+    jax.distributed.initialize(f"127.0.0.1:{port}", num_processes=2, process_id=process)
+rng = np.random.default_rng(0)
+t = np.linspace(0.0, 2.5, 41)
+trials = []
+for k in range(3):
+    f = lambda t, y: [y[1], -9.81 / 1.1 * np.sin(y[0]) + 3 * np.sin(2 * t + k) / (2.0 * 1.1**2)]
+    ride = solve_ivp(f, (0.0, 2.5), [0.1 + 0.2 * k, 0.0], t_eval=t, rtol=1e-10, atol=1e-10).y
+    seen = {name: y + 0.01 * rng.normal(size=t.shape) for name, y in zip(("angle", "rate"), ride)}
+    trials.append(jk.fit.Trial(t, seen, {"torque": 3 * np.sin(2 * t + k)}, sigma=0.01, name=f"pendulum {k}"))
+windows = []
+from jaxkane.fit import _model
+original = _model.each
+_model.each = lambda f, args: (windows.append(jax.tree.leaves(args)[0].shape[0]), original(f, args))[1]
+try:
+    found = jk.fit.fit(
+        Pendulum(mass=1.5, length=1.0), trials[: given + process], ("mass", "length"),
+        unknown=("angle", "rate"), window=0.5, step=0.0625, sensor_bias=("rate",),
+        method="least_squares", processes=True)
+    values = {"estimates": found.estimates, "errors": found.standard_errors, "cost": found.cost,
+              "z": np.asarray(found.point.z).tolist(), "b": np.asarray(found.point.b).tolist(),
+              "windows": sorted(set(windows)), "status": found.status, "count": jax.process_count()}
+except ValueError as error:
+    values = {"error": str(error)}
+print(json.dumps(values))
+"""
+
+
+def free_port():
+    with socket.socket() as s:
+        s.bind(("127.0.0.1", 0))
+        return s.getsockname()[1]
+
+
+def run(script, port, processes, given=3):
+    clean = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
+    started = [
+        subprocess.Popen(
+            [sys.executable, script, str(i), str(port), str(given), script.parent / "cache"],
+            env=clean,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        for i in range(processes)
+    ]
+    try:
+        told = [process.communicate(timeout=120) for process in started]
+    finally:
+        for process in started:
+            process.kill()
+    assert [process.returncode for process in started] == [0] * processes, told
+    return [json.loads(out.splitlines()[-1]) for out, _ in told]
+
+
+@pytest.fixture(scope="module")
+def script(tmp_path_factory):
+    path = tmp_path_factory.mktemp("script") / "fit.py"
+    path.write_text(SCRIPT)
+    return path
+
+
+def test_two_processes_fit_as_one(script):
+    rtol = 1e-10
+    (alone,) = run(script, 0, 1)
+    both = run(script, free_port(), 2)
+    assert alone["status"] == "converged"
+    assert abs(alone["estimates"]["mass"] - 2.0) < 4 * alone["errors"]["mass"]
+    assert (alone["count"], alone["windows"]) == (1, [16])  # fifteen, and the next
+    for one in both:
+        assert (one["count"], one["windows"]) == (2, [9])  # eight, and the next
+        for name in ("cost", "z", "b"):
+            np.testing.assert_allclose(one[name], alone[name], rtol=rtol, atol=1e-12)
+        for name in ("mass", "length"):
+            np.testing.assert_allclose(one["estimates"][name], alone["estimates"][name], rtol=rtol)
+            np.testing.assert_allclose(one["errors"][name], alone["errors"][name], rtol=1e-8)
+    assert both[0] == both[1]
+
+
+def test_processes_with_different_trials_are_refused(script):
+    told = run(script, free_port(), 2, given=2)
+    assert all("the processes pose different problems" in one["error"] for one in told)
