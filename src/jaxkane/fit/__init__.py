@@ -4,6 +4,8 @@ from ._bfgs import bfgs as bfgs
 from ._bijections import Interval as Interval
 from ._bijections import PossibleBody as PossibleBody
 from ._density import log_density as log_density
+from ._design import Design as Design
+from ._design import design as design
 from ._fit import fit as fit
 from ._gradient_descent import gradient_descent as gradient_descent
 from ._identifiability import Direction as Direction
@@ -13,12 +15,15 @@ from ._least_squares import gauss_newton as gauss_newton
 from ._least_squares import least_squares as least_squares
 from ._model import Model as Model
 from ._model import Point as Point
+from ._multistart import MultiStart as MultiStart
+from ._multistart import multi_start as multi_start
 from ._parameters import Delay as Delay
 from ._parameters import Free as Free
 from ._parameters import Gain as Gain
 from ._parameters import Inertia as Inertia
 from ._problem import Problem as Problem
 from ._read import read_trials as read_trials
+from ._report import save_report as save_report
 from ._residual_tests import ResidualTest as ResidualTest
 from ._result import Fit as Fit
 from ._trial import Trial as Trial

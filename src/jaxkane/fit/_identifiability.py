@@ -71,7 +71,7 @@ class Identifiability:
     def __str__(self) -> str:
         lines = ["singular value   deviation   direction (scaled parameters)"]
         for s, deviation, row in zip(self.singular_values, self.deviations, self.vectors, strict=True):
-            lines.append(f"{s:14.4g}   {deviation:9.2g}   {_combination(self.names, row)}")
+            lines.append(f"{s:14.4g}   {deviation:9.2g}   {combination(self.names, row)}")
         return "\n".join([*lines, *self.messages])
 
 
@@ -167,12 +167,12 @@ def _direction(seen: Identifiability, i: int) -> Direction:
             f"{name} by {share * size * seen.scales[j]:+.2g}{' ' * bool(seen.units[j])}{seen.units[j]}"
             for j, (name, share) in zip(order, parts, strict=True)
         )
-        how = "changes nothing" if s == 0 else f"changes the residuals by no more than {size / deviation:.2g} deviations"
+        how = "changes nothing" if s == 0 else f"changes the fit by {size / deviation:.2g} standard deviations"
         text = f"{', '.join(name for name, _ in parts)} trade off: moving {together} together {how}."
     return Direction(float(s), float(deviation), parts, text)
 
 
-def _combination(names: Sequence[str], row: np.ndarray) -> str:
+def combination(names: Sequence[str], row: np.ndarray) -> str:
     """`0.71 mB - 0.70 zB`."""
     order = [i for i in np.argsort(-np.abs(row), kind="stable") if abs(row[i]) > 0.1]
     text = " ".join(f"{'-' if row[i] < 0 else '+'} {abs(row[i]):.2f} {names[i]}" for i in order)

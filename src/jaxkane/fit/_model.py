@@ -70,7 +70,7 @@ class Held(eqx.Module):
 class Model(eqx.Module):
     """A system, its free parameters, what else is unknown, and how measurements are compared with simulations.
 
-        residual = (gain * simulated + bias - measured) / sigma
+    residual = (gain * simulated + bias - measured) / sigma
     """
 
     system: System
@@ -130,8 +130,9 @@ class Model(eqx.Module):
         difference = jnp.where(window.weight > 0, (simulated - window.measured) * window.weight, 0.0)
         end = jnp.concatenate([ride.q[-1], ride.u[-1]])
         jump = jnp.where(window.linked > 0, (end - window.next_start)[self.unknown_places] / n.jump, 0.0)
-        # A prior of infinite width is a row of zeros; a trial's prior is counted in its first window.
-        of_start = z / n.start_deviation
+        # A prior of infinite width is a row of zeros. A trial's prior is counted in its first window, and so is that of
+        # a start from which all else follows.
+        of_start = jnp.where(window.first, z / n.start_deviation, 0.0) if n.chained else z / n.start_deviation
         of_trial = jnp.where(window.first, b / n.trial_deviation, 0.0)
         of_all = jnp.where(window.very_first, self.parameters.prior_residuals(x), 0.0)
         rows = [difference.ravel(), *([jump] if n.chained else []), of_start, of_trial, of_all]
@@ -153,6 +154,19 @@ def starts_of(model: Model, windows: Windows, point: Point) -> tuple[Array, Arra
     return jax.lax.map(start_of, (windows, point.z))
 
 
+def jacobian_of(model: Model, window: Windows, start: Array, start_dot: Array, z: Array, b: Array, x: Array):
+    """Residuals (m,) of a window, their derivatives (m, n_z + n_b + p), what was simulated and its status."""
+    n_z, n_b = z.shape[0], b.shape[0]
+    unit = jnp.eye(n_z + n_b + x.shape[0], dtype=z.dtype)
+    directions = (start_dot.T, unit[:, :n_z], unit[:, n_z : n_z + n_b], unit[:, n_z + n_b :])
+
+    def along(*direction):
+        residuals = lambda *unknowns: model.residuals(window, *unknowns)  # noqa: E731
+        return jax.jvp(residuals, (start, z, b, x), direction, has_aux=True)
+
+    return jax.vmap(along, out_axes=(None, -1, None))(*directions)
+
+
 @eqx.filter_jit
 def blocks_of(model: Model, windows: Windows, by_trial: Array, point: Point, starts: Array, starts_dot: Array):
     """Blocks, what was simulated (W, n_c, n_t) and the status of every window (W,)."""
@@ -161,14 +175,7 @@ def blocks_of(model: Model, windows: Windows, by_trial: Array, point: Point, sta
 
     def window_block(arguments):
         window, z, z_next, b, start, start_dot = arguments
-        unit = jnp.eye(n_z + n_b + point.x.shape[0], dtype=z.dtype)
-        directions = (start_dot.T, unit[:, :n_z], unit[:, n_z : n_z + n_b], unit[:, n_z + n_b :])
-
-        def along(*direction):
-            residuals = lambda *unknowns: model.residuals(window, *unknowns)  # noqa: E731
-            return jax.jvp(residuals, (start, z, b, point.x), direction, has_aux=True)
-
-        r, J, more = jax.vmap(along, out_axes=(None, -1, None))(*directions)  # (m,), (m, n_z + n_b + p)
+        r, J, more = jacobian_of(model, window, start, start_dot, z, b, point.x)
         by_next = _by_next(model, window, r.shape[0])[:, :n_next]
         A = jnp.column_stack([J[:, :n_z], by_next, J[:, n_z:], r + by_next @ z_next[:n_next]])
         # The triangle says all that the (m, k) matrix says about least squares. QR of NaN is not everywhere NaN.

@@ -92,11 +92,9 @@ class Problem:
         held = tuple(_names(system, "hold", hold, system.inputs))
         stuck = sorted(set(late) & set(held))
         if stuck:
-            raise ValueError(f"{stuck[0]} is held from sample to sample, so that nothing changes smoothly with a delay.")
+            raise ValueError(f"{stuck[0]} is held from sample to sample: nothing changes smoothly with its delay.")
         parameters = parameters_of(system, free).with_priors(priors or {})
-        windows, places = cut(
-            system, trials, window, channels, chained=continuity is not None, delayed=bool(late)
-        )
+        windows, places = cut(system, trials, window, channels, chained=continuity is not None, delayed=bool(late))
         fixed = step is not None or (rtol is None and any(np.ptp(x) > 0 for t in trials for x in t.inputs.values()))
         settings = settings_for(
             windows.t[0],
@@ -199,7 +197,7 @@ class Problem:
         T = len(np.unique(np.asarray(self.windows.trial)[seen]))
         finite = lambda x: int(np.isfinite(np.asarray(x)).sum())  # noqa: E731
         residuals = int(jnp.sum(self.windows.weight > 0)) + finite(self.parameters.prior_deviation)
-        residuals += int(seen.sum()) * finite(n.start_deviation) + T * finite(n.trial_deviation)
+        residuals += (T if n.chained else int(seen.sum())) * finite(n.start_deviation) + T * finite(n.trial_deviation)
         residuals += int(np.asarray(self.windows.linked)[seen].sum()) * finite(n.jump)
         unknowns = len(self.parameters.entries) + T * len(n.trial) + int(seen.sum()) * len(n.start)
         return residuals, unknowns

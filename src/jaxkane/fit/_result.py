@@ -139,7 +139,7 @@ class Fit:
 
     @property
     def robust(self) -> bool:
-        """Whether `intervals` are built on the clustered errors: residuals are not noise, and there are trials enough."""
+        """Whether `intervals` use the clustered errors: the residuals are not noise, and there are trials enough."""
         known = np.all(np.isfinite(self.clustered_covariance.diagonal()))
         return bool(known and abs(self.autocorrelation) > 0.2)
 
@@ -272,7 +272,7 @@ class Fit:
 
     def table(self, truth: Mapping[str, float] | System | None = None) -> str:
         """Name, start, estimate and standard error of every parameter; and the truth, where it is known."""
-        known = _truth(self, truth)
+        known = known_values(self, truth)
         head = f"{'parameter':<22}{'start':>12}{'estimate':>12}{'std. error':>12}"
         lines = [head + (f"{'truth':>12}{'error':>9}" if known else "")]
         errors, start = self.standard_errors, self.start
@@ -312,7 +312,8 @@ class Fit:
     __repr__ = __str__
 
 
-def _truth(fit: Fit, truth: Any) -> dict[str, float]:
+def known_values(fit: Fit, truth: Any) -> dict[str, float]:
+    """The true values of free parameters, from a system that has them or by name."""
     if truth is None or isinstance(truth, Mapping):
         return dict(truth or {})
     leaves = jax.tree.leaves(truth)

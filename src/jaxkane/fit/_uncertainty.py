@@ -1,4 +1,4 @@
-"""How far estimates can be trusted: robust errors, profiles of the likelihood, trials left out, a Gaussian posterior."""
+"""How far estimates can be trusted: robust errors, profile likelihood, trials left out, a Gaussian posterior."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def clustered_covariance(fit: Fit) -> np.ndarray:
 class Profile:
     """The sum of squares with one parameter held at values (n,), all others found anew.
 
-    `interval`: where `costs` exceed their minimum by no more than chance does at `level`; infinite on a side where they
-    do not come so far.
+    `interval`: where `costs` exceed their minimum by no more than chance does at `level`, as much more as the clustered
+    error exceeds the formal one where `Fit.robust`; infinite on a side where they do not come so far.
     """
 
     name: str
@@ -54,11 +54,11 @@ class Profile:
     estimates: tuple[dict[str, float], ...]
 
 
-def profile(fit: Fit, name: str, *, n: int = 9, span: float = 3.0, level: float = 0.95) -> Profile:
+def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level: float = 0.95) -> Profile:
     """The profile likelihood of one parameter: no assumption that the problem is linear between the ends.
 
-    **Arguments:** `name`; `n`: values, half on either side of the estimate; `span`: how many standard errors to either
-    side; `level` of the interval.
+    **Arguments:** `name`; `n`: values, half on either side of the estimate; `span`: how many formal standard errors to
+    either side, by default half as far again as the interval reaches; `level` of the interval.
 
     **Raises:** `ValueError` for a name that is not free, or a parameter that the data do not tell.
     """
@@ -69,6 +69,9 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float = 3.0, level: float 
     error, best = fit.standard_errors[name], fit.estimates[name]
     if not np.isfinite(error):
         raise ValueError(f"{name} has no influence on these data: its likelihood is the same everywhere.")
+    if span is None:
+        low, high = fit.intervals(level)[name]
+        span = 0.75 * (high - low) / error
     i = fit.names.index(name)
     prior = float(fit.parameters.prior_mean[i]), float(fit.parameters.prior_deviation[i])
     values, found = best + span * error * np.linspace(-1, 1, n | 1), {}
@@ -85,7 +88,9 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float = 3.0, level: float 
             found[float(value)], point = (cost, there.estimates), there.point
     values = np.array(sorted(found))
     costs = np.array([found[v][0] for v in values])
-    limit = costs.min() + fit.variance * fit.quantile(level) ** 2
+    # Where residuals are correlated, chance raises the cost by more than independent ones would.
+    inflation = (fit.clustered_errors[name] / error) ** 2 if fit.robust else 1.0
+    limit = costs.min() + inflation * fit.variance * fit.quantile(level) ** 2
     return Profile(name, values, costs, level, _crossings(values, costs, limit), tuple(found[v][1] for v in values))
 
 
@@ -150,7 +155,9 @@ def cross_validate(fit: Fit, folds: int | Sequence[Sequence[int]] | None = None)
         raise ValueError("Leaving trials out needs two at least: cut a long one with `Trial.between`.")
     if folds is None:
         folds = T if T <= 10 else 5
-    groups = [list(g) for g in folds] if not isinstance(folds, int) else [list(range(k, T, folds)) for k in range(folds)]
+    groups = (
+        [list(g) for g in folds] if not isinstance(folds, int) else [list(range(k, T, folds)) for k in range(folds)]
+    )
     held, estimates = np.full(T, np.nan), {name: [] for name in fit.names}
     for group in groups:
         others = fit.problem.only(set(range(T)) - set(group))

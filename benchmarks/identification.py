@@ -1,0 +1,144 @@
+"""Can identification be trusted? Figures on simulated and measured bicycles, with the time that they take.
+
+    unstable   the benchmark bicycle at 3 m/s, which falls over by itself, kept up by a rider for 10 s; noise and
+               offsets on roll rate, steer and steer rate; three parameters up to 30 % off, ten random first guesses; by
+               multiple shooting, and by a single shoot
+    coverage   at 1, 3, 5 and 7 m/s jointly, eight parameters: how often 95 % intervals hold the truth in repetitions
+    measured   31 rides of a steer-by-wire bicycle (`--data FOLDER`): damping alone, four parameters, trials left out
+
+Run:      python benchmarks/identification.py [unstable] [coverage] [measured] [--data FOLDER] [--repetitions 100]
+Takes:    on two cores a minute, half an hour, and a minute.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxkane as jk
+from jaxkane.catalog import WhippleBicycle
+from jaxkane.fit import Gain, Problem, Trial, cross_validate, fit_bicycle, least_squares, multi_start, read_trials
+
+jax.config.update("jax_enable_x64", True)
+
+NOISE = {"roll_rate": 0.01, "steer": 0.003, "steer_rate": 0.02}  # [rad/s], [rad], [rad/s]
+OFFSET = {"roll_rate": 0.02, "steer": -0.01, "steer_rate": 0.03}
+UNKNOWN = ("roll", "steer", "roll_rate", "steer_rate", "rear_wheel_rate")
+
+
+def ride(bicycle, speed, seconds, seed, rate=100):
+    """A ride in which a rider holds the roll angle near zero and pokes at the handlebar: true channels and torque."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, seconds, 1.0 / rate)
+    frequencies, phases = np.array([0.35, 0.8, 1.3, 2.1, 3.1]), rng.uniform(0.0, 2.0 * np.pi, 5)
+    pokes = jnp.asarray(1.2 * np.sin(2 * np.pi * frequencies * t[:, None] + phases).sum(axis=1))
+    gain = 25.0 + 60.0 / speed
+
+    def rider(t, now):
+        poke = jnp.interp(t, ts, pokes)
+        return gain * (now["roll"] + 0.4 * now["roll_rate"]) - 4.0 * now["steer_rate"] + poke
+
+    ts = jnp.asarray(t)
+    start = jk.assemble(bicycle, {"roll": 0.03}, {"rear_wheel_rate": -speed / bicycle.rR})
+    motion = jk.simulate(bicycle, start, t, {"steer_torque": rider}, rtol=1e-9, atol=1e-10)
+    assert motion.ok, motion
+    channels = {name: np.asarray(motion[name]) for name in (*NOISE, "roll")}
+    return t, channels, np.asarray(motion.inputs["steer_torque"])
+
+
+def noisy(t, channels, torque, rng, name, speed, offset=OFFSET):
+    measured = {c: channels[c] + offset.get(c, 0.0) + rng.normal(0.0, s, t.size) for c, s in NOISE.items()}
+    wheel = {"rear_wheel_rate": -speed / float(WhippleBicycle.benchmark().rR)}
+    return Trial(t, measured, {"steer_torque": torque}, sigma=NOISE, initial=wheel, name=name)
+
+
+def unstable():
+    truth, names = WhippleBicycle.benchmark(), ("IBxx", "zB", "c")
+    trial = noisy(*ride(truth, 3.0, 10.0, 1), np.random.default_rng(0), "3 m/s", 3.0)
+    options = {"unknown": UNKNOWN, "sensor_bias": tuple(NOISE)}
+    for window in (1.0, None):
+        problem = Problem.of(truth, trial, names, window=window, **options)
+        began = time.perf_counter()
+        try:
+            found = multi_start(problem, 10, spread=0.3, seed=2)
+        except ValueError as error:
+            print(f"\nwindow {window}: {error}")
+            continue
+        print(f"\nwindow {window} s: {time.perf_counter() - began:.1f} s with compilation\n{found}")
+        right = [
+            all(abs(f.estimates[n] / float(getattr(truth, n)) - 1) < 0.01 for n in names) for f in found.fits
+        ]
+        print(f"all three within 1 %: {sum(right)} of 10\n{found.best.table(truth)}")
+
+
+EIGHT = ("c", "lam", "IBxx", "IBxz", "IBzz", "zB", "IFyy", "steer_damping")
+
+
+def coverage(repetitions):
+    truth = eqx.tree_at(lambda b: b.steer_damping, WhippleBicycle.benchmark(), jnp.asarray(0.5))
+    rides = [(ride(truth, speed, 8.0, seed, rate=50), speed) for seed, speed in enumerate((1.0, 3.0, 5.0, 7.0))]
+    guess = truth
+    for i, name in enumerate(EIGHT):
+        value = getattr(truth, name) * (1.1 if i % 2 else 0.9)
+        guess = eqx.tree_at(lambda b, name=name: getattr(b, name), guess, value)
+    hits, scores, began = np.zeros(len(EIGHT), int), [], time.perf_counter()
+    for k in range(repetitions):
+        rng = np.random.default_rng(100 + k)
+        trials = [noisy(*r, rng, f"{speed:g} m/s", speed) for r, speed in rides]
+        problem = Problem.of(guess, trials, EIGHT, window=2.0, unknown=UNKNOWN, sensor_bias=tuple(NOISE))
+        result = least_squares(problem)
+        assert result.status == "converged", result
+        intervals, errors = result.intervals(0.95), result.standard_errors
+        hits += [low <= float(getattr(truth, n)) <= high for n, (low, high) in intervals.items()]
+        scores.append([(result.estimates[n] - float(getattr(truth, n))) / errors[n] for n in EIGHT])
+        if k == 0:
+            print(f"{result}\n{result.table(truth)}\n{result.report()}", flush=True)
+        if (k + 1) % 10 == 0:
+            print(f"{k + 1} repetitions, {time.perf_counter() - began:.0f} s: {dict(zip(EIGHT, hits.tolist()))}", flush=True)
+    z = np.array(scores)
+    for name, n, mean, std in zip(EIGHT, hits, z.mean(axis=0), z.std(axis=0)):
+        print(f"{name:<16}{n:>4} of {repetitions} intervals hold the truth; error in standard errors {mean:+.2f} ± {std:.2f}")
+
+
+def measured(folder):
+    values = {"IByy": 2.0, "IHyy": 0.01} | json.loads((folder / "parameters.json").read_text())
+    rides = read_trials(
+        folder / "free_responses.csv",
+        {"roll": "roll_angle", "steer": "steer_angle", "roll_rate": "roll_rate", "steer_rate": "steer_rate"},
+        inputs={"steer_torque": "steer_torque"},
+        initial={"speed": "speed_treadmill"},
+        sigma={"roll": 0.01, "steer": 0.02, "roll_rate": 0.1, "steer_rate": 0.2},
+        by="segment",
+    )
+    rides, bicycle = [r.between(0.0, 0.995) for r in rides], WhippleBicycle.from_parameters(values)
+    options = {"input_bias": ("roll_torque", "steer_torque"), "hold": ("steer_torque",), "method": "least_squares"}
+    four = (Gain("steer_torque"), "steer_damping", "IHzz", "c")
+    for free in (("steer_damping",), four, four, (*four, "IBxx")):
+        began = time.perf_counter()
+        result = fit_bicycle(rides, bicycle, free, **options)
+        print(f"\n{time.perf_counter() - began:.1f} s\n{result}")
+        if free == ("steer_damping",):
+            print(cross_validate(result))
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("what", nargs="*", default=["unstable", "coverage"], help="unstable, coverage, measured")
+    parser.add_argument("--data", type=Path, help="folder with free_responses.csv and parameters.json")
+    parser.add_argument("--repetitions", type=int, default=100)
+    arguments = parser.parse_args()
+    if "unstable" in arguments.what:
+        unstable()
+    if "coverage" in arguments.what:
+        coverage(arguments.repetitions)
+    if arguments.data:
+        measured(arguments.data)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,24 @@
+"""A mechanism for tests: a mass between a spring and a damper, pushed."""
+
+import jaxkane as jk
+
+
+class Cart(jk.System):
+    """m x'' + damping x' + stiffness x = push."""
+
+    mass: jk.Scalar = jk.parameter(1.0, positive=True)  # [kg]
+    stiffness: jk.Scalar = jk.parameter(4.0, positive=True)  # [N/m]
+    damping: jk.Scalar = jk.parameter(0.3)  # [N s/m]
+
+    coordinates = ("x",)
+    speeds = ("x_dot",)
+    inputs = ("push",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = jk.Point.at(u[0] * N.x, q[0] * N.x, "P")
+        return jk.Motion([jk.Body(self.mass, 0.0, P, name="cart")], frames={"N": N})
+
+    def loads(self, t, q, u, motion, inputs):
+        force = inputs["push"] - self.stiffness * q["x"] - self.damping * u["x_dot"]
+        return (jk.Force(force * motion.N.x, motion["cart"]),)

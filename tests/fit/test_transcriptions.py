@@ -1,0 +1,219 @@
+"""One residual, several transcriptions: chained windows, delays, gains, rates, gaps; and what is kept in a file."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from systems import Cart
+
+import jaxkane as jk
+from jaxkane.fit import Delay, Free, Gain, Problem, Trial, bfgs, gauss_newton, gradient_descent, least_squares
+from jaxkane.fit._blocks import Blocks, eliminate
+from jaxkane.fit._steps import settle
+
+TRUTH = Cart(mass=1.3, stiffness=5.0, damping=0.4)
+GUESS = Cart(mass=1.0, stiffness=4.0, damping=0.2)
+
+
+def record(t, seed, late=0.0, noise=0.01, system=TRUTH, **changes):
+    """A pushed cart: positions with noise; what was pushed acts `late` [s]."""
+    rng = np.random.default_rng(seed)
+    push = lambda t: np.sin(2.0 * t + seed) + 0.5 * np.sin(5.3 * t)  # noqa: E731
+    fine = np.linspace(t[0], t[-1], 1001)
+    signal = jk.Samples(jnp.asarray(fine), jnp.asarray(push(fine - late)))
+    ride = jk.simulate(system, jk.assemble(system, {"x": 0.2}), t, {"push": signal}, rtol=1e-9, atol=1e-9)
+    x = np.asarray(ride["x"]) + rng.normal(0.0, noise, t.size)
+    return Trial(t, {"x": x}, {"push": push(t)}, **{"sigma": 0.01, "name": f"run {seed}"} | changes)
+
+
+def near(result, truth=TRUTH, names=("mass", "stiffness", "damping"), within=3.5):
+    for name in names:
+        error = result.estimates[name] - float(getattr(truth, name))
+        assert abs(error) < within * result.standard_errors[name], (name, error, result.standard_errors[name])
+
+
+def test_a_chain_is_the_dense_solution():
+    tolerance = 1e-9
+    rng = np.random.default_rng(4)
+    W, n_z, n_b, n_x = 5, 2, 1, 2
+    trial, windows = np.array([0, 0, 0, 1, 1]), jnp.array([[0, 1, 2], [3, 4, W]])
+    k = 2 * n_z + n_b + n_x + 1
+    A = rng.normal(size=(W, 20, k))
+    A[[2, 4], :, n_z : 2 * n_z] = 0.0  # the last windows have no next
+    blocks = Blocks(jnp.linalg.qr(jnp.asarray(A), mode="r"), windows, n_z, n_z, n_b)
+    eliminated = eliminate(blocks, 0.0)
+    x, least = eliminated.step(1e-14)
+    z, b = eliminated.others(x)
+    dense = np.zeros((W * 20, W * n_z + 2 * n_b + n_x))
+    for w in range(W):
+        rows = slice(20 * w, 20 * w + 20)
+        dense[rows, n_z * w : n_z * w + n_z] = A[w, :, :n_z]
+        if w not in (2, 4):
+            dense[rows, n_z * w + n_z : n_z * w + 2 * n_z] = A[w, :, n_z : 2 * n_z]
+        dense[rows, W * n_z + trial[w]] = A[w, :, 2 * n_z]
+        dense[rows, -n_x:] = A[w, :, 2 * n_z + n_b : -1]
+    r = A[:, :, -1].ravel()
+    solution = np.linalg.lstsq(dense, -r, rcond=None)[0]
+    np.testing.assert_allclose(np.concatenate([z.ravel(), b.ravel(), x]), solution, rtol=tolerance, atol=tolerance)
+    np.testing.assert_allclose(least, np.sum((dense @ solution + r) ** 2), rtol=tolerance)
+    gradient = np.concatenate([g.ravel() for g in blocks.gradient])
+    np.testing.assert_allclose(gradient, dense.T @ r, rtol=tolerance, atol=tolerance)
+    determinant = np.linalg.slogdet(dense[:, :-n_x].T @ dense[:, :-n_x])[1]
+    np.testing.assert_allclose(eliminated.log_determinant, determinant, rtol=tolerance)
+
+
+def test_short_chained_windows_are_a_kalman_filter():
+    tolerance = 1e-6
+    t = np.arange(0.0, 2.0, 0.05)
+    trial = record(t, 1)
+    jump = {"x": 0.01, "x_dot": 0.05}
+    start = {"x": 0.5, "x_dot": 1.0}
+    problem = Problem.of(
+        TRUTH, trial, "mass", unknown=start, window=0.05, continuity=jump, rtol=1e-10, atol=1e-10, solver=None
+    )
+    least = settle(problem, problem.start, rtol=1e-12)[1].cost  # over all starts, the mass held
+
+    # The same motion by a Kalman filter: x_dot = F x + G push, push linear between samples.
+    m, k, c = (float(getattr(TRUTH, name)) for name in ("mass", "stiffness", "damping"))
+    F = np.array([[0.0, 1.0], [-k / m, -c / m]])
+    push, y, h = trial.inputs["push"], trial.measured["x"], 0.05
+    big = np.zeros((4, 4))
+    big[:2, :2], big[1, 2], big[2, 3] = F, 1.0 / m, 1.0  # push, and its rate
+    Phi = scipy.linalg.expm(big * h)
+    x, P = np.array([y[0], 0.0]), np.diag([0.5**2, 1.0])
+    Q, R, H = np.diag([jump["x"] ** 2, jump["x_dot"] ** 2]), 0.01**2, np.array([1.0, 0.0])
+    squares = 0.0
+    for i in range(len(t)):
+        S, e = H @ P @ H + R, y[i] - H @ x
+        squares += e**2 / S
+        K = P @ H / S
+        x, P = x + K * e, P - np.outer(K, H @ P)
+        if i + 1 < len(t):
+            x = (Phi @ np.append(x, [push[i], (push[i + 1] - push[i]) / h]))[:2]
+            # The last two samples share a window: nothing jumps between them.
+            P = Phi[:2, :2] @ P @ Phi[:2, :2].T + (Q if i + 2 < len(t) else 0.0)
+    assert least == pytest.approx(squares, rel=tolerance)
+
+
+@pytest.fixture(scope="module")
+def runs():
+    """Of two rates and lengths, one with an offset, a gap, and a delay of 30 ms in what was pushed."""
+    first = record(np.arange(0.0, 6.0, 0.02), 1, late=0.03)
+    second = record(np.arange(0.0, 4.0, 0.05), 2, late=0.03)
+    second.measured["x"][20:30] = np.nan
+    second.measured["x"] = 1.1 * second.measured["x"] + 0.05
+    return [first, second]
+
+
+FREE = ("mass", "stiffness", "damping", Delay("push"))
+UNKNOWN = {"unknown": ("x", "x_dot"), "sensor_bias": ("x",), "window": 2.0}
+
+
+@pytest.fixture(scope="module")
+def problem(runs):
+    return Problem.of(GUESS, runs, FREE, sensor_gain={"x": 0.1}, **UNKNOWN)
+
+
+@pytest.fixture(scope="module")
+def result(problem):
+    return least_squares(problem)
+
+
+def test_delays_gains_rates_and_gaps(result):
+    assert result.ok, result.message
+    near(result)
+    assert result.estimates["delay of push"] == pytest.approx(0.03, abs=0.005)
+    gains = [result.nuisance[name]["gain of x"] for name in result.trial_names]
+    assert gains[1] / gains[0] == pytest.approx(1.1, abs=0.03)
+    steps = np.asarray(result.problem.windows.step)
+    assert steps.max() < 0.051
+    assert steps.min() < 0.021
+
+
+def test_other_data_and_guesses_compile_nothing(result, runs, problem):
+    import jaxkane.fit._model as model
+
+    before = model.blocks_of._cached._cache_size()
+    again = [Trial(r.t, r.measured, r.inputs, sigma=0.02, name="again") for r in runs]
+    other = Problem.of(TRUTH, again, FREE, sensor_gain={"x": 0.2}, **UNKNOWN)
+    near(least_squares(other))
+    assert model.blocks_of._cached._cache_size() == before
+
+
+@pytest.mark.parametrize("method", [gauss_newton, bfgs])
+def test_other_methods_find_the_same(problem, result, method):
+    found = method(problem)
+    assert found.status == "converged"
+    assert found.cost == pytest.approx(result.cost, rel=1e-4)
+    for name, value in result.estimates.items():
+        assert found.estimates[name] == pytest.approx(value, abs=0.3 * result.standard_errors[name])
+
+
+@pytest.mark.parametrize("method", [least_squares, gradient_descent])
+def test_an_interrupted_fit_goes_on_from_its_file(problem, method, tmp_path):
+    whole = method(problem, steps=6)
+    calls = []
+
+    def interrupt(point, cost):
+        calls.append(cost)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+
+    path = tmp_path / "fit.npz"
+    assert method(problem, steps=6, checkpoint=path, callback=interrupt).status == "interrupted"
+    resumed = method(problem, steps=6, checkpoint=path)
+    assert resumed.history == pytest.approx(whole.history, rel=1e-12)
+    np.testing.assert_allclose(resumed.point.x, whole.point.x, rtol=1e-12)
+    with pytest.raises(ValueError, match="is the state of another fit"):
+        method(problem.only([0]), checkpoint=path)
+
+
+def test_a_start_from_which_the_end_is_out_of_reach():
+    # A single shoot over 8 s with a stiffness sixteen times too large lands in another minimum; growing horizons do not.
+    t = np.arange(0.0, 8.0, 0.05)
+    far = Cart(mass=1.3, stiffness=80.0, damping=0.4)
+    problem = Problem.of(far, record(t, 3), ("stiffness", "damping"), unknown=("x", "x_dot"))
+    grown = least_squares(problem, horizons=(0.1, 0.3))
+    near(grown, names=("stiffness", "damping"))
+    assert grown.cost < 1.3 * t.size
+    assert least_squares(problem).cost > 10 * grown.cost
+
+
+def test_process_noise_is_taken_for_what_it_is():
+    # A hidden force shakes the cart: one rigid motion through it is a wrong model, and its damping is biased.
+    t = np.arange(0.0, 8.0, 0.05)
+    rng = np.random.default_rng(8)
+    fine = np.arange(0.0, 8.0, 0.01)
+    trials = []
+    for seed in (1, 2, 3):
+        push = np.sin(2.0 * fine + seed)
+        shake = rng.normal(0.0, 1.0, fine.size)
+        ride = jk.simulate(TRUTH, jk.assemble(TRUTH, {"x": 0.2}), fine, {"push": push + shake})
+        x = np.asarray(ride["x"])[::5] + rng.normal(0.0, 0.003, t.size)
+        trials.append(Trial(t, {"x": x}, {"push": np.sin(2.0 * t + seed)}, sigma=0.003, name=f"run {seed}"))
+    options = {"unknown": ("x", "x_dot"), "window": 0.25}
+    jump = {"x": 0.005, "x_dot": 0.05}
+    names = ("mass", "stiffness", "damping")
+    chained = least_squares(Problem.of(GUESS, trials, names, continuity=jump, **options))
+    free = least_squares(Problem.of(GUESS, trials, names, **options))
+    single = least_squares(Problem.of(GUESS, trials, names, unknown=("x", "x_dot")))
+    near(chained)
+    assert all(chained.standard_errors[name] < free.standard_errors[name] for name in names)
+    assert single.variance > 5 * chained.variance
+
+
+def test_what_is_held_has_no_delay():
+    with pytest.raises(ValueError, match="push is held from sample to sample"):
+        Problem.of(GUESS, record(np.arange(0.0, 1.0, 0.1), 1), Delay("push"), hold=("push",))
+
+
+def test_tied_parameters_and_gains():
+    trial = record(np.arange(0.0, 4.0, 0.05), 4)
+    twice = Trial(trial.t, trial.measured, {"push": 0.5 * trial.inputs["push"]}, sigma=0.01)
+    free = (Free("stiffness", tied={"damping": 0.08}), Gain("push"))
+    problem = Problem.of(TRUTH, twice, free, unknown=("x", "x_dot"))
+    system, _ = problem.parameters.apply(TRUTH, jnp.array([0.1, 0.0]))
+    assert float(system.damping) == pytest.approx(0.08 * float(system.stiffness))
+    result = least_squares(problem)
+    assert result.estimates["gain of push"] == pytest.approx(2.0, abs=0.05)
+    assert float(result.system.damping) == pytest.approx(0.4, abs=0.02)
