@@ -10,8 +10,8 @@ open, turn and play, and a GIF.
     ride       roll, steer, yaw, place, ... over time                    rad, m
 
 Run:      python examples/animate_bicycle.py [--out FOLDER]
-Appears:  a few lines on the ride, the time to build the page, and the sizes of ride.html and ride.gif. In the page: drag
-          to turn, wheel to zoom, space to stop; "?" lists the keys.
+Appears:  a few lines on the ride, the time to build the page, and the sizes of ride.html and ride.gif. In the page:
+          drag to turn, wheel to zoom, space to stop; "?" lists the keys.
 Takes:    about half a minute, most of it compilation.
 """
 

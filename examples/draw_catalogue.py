@@ -1,21 +1,21 @@
 """What do the systems of the catalogue look like, and how do they move when left to themselves?
 
-Every entry of `jaxkane.catalog.CATALOG` is simulated from its own state, without inputs, and drawn as a stroboscopic
-photograph: the mechanism as a stick figure at a few instants, the last one brightest, over the traces of mass centres
-and of a few ends. Planar systems are seen from the front, spatial ones obliquely from above.
+Every entry of `jaxkane.catalog.CATALOG` is simulated from its own state, without inputs, and sketched as a stick
+figure. The sketch is animated, and drawn as a stroboscopic photograph: the figure at a few instants, the last one brightest,
+over the traces of mass centres and of a few ends. Planar systems are seen from the front, others obliquely from above.
 
     variable            meaning                                                               unit
     seconds             how long the shutter is open, for each system its own                 s
     flashes             instants at which the figure is drawn
     azimuth, elevation  from where it is seen: about the vertical, above the horizon          rad (given in degrees)
-    places, traces      points of the figure in the inertial frame, before the projection     m
+    scene               the figure's vertices in the parts that carry them, z upwards          m
 
 Run:      python examples/draw_catalogue.py [--out FOLDER] [--each]
-Appears:  a line for each simulation, and catalogue.png: a panel for each system with its name and its place in the
-          book (Kamman, Volume II, Unit 5). With --each, also NAME.png for each system. The aircraft are drawn ten times
-          too large for the way they fly; what a description leaves open (the length of a column, the rider's back) is
-          the draughtsman's. Red, green and blue are a body's axes 1, 2 and 3; a system that is not in the table
-          `PICTURES` shows those of every body.
+Appears:  a line for each simulation; catalogue.png: a panel for each system with its name and its place in the book
+          (Kamman, Volume II, Unit 5); and catalogue/NAME.html, an animation of each. With --each, also NAME.png for
+          each system. The aircraft are drawn ten times too large for the way they fly; what a description leaves open (the
+          length of a column, the rider's back) is the draughtsman's. Red, green and blue are a body's axes 1, 2 and 3;
+          a system that is not in the table `PICTURES` is drawn as `jaxkane.animate` draws it.
 Takes:    less than a minute, most of it compilation.
 """
 
@@ -35,37 +35,11 @@ import jaxkane as jk
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_disable_most_optimizations", True)  # compiles faster, and these runs are short
 
-GOLD, BLUE, WHITE, GREY, INK, NIGHT = "#f0ab45", "#4fa3e3", "#f4f6fa", "#5d6880", "#2b2f36", "#0d1220"
-AXES = ("#e8604c", "#58b368", "#4fa3e3")
+GOLD, BLUE, WHITE, GREY = "gold", "blue", "ink", "grey"  # names that a page reads according to its light
+INK, NIGHT = "#2b2f36", "#0d1220"
+AT_NIGHT = {"gold": "#f0ab45", "blue": "#4fa3e3", "ink": "#f4f6fa", "grey": "#5d6880"}
+AT_NIGHT |= {"red": "#e8604c", "green": "#58b368"}
 AROUND = np.linspace(0.0, 2.0 * np.pi, 49)
-
-
-class Sketch:
-    """The stick figure of one instant: lines of places in N, and the places that leave a trace."""
-
-    def __init__(self, motion: jk.Motion):
-        self.N = motion.N
-        self.lines: list[tuple[str, jax.Array]] = []  # colour, places (n, 3); grey is what stands still
-        self.dots: list[tuple[str, jax.Array]] = []
-        self.traces: list[tuple[str, jax.Array]] = []
-
-    def line(self, color: str, *places: jk.Vector) -> None:
-        self.lines.append((color, jnp.stack([place.to(self.N) for place in places])))
-
-    def circle(self, color: str, center: jk.Vector, a: jk.Vector, b: jk.Vector, radius: jk.Scalar | float) -> None:
-        """A circle in the plane of two unit vectors."""
-        round_ = jnp.cos(AROUND)[:, None] * a.to(self.N) + jnp.sin(AROUND)[:, None] * b.to(self.N)
-        self.lines.append((color, center.to(self.N) + radius * round_))
-
-    def dot(self, color: str, place: jk.Vector) -> None:
-        self.dots.append((color, place.to(self.N)))
-
-    def trace(self, color: str, *places: jk.Vector) -> None:
-        self.traces.extend((color, place.to(self.N)) for place in places)
-
-    def axes(self, center: jk.Vector, frame: jk.Frame, length: jk.Scalar | float) -> None:
-        for color, axis in zip(AXES, (frame.x, frame.y, frame.z)):
-            self.line(color, center, center + length * axis)
 
 
 def two_links(system, motion, s):
@@ -115,24 +89,6 @@ def airliner(system, motion, s):
         x, y, z = system.engine_x, side * system.engine_y, system.engine_z
         s.line(BLUE, at(x + 1.2, y, z), at(x - 1.2, y, z))
     s.trace(WHITE, G)
-
-
-def bicycle(system, motion, s):
-    B, C = motion["B"], motion["C"]
-    rear, front = motion["rear wheel"].center.position, motion["front wheel"].center.position
-    at = lambda x, height: rear + B.vector(x, 0.0, system.rR - height)  # noqa: E731  of the upright bicycle, in metres
-    S = motion["S"].position
-    head = S - 0.3 * C.z
-    s.circle(WHITE, rear, B.x, B.z, system.rR)
-    s.circle(WHITE, front, C.x, C.z, system.rF)
-    s.line(GOLD, rear, at(0.42, 0.28), S, at(0.26, 0.72), rear)
-    s.line(GOLD, at(0.42, 0.28), at(0.22, 0.88), at(0.48, 1.45))  # to the rider's shoulders
-    s.circle(GOLD, at(0.56, 1.62), B.x, B.z, 0.11)
-    s.line(BLUE, front, S, head)
-    s.line(BLUE, head - 0.28 * C.y, head + 0.28 * C.y)
-    s.trace(WHITE, motion["P"].position)
-    s.trace(BLUE, motion["Q"].position)
-    s.trace(GOLD, motion["rear frame"].center.position)
 
 
 def bar_with_piston(system, motion, s):
@@ -220,145 +176,120 @@ def bracket(system, motion, s):
     s.trace(BLUE, B)
 
 
-def axes_of_bodies(system, motion, s):
-    """For a system that nobody has drawn: every body's axes, as long as its radius of gyration."""
-    for body in motion.bodies:
-        G = body.center.position
-        inertia = sum(body.inertia[i][i] for i in range(3))
-        s.axes(G, body.frame, jnp.maximum(jnp.sqrt(inertia / 2.0 / body.mass), 0.05))
-        s.trace(GOLD, G)
-
-
 @dataclasses.dataclass(frozen=True)
 class Picture:
-    """How a system is photographed: figure, seconds, flashes, the axis that points up, and from where [degrees]."""
+    """How a system is shown: figure, seconds, flashes, from where [degrees], the axis that points up; and the speed and
+    the seconds of its animation."""
 
-    figure: Callable[[jk.System, jk.Motion, Sketch], None] = axes_of_bodies
+    figure: Callable[[jk.System, jk.Motion, jk.Sketch], None] | None = None
     seconds: float = 3.0
     flashes: int = 6
-    up: str = "z"
     azimuth: float = 35.0
     elevation: float = 22.0
+    up: str | None = None
+    speed: float = 1.0
+    watched: float = 6.0
 
 
-PLANAR = {"up": "y", "azimuth": 0.0, "elevation": 0.0}
+PLANAR = {"azimuth": -90.0, "elevation": 0.0}
 PICTURES = {
     "DoublePendulum": Picture(two_links, 0.9, 7, **PLANAR),
-    "RigidBody": Picture(free_body, 7.0, 4, azimuth=100.0, elevation=30.0),
+    "RigidBody": Picture(free_body, 7.0, 4, azimuth=100.0, elevation=30.0, watched=10.0),
     "RotatingFrameAndBar": Picture(arm_and_bar, 2.4, 6),
     "RotatingFrameAndBarChosenSpeeds": Picture(arm_and_bar, 2.4, 6),
-    "Aircraft": Picture(airliner, 2.2, 3, up="-z", azimuth=-10.0, elevation=35.0),
-    "AircraftEulerParameters": Picture(airliner, 2.2, 3, up="-z", azimuth=60.0, elevation=35.0),
-    "SpatialDoublePendulum": Picture(two_links, 1.2, 7, up="y"),
-    "WhippleBicycle": Picture(bicycle, 1.2, 4, up="-z", azimuth=55.0),
-    "BarWithPiston": Picture(bar_with_piston, 0.1, 5, **PLANAR),
+    "Aircraft": Picture(airliner, 2.2, 3, -10.0, 35.0, up="-z"),
+    "AircraftEulerParameters": Picture(airliner, 2.2, 3, 60.0, 35.0, up="-z"),
+    "SpatialDoublePendulum": Picture(two_links, 1.2, 7, -55.0),
+    "WhippleBicycle": Picture(None, 1.2, 4, 55.0),
+    "BarWithPiston": Picture(bar_with_piston, 0.1, 5, **PLANAR, speed=0.25, watched=2.0),
     "SliderWithPinnedBar": Picture(slider_and_bar, 0.9, 7, **PLANAR),
     "ShaftAndBar": Picture(shaft_and_bar, 2.0, 5),
-    "LightShaftAndBar": Picture(shaft_and_bar, 2.4, 5, azimuth=75.0),
+    "LightShaftAndBar": Picture(shaft_and_bar, 2.4, 5, 75.0),
     "DiskAndBar": Picture(disk_and_bar, 2.0, 6),
-    "SpinningTop": Picture(top, 0.2, 3, azimuth=60.0),
+    "SpinningTop": Picture(top, 0.2, 3, 60.0, speed=0.25, watched=1.5),
     "ColumnFrameAndDisk": Picture(column_frame_and_disk, 1.8, 4),
-    "Bracket": Picture(bracket, 1.2, 6, up="y"),
+    "Bracket": Picture(bracket, 1.2, 6, -55.0),
 }
 
 
-@dataclasses.dataclass(frozen=True)
-class Photograph:
-    """A figure for each flash and the traces, projected: colour and places (n, 2) [m]."""
-
-    flashes: list[tuple[list[tuple[str, np.ndarray]], list[tuple[str, np.ndarray]]]]
-    traces: list[tuple[str, np.ndarray]]
-
-
 def main(folder: Path, each: bool) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    photographs = {}
+    pages = folder / "catalogue"
+    pages.mkdir(parents=True, exist_ok=True)
+    scenes = {}
     for name, entry in jk.catalog.CATALOG.items():
         started = time.perf_counter()
-        photographs[name], motion = photograph(entry, PICTURES.get(name, Picture()))
-        print(f"{name + ':':33s}{motion}, {time.perf_counter() - started:.1f} s")
+        picture = PICTURES.get(name, Picture())
+        system, ts = (
+            entry.example(),
+            jnp.linspace(0.0, picture.watched, round(100 * picture.watched / picture.speed) + 1),
+        )
+        motion = jk.simulate(system, jk.State(jnp.array(entry.q), jnp.array(entry.u)), ts)
+        angles = {"azimuth": picture.azimuth, "elevation": picture.elevation}
+        animation = jk.animate(system, motion, picture.figure, speed=picture.speed, up=picture.up, **angles)
+        page = animation.save(pages / f"{name}.html")
+        scenes[name] = animation.scene
+        size = f"{page.stat().st_size / 1e3:.0f} kB"
+        print(f"{name + ':':33s}{motion}, {size}, {time.perf_counter() - started:.1f} s")
 
     if each:
-        for name, taken in photographs.items():
+        for name, scene in scenes.items():
             figure = plt.figure(figsize=(2.4, 2.4))
-            draw(figure.add_axes((0.0, 0.0, 1.0, 1.0)), taken)
+            draw(figure.add_axes((0.0, 0.0, 1.0, 1.0)), scene, PICTURES.get(name, Picture()))
             figure.savefig(folder / f"{name}.png", dpi=100, facecolor=NIGHT)
             plt.close(figure)
-    draw_montage(photographs, folder / "catalogue.png")
-    print(f"pictures: {folder / 'catalogue.png'}" + f" and {len(photographs)} more" * each)
-
-
-def photograph(entry: jk.catalog.Entry, picture: Picture) -> tuple[Photograph, jk.Trajectory]:
-    """Simulates an entry from its state and sketches it."""
-    system = entry.example()
-    ts = jnp.linspace(0.0, picture.seconds, 241)
-    motion = jk.simulate(system, jk.State(jnp.array(entry.q), jnp.array(entry.u)), ts)
-    at_rest = (0.0,) * (len(system.speeds) + len(system.dependent_speeds) + len(system.auxiliary_speeds))
-
-    def sketch(t, q):  # places do not depend on speeds
-        described = system.motion(t, q, at_rest)
-        drawn = Sketch(described)
-        picture.figure(system, described, drawn)
-        return drawn
-
-    # Compiled once for all instants; the colours are noted while it is traced.
-    colors: list[list[str]] = []
-
-    def places(t, q):
-        drawn = sketch(t, q)
-        parts = (drawn.lines, drawn.dots, drawn.traces)
-        colors[:] = [[color for color, _ in part] for part in parts]
-        return [[place for _, place in part] for part in parts]
-
-    seen = jax.tree.map(lambda x: np.asarray(x) @ view(picture).T, jax.jit(jax.vmap(places))(motion.t, motion.q))
-    lines, dots, traces = (list(zip(c, part)) for c, part in zip(colors, seen))
-    flashes = np.linspace(0, len(ts) - 1, picture.flashes).round().astype(int)
-    figures = [([(c, x[i]) for c, x in lines], [(c, x[i]) for c, x in dots]) for i in flashes]
-    return Photograph(figures, traces), motion
+    draw_montage(scenes, folder / "catalogue.png")
+    print(f"pictures: {folder / 'catalogue.png'}" + f" and {len(scenes)} more" * each + f"; animations: {pages}")
 
 
 def view(picture: Picture) -> np.ndarray:
-    """The projection (2, 3): to the right and upwards on the page, from components in N."""
+    """The projection (2, 3): to the right and upwards on the page, from a scene's components."""
     azimuth, elevation = np.deg2rad(picture.azimuth), np.deg2rad(picture.elevation)
     right = (-np.sin(azimuth), np.cos(azimuth), 0.0)
     above = (-np.sin(elevation) * np.cos(azimuth), -np.sin(elevation) * np.sin(azimuth), np.cos(elevation))
-    stand_up = {"z": np.eye(3), "-z": np.diag((1.0, -1.0, -1.0)), "y": np.roll(np.eye(3), 1, axis=0)}
-    return np.array((right, above)) @ stand_up[picture.up]
+    return np.array((right, above))
 
 
-def draw(axes: plt.Axes, taken: Photograph) -> None:
-    every = np.concatenate([x for lines, _ in taken.flashes for _, x in lines] + [x for _, x in taken.traces])
+def draw(axes, scene, picture: Picture) -> None:
+    seen = scene.at(np.linspace(0.0, picture.seconds, 241))[0] @ view(picture).T  # (241, V, 2)
+    places = lambda shape: seen[:, shape.first : shape.first + shape.count]  # noqa: E731
+    traces = [(shape, places(shape)[:, 0]) for shape in scene.shapes if shape.kind == "trace"]
+    figure = [(shape, places(shape)) for shape in scene.shapes if shape.kind != "trace"]
+    flashes = np.linspace(0, 240, picture.flashes).round().astype(int)
+    every = np.concatenate([x[flashes].reshape(-1, 2) for _, x in figure] + [x for _, x in traces])
     low, high = every.min(axis=0), every.max(axis=0)
     middle, reach = 0.5 * (low + high), 0.56 * float((high - low).max())
     axes.set(xlim=middle[0] + reach * np.array((-1, 1)), ylim=middle[1] + reach * np.array((-1, 1)))
     axes.set(aspect="equal", facecolor=NIGHT, xticks=[], yticks=[])
     axes.spines[:].set_visible(False)
 
-    still = [(color, x) for color, x in taken.flashes[-1][0] if color == GREY]
-    for color, x in still:
-        axes.plot(*x.T, color=color, lw=1.2, solid_capstyle="round")
-    for color, x in taken.traces:
-        axes.plot(*x.T, color=color, lw=1.0, alpha=0.55)
-    strengths = np.linspace(0.0, 1.0, len(taken.flashes)) ** 1.6
-    for strength, (lines, dots) in zip(strengths, taken.flashes):
+    for shape, x in traces:
+        axes.plot(*x.T, color=AT_NIGHT[shape.color], lw=1.0, alpha=0.55)
+    for i, strength in zip(flashes, np.linspace(0.0, 1.0, picture.flashes) ** 1.6):
         alpha = 0.16 + 0.84 * strength
-        for color, x in lines:
-            if color != GREY:
-                axes.plot(*x.T, color=color, lw=1.3 + 0.9 * strength, alpha=alpha, solid_capstyle="round")
-        for color, x in dots:
-            axes.plot(*x, "o", color=color, ms=3.0 + 1.5 * strength, alpha=alpha, mew=0)
+        for shape, x in figure:
+            color, moves = AT_NIGHT[shape.color], scene.owner[shape.first] >= 0
+            if not moves and i != flashes[-1]:
+                continue
+            if shape.kind == "line":
+                lw = (1.3 + 0.9 * strength if moves else 1.2) * min(shape.width, 2.0) / 2.0
+                closed = [*range(shape.count)] + [0] * shape.closed
+                axes.plot(*x[i, closed].T, color=color, lw=lw, alpha=alpha, solid_capstyle="round")
+            elif shape.kind == "pairs":
+                axes.plot(*x[i].reshape(-1, 2, 2).transpose(2, 1, 0), color=color, lw=0.4, alpha=alpha)
+            else:
+                axes.plot(*x[i, 0], "o", color=color, ms=3.0 + 1.5 * strength, alpha=alpha, mew=0)
 
 
-def draw_montage(photographs: dict[str, Photograph], path: Path) -> None:
+def draw_montage(scenes: dict, path: Path) -> None:
     columns = 4
-    rows = -(-len(photographs) // columns)
+    rows = -(-len(scenes) // columns)
     figure, panels = plt.subplots(
         rows, columns, figsize=(2.6 * columns, 2.95 * rows), layout="constrained", squeeze=False
     )
-    for axes in panels.flat[len(photographs) :]:
+    for axes in panels.flat[len(scenes) :]:
         axes.set_axis_off()
-    for axes, (name, taken) in zip(panels.flat, photographs.items()):
-        draw(axes, taken)
+    for axes, (name, scene) in zip(panels.flat, scenes.items()):
+        draw(axes, scene, PICTURES.get(name, Picture()))
         title = f"{jk.catalog.CATALOG[name].book}\n{name}"
         axes.set_title(title, fontsize=8.5, color=INK)
     figure.get_layout_engine().set(w_pad=0.08, h_pad=0.08)
