@@ -1,8 +1,9 @@
 """What do the systems of the catalogue look like, and how do they move when left to themselves?
 
 Every entry of `jaxkane.catalog.CATALOG` is simulated from its own state, without inputs, and sketched as a stick
-figure. The sketch is animated, and drawn as a stroboscopic photograph: the figure at a few instants, the last one brightest,
-over the traces of mass centres and of a few ends. Planar systems are seen from the front, others obliquely from above.
+figure. The sketch is animated, and drawn as a stroboscopic photograph: the figure at a few instants, the last one
+brightest, over the traces of mass centres and of a few ends. Planar systems are seen from the front, others obliquely
+from above.
 
     variable            meaning                                                               unit
     seconds             how long the shutter is open, for each system its own                 s
@@ -13,9 +14,9 @@ over the traces of mass centres and of a few ends. Planar systems are seen from 
 Run:      python examples/draw_catalogue.py [--out FOLDER] [--each]
 Appears:  a line for each simulation; catalogue.png: a panel for each system with its name and its place in the book
           (Kamman, Volume II, Unit 5); and catalogue/NAME.html, an animation of each. With --each, also NAME.png for
-          each system. The aircraft are drawn ten times too large for the way they fly; what a description leaves open (the
-          length of a column, the rider's back) is the draughtsman's. Red, green and blue are a body's axes 1, 2 and 3;
-          a system that is not in the table `PICTURES` is drawn as `jaxkane.animate` draws it.
+          each system. The aircraft are drawn ten times too large for the way they fly; what a description leaves open
+          (the length of a column, the rider's back) is the draughtsman's. Red, green and blue are a body's axes 1, 2
+          and 3; a system that is not in the table `PICTURES` is drawn as `jaxkane.animate` draws it.
 Takes:    less than a minute, most of it compilation.
 """
 
