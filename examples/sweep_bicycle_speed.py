@@ -22,7 +22,6 @@ import time
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.collections import LineCollection
@@ -38,30 +37,29 @@ MAP = plt.get_cmap("turbo")
 
 def main(folder: Path) -> None:
     bicycle = jk.catalog.WhippleBicycle.benchmark()
-    speed = jnp.linspace(1.0, 10.0, 200)
+    speed = np.linspace(1.0, 10.0, 200)
 
-    def pushed(speed):  # the wheels' angles fall when riding forward
-        return jk.assemble(bicycle, {}, {"roll_rate": PUSH, "rear_wheel_rate": -speed / bicycle.rR})
+    def pushed(bicycle, row):  # the wheels' angles fall when riding forward
+        return jk.assemble(bicycle, {}, {"roll_rate": PUSH, "rear_wheel_rate": -row["speed"] / bicycle.rR})
 
-    states = jax.vmap(pushed)(speed)
-    ts = jnp.linspace(0.0, 10.0, 501)
+    ts = np.linspace(0.0, 10.0, 501)
 
     for attempt in ("first, with compilation", "again"):
         started = time.perf_counter()
-        rides = jax.block_until_ready(jk.sweep.sweep(bicycle, states, ts))
+        rides = jk.sweep.sweep(bicycle, pushed, ts, table={"speed": speed})
         seconds = time.perf_counter() - started
         print(
             f"{attempt + ':':25s}{len(speed)} rides of 10 s in {seconds:5.2f} s, {len(speed) / seconds:4.0f} a second"
         )
 
-    print_endings(np.asarray(speed), rides)
+    print_endings(speed, rides)
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / "sweep_bicycle_speed.png"
-    draw(np.asarray(speed), rides, path)
+    draw(speed, rides, path)
     print(f"picture: {path}")
 
 
-def print_endings(speed: np.ndarray, rides: jk.Trajectory) -> None:
+def print_endings(speed: np.ndarray, rides: jk.sweep.Sweep) -> None:
     reasons, t_end = np.asarray(rides.reason), np.asarray(rides.t_end)
     print(f"\n{'the ride':18s}{'rides':>6s}{'speeds [m/s]':>16s}{'ended at [s]':>16s}")
     for reason in dict.fromkeys(reasons):
@@ -71,7 +69,7 @@ def print_endings(speed: np.ndarray, rides: jk.Trajectory) -> None:
     print()
 
 
-def draw(speed: np.ndarray, rides: jk.Trajectory, path: Path) -> None:
+def draw(speed: np.ndarray, rides: jk.sweep.Sweep, path: Path) -> None:
     t, roll = np.asarray(rides.t[0]), np.rad2deg(np.asarray(rides["roll"]))  # (n_t,) (b,n_t) [deg]
     plt.rcParams.update({"font.size": 10, "axes.spines.top": False, "axes.spines.right": False})
     figure, (over_time, over_speed) = plt.subplots(

@@ -203,6 +203,40 @@ def test_two_devices_give_the_same(rides, script, tmp_path):
     np.testing.assert_array_equal(np.load(tmp_path / "q.npy"), rides.q)
 
 
+def test_two_devices_find_dependent_coordinates():
+    code = """
+import jaxkane as jk, numpy as np, jax
+jk.configure(cache=False, devices=2, verbose=False)
+
+class Bead(jk.System):  # on a ring
+    mass: jk.Scalar = jk.parameter(1.0)
+    coordinates, speeds = ("x", "y"), ("rate",)
+    dependent_coordinates = ("y",)
+
+    def q_dot(self, t, q, u):
+        return -q[1] * u[0], q[0] * u[0]
+
+    def configuration_constraints(self, t, q):
+        return [q[0] * q[0] + q[1] * q[1] - 1.0]
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        r = q[0] * N.x + q[1] * N.y
+        return jk.Motion([jk.Body(self.mass, 0.0, O.moving(r, -q[1] * u[0] * N.x + q[0] * u[0] * N.y))])
+
+table = {"x": np.linspace(0.0, 0.9, 40)}
+state = jk.State(np.array([0.0, 0.7]), np.ones(1))
+rides = jk.sweep.sweep(Bead(), state, np.linspace(0.0, 1.0, 3), table=table)
+assert len(jax.local_devices()) == 2
+np.testing.assert_allclose(rides["y"][:, 0], np.sqrt(1 - table["x"] ** 2), atol=1e-12)
+angle = np.arccos(table["x"]) + 1.0
+np.testing.assert_allclose(rides.q[:, -1], np.stack([np.cos(angle), np.sin(angle)], axis=1), atol=1e-7)
+"""
+    clean = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    run = subprocess.run([sys.executable, "-c", code], env=clean, capture_output=True, text=True, timeout=120)
+    assert run.returncode == 0, run.stderr
+
+
 def test_a_worker_that_is_killed_is_survived(rides, folder, tmp_path):
     distributed = pytest.importorskip("distributed")
     workers = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "host": "127.0.0.1"}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -43,7 +42,7 @@ def members_of(system: Any, state: Any, inputs: Inputs, table: Table | None, ts:
     columns = {name: np.asarray(x, dtype=ts.dtype) for name, x in table.numbers.items()} if table else {}
     signals = inputs if callable(inputs) else _signals(inputs, system, columns, ts)
     tree = (system, state, signals, columns)
-    is_member = _batches(tree, None if table is None else len(table))
+    is_member = _batches(tree)
     members, shared = eqx.partition(tree, jax.tree.map(lambda x: id(x) in is_member, tree))
     lengths = {is_member[id(x)]: x.shape[0] for x in jax.tree.leaves(members)}
     if table is not None and not columns:
@@ -56,30 +55,41 @@ def members_of(system: Any, state: Any, inputs: Inputs, table: Table | None, ts:
     if len(set(lengths.values())) > 1:
         listed = ", ".join(f"{name} ({n})" for name, n in lengths.items())
         raise ValueError(f"sweep: the batches differ in length: {listed}.")
-    _check(members, shared)
+    _check(members, shared, ts[0])
     return members, shared, next(iter(lengths.values()))
 
 
-def member(own: Tree, shared: Tree) -> tuple[System, State, Any]:
-    """System, state and signals of one member."""
-    return _member(*eqx.combine(own, shared))[:3]
+def system_and_signals(own: Tree, shared: Tree) -> tuple[System, Any]:
+    """System and signals of one member."""
+    system, _, signals, columns = eqx.combine(own, shared)
+    system, _ = _system(system, Row(columns))
+    if not callable(signals):
+        signals = {**signals, **{name: columns[name] for name in system.inputs if name in columns}}
+    return system, signals
 
 
-def _member(system: Any, state: Any, signals: Any, columns: dict[str, Any]):
-    row = Row(columns)
+def start_of(own: Tree, shared: Tree, t: Any) -> State:
+    """The first state of one member, at the time t."""
+    system, state, _, columns = eqx.combine(own, shared)
+    return _start(system, state, Row(columns), t)
+
+
+def _system(system: Any, row: Row) -> tuple[System, dict[str, Any]]:
+    """The system of a row, and the parameters that were set by name."""
     if not isinstance(system, System):
         system = system(row)
-    parameters = {name: columns[name] for name in parameter_info(system) if name in columns}
-    system = replace(system, **parameters)
-    state = state(system, row) if not isinstance(state, State) else state
-    q, u = ({name: columns[name] for name in names if name in columns} for names in (system.coordinates, system.speeds))
+    given = {name: dict.__getitem__(row, name) for name in parameter_info(system) if name in row}
+    return replace(system, **given), given
+
+
+def _start(system: Any, state: Any, row: Row, t: Any) -> State:
+    system, parameters = _system(system, row)
+    state = state if isinstance(state, State) else state(system, row)
+    q, u = ({n: dict.__getitem__(row, n) for n in names if n in row} for names in (system.coordinates, system.speeds))
     state = State(_set(state.q, q, system.coordinates), _set(state.u, u, system.speeds))
     if system.dependent_coordinates and (q or parameters):  # they follow from the others
-        state = assemble(system, state.q, state.u)
-    constants = {name: columns[name] for name in system.inputs if name in columns}
-    if not callable(signals):
-        signals = {**signals, **constants}
-    return system, state, signals, (row, {*parameters, *q, *u, *constants})
+        state = assemble(system, state.q, state.u, t)
+    return state
 
 
 def _set(values: Any, given: dict[str, Any], names: tuple[str, ...]) -> Any:
@@ -88,17 +98,22 @@ def _set(values: Any, given: dict[str, Any], names: tuple[str, ...]) -> Any:
     return values
 
 
-def _check(members: Tree, shared: Tree) -> None:
+def _check(members: Tree, shared: Tree, t: Any) -> None:
     """Make one member in the abstract, and refuse what does not fit."""
 
     def trial(own):
-        system, state, signals, account = _member(*eqx.combine(own, shared))
-        seen.append((system, signals, account))
-        return checked_state(system, state)
+        system, state, signals, columns = eqx.combine(own, shared)
+        row = Row(columns)
+        start = _start(system, state, row, t)
+        system, _ = _system(system, row)
+        seen.append((system, signals, row))
+        return checked_state(system, start)
 
     seen: list[Any] = []
     jax.eval_shape(trial, jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), members))
-    system, signals, (row, applied) = seen[0]
+    system, signals, row = seen[0]
+    applied = set(row) & {*parameter_info(system), *system.coordinates, *system.speeds, *system.inputs}
+    applied -= set(system.dependent_coordinates)
     name = type(system).__name__
     if callable(signals) and applied & set(system.inputs):
         listed = ", ".join(sorted(applied & set(system.inputs)))
@@ -138,7 +153,7 @@ def _signals(inputs: Inputs, system: Any, columns: dict[str, Any], ts: Any) -> A
     return known
 
 
-def _batches(tree: Tree, n: int | None) -> dict[int, str]:
+def _batches(tree: Tree) -> dict[int, str]:
     """Name of every leaf that has a leading axis of members, by its identity."""
     system, state, signals, columns = tree
     found = {id(column): name for name, column in columns.items()}
@@ -157,6 +172,3 @@ def _batches(tree: Tree, n: int | None) -> dict[int, str]:
             if isinstance(values, jax.Array) and values.ndim == (2 if isinstance(signal, Samples) else 1):
                 found[id(values)] = name
     return found
-
-
-StateOf = Callable[[System, Row], State]

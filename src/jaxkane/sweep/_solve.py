@@ -18,8 +18,9 @@ from jax.sharding import AxisType, Mesh
 from jax.sharding import PartitionSpec as P
 
 from .._simulate import Settings, solve
+from .._system import State
 from .._trajectory import Trajectory
-from ._members import member
+from ._members import start_of, system_and_signals
 
 GROUP = 32
 
@@ -45,10 +46,14 @@ class Job(eqx.Module):
     reduce: Callable[[Trajectory], Any] | None
     mesh: Mesh | None = eqx.field(static=True)
 
-    def one(self, own: Any) -> Part:
+    def whole(self, own: Any) -> Part:
         """The motion of one member."""
-        system, state, signals = member(own, self.shared)
-        ride = solve(system, state, self.ts, signals, self.settings)
+        return self.from_start(own, start_of(own, self.shared, self.ts[0]))
+
+    def from_start(self, own: Any, start: State) -> Part:
+        """The motion of one member from its first state."""
+        system, signals = system_and_signals(own, self.shared)
+        ride = solve(system, start, self.ts, signals, self.settings)
         if self.reduce is None:
             values = (ride.q, ride.u, ride.u_dep, ride.inputs)
         else:
@@ -63,7 +68,7 @@ class Job(eqx.Module):
         lanes = size if size <= GROUP and self.mesh is None else unit * -(-size // unit)
         places = np.minimum(np.arange(lanes), n - 1)
         members = jax.tree.map(lambda x: jnp.asarray(x if lanes == n else x[places]), members)
-        part = _solve(members, self)
+        part = _solve(members, _starts(members, self), self)
         return part if lanes == n else jax.tree.map(lambda x: x[:n], part)
 
 
@@ -76,21 +81,26 @@ def mesh_of(devices: Sequence[Any] | None) -> Mesh | None:
 
 
 @eqx.filter_jit
-def _solve(members: Any, job: Job) -> Part:
+def _starts(members: Any, job: Job) -> State:
+    # A program of its own: lineax, which Newton's method calls, cannot be traced within shard_map.
+    return jax.vmap(lambda own: start_of(own, job.shared, job.ts[0]))(members)
+
+
+@eqx.filter_jit
+def _solve(members: Any, starts: State, job: Job) -> Part:
     arrays, static = eqx.partition(job, eqx.is_array)
 
-    def on_one_device(members, arrays):
-        job = eqx.combine(arrays, static)
-        n = jax.tree.leaves(members)[0].shape[0]
+    def on_one_device(members, starts, arrays):
+        one = eqx.combine(arrays, static).from_start
+        n = starts.q.shape[0]
         if jax.default_backend() != "cpu":
-            return jax.vmap(job.one)(members)
+            return jax.vmap(one)(members, starts)
         group = min(n, GROUP)  # n is a multiple of it
-        groups = jax.tree.map(lambda x: x.reshape(n // group, group, *x.shape[1:]), members)
-        return jax.tree.map(lambda x: x.reshape(n, *x.shape[2:]), jax.lax.map(jax.vmap(job.one), groups))
+        groups = jax.tree.map(lambda x: x.reshape(n // group, group, *x.shape[1:]), (members, starts))
+        return jax.tree.map(lambda x: x.reshape(n, *x.shape[2:]), jax.lax.map(lambda g: jax.vmap(one)(*g), groups))
 
     if job.mesh is None:
-        return on_one_device(members, arrays)
-    across = jax.shard_map(
-        on_one_device, mesh=job.mesh, in_specs=(P("members"), P()), out_specs=P("members"), check_vma=False
-    )
-    return across(members, arrays)
+        return on_one_device(members, starts, arrays)
+    each, all_ = P("members"), P()
+    across = jax.shard_map(on_one_device, mesh=job.mesh, in_specs=(each, each, all_), out_specs=each, check_vma=False)
+    return across(members, starts, arrays)

@@ -128,7 +128,7 @@ def _finished(
     if kept is None or not there:
         return
     own = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), members_at(0))
-    like = jax.eval_shape(job.one, own)
+    like = jax.eval_shape(job.whole, own)
     for start in there:
         part = kept.read(start, like)
         if part is not None:
