@@ -196,7 +196,10 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
 
     # A first step, right or wrong by a factor of ten, spares the two more copies of the right-hand side that diffrax
     # would compile to choose one.
-    step = jnp.minimum((ts[-1] - ts[0]) / 1000, ts[1] - ts[0]) if settings.step is None else settings.step
+    # A fixed step is spread evenly over the whole time: a rounding error must not make it one step more, after which no
+    # step would end where a sample of an input stands.
+    several = 1.0 + jnp.finfo(ts.dtype).eps ** 0.5
+    step = jnp.minimum((ts[-1] - ts[0]) / 1000, ts[1] - ts[0]) if settings.step is None else several * settings.step
     if settings.step is None:
         smallest = 1e3 * jnp.finfo(ts.dtype).eps * (ts[-1] - ts[0])
         controller = diffrax.PIDController(rtol=settings.rtol, atol=settings.atol, dtmin=smallest, force_dtmin=False)
