@@ -162,8 +162,9 @@ class Animation:
         return page
 
     def _repr_html_(self) -> str:
+        page = html.escape(self.html()).replace("\n", "&#10;")  # one line: a page of Markdown keeps it whole
         return (
-            f'<iframe srcdoc="{html.escape(self.html())}" title="{html.escape(self.scene.title, quote=True)}" '
+            f'<iframe srcdoc="{page}" title="{html.escape(self.scene.title, quote=True)}" '
             f'style="width: 100%; height: {self.height}px; border: 0" loading="lazy" allowfullscreen></iframe>'
         )
 

@@ -1,0 +1,40 @@
+"""The documentation's pages can be typed in as they stand, one after the other, and lead somewhere."""
+
+import re
+from pathlib import Path
+
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
+PAGES = sorted(path for path in DOCS.glob("*.md") if path.name != "describing.md")  # see test_documentation.py
+
+
+@pytest.mark.parametrize("page", PAGES, ids=[page.stem for page in PAGES])
+def test_a_page_runs(page, tmp_path, monkeypatch):
+    blocks = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    assert blocks, f"{page.name} has nothing to type in"
+    monkeypatch.chdir(tmp_path)
+    names = {}
+    for block in blocks:
+        exec(compile(block, page.name, "exec"), names)
+    plt.close("all")
+
+
+def test_links_and_pictures_are_there():
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for target in re.findall(r"\]\(([^)#:]+)\)", text) + re.findall(r'src="([^"]+)"', text):
+            if not target.startswith("reference/"):  # made when the site is built
+                assert (DOCS / target).exists(), f"{page.name}: {target}"
+
+
+def test_the_gallery_shows_the_whole_catalogue():
+    from jaxkane.catalog import CATALOG
+
+    shown = re.findall(r'src="catalogue/(\w+)\.png"', (DOCS / "catalogue.md").read_text(encoding="utf-8"))
+    assert shown == list(CATALOG)
