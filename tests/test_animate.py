@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import browser
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -163,6 +164,18 @@ def test_ten_seconds_of_riding_are_small_and_quick(ride, weaving):
     again = jk.animate(*ride).html()
     assert time.perf_counter() - started < 2.0
     assert again == weaving.html()
+
+
+def test_single_precision_far_from_the_origin(ride):
+    """Places that are known to 0.03 mm only, a kilometre away, are still those of rigid bodies: within 3 mm."""
+    system, trajectory = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == float else x, ride)
+    far = trajectory.q.at[:, 6].add(jnp.float32(1000.0))
+    animation = jk.animate(system, eqx.tree_at(lambda r: r.q, trajectory, far))
+    scene, near = animation.scene, jk.animate(*ride).scene
+    assert scene.position.shape[1] <= near.position.shape[1]
+    assert len(animation.html()) < 150e3
+    x, expected = (s.at(3.0)[0] for s in (scene, near))
+    np.testing.assert_allclose(x - [1000.0, 0.0, 0.0], expected, atol=3e-3)
 
 
 def test_a_figure_of_ones_own(swing):

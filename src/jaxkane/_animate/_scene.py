@@ -91,7 +91,8 @@ class Builder:
 
     def __init__(self, orientation: np.ndarray, place: np.ndarray, turned: np.ndarray, scale: float):
         self.n_t = len(place)
-        self.tolerance = _SAME * scale
+        # Far from the origin, and in single precision above all, nothing stands perfectly still.
+        self.tolerance = _SAME * scale + 16.0 * float(np.finfo(place.dtype).eps) * float(np.abs(place).max(initial=0.0))
         # Bodies whose frames do not spin with them come twice: as their frame, and turned.
         self.rotations = [*np.moveaxis(orientation, 1, 0), *np.moveaxis(turned, 1, 0)]
         self.origins = [*np.moveaxis(place, 1, 0)] * 2
@@ -118,16 +119,16 @@ class Builder:
         `body` says which part they are to turn with; they are given as if it did not spin.
         """
         if body is not None:
-            self.local(self._seen_from(self.rotations[body], self.origins[body], x)[0], body)
+            self.local(self._seen_from(self.rotations[body], self.origins[body], x).mean(axis=0), body)
             return
         if np.abs(x - x[:1]).max() <= self.tolerance:
-            for vertex in x[0]:
+            for vertex in x.mean(axis=0):
                 self._keep(vertex, "fixed", FIXED)
             return
         for k, (R, origin) in enumerate(zip(self.rotations, self.origins, strict=True)):
             seen = self._seen_from(R, origin, x)
             if np.abs(seen - seen[:1]).max() <= self.tolerance:
-                for vertex in seen[0]:
+                for vertex in seen.mean(axis=0):
                     self._keep(vertex, "part", k)
                 return
         if x.shape[1] == 1:
@@ -144,7 +145,7 @@ class Builder:
             if np.abs(seen - seen[:1]).max() <= self.tolerance:
                 self.rotations.append(R)
                 self.origins.append(x[:, 0])
-                for vertex in seen[0]:
+                for vertex in seen.mean(axis=0):
                     self._keep(vertex, "part", len(self.rotations) - 1)
                 return True
         return False
