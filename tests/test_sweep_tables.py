@@ -29,6 +29,7 @@ def test_a_grid_has_an_axis_for_every_name(rides):
     assert GRID.dims == rides.dims == ("theta1", "mass", "elbow_torque")
     assert rides.shape == rides.status.shape == (12, 3, 2)
     assert rides["theta2"].shape == rides.t.shape == (12, 3, 2, 6)
+    assert rides.names[0] == ("theta1", "theta2")
     np.testing.assert_array_equal(rides["mass"][0, :, 0], [1.0, 2.0, 3.0])
     np.testing.assert_array_equal(rides["theta1"][..., 0], rides.table["theta1"].reshape(12, 3, 2))
     assert repr(rides) == "Sweep(72 members: theta1 (12) x mass (3) x elbow_torque (2); 72 completed)"

@@ -23,8 +23,8 @@ class Sweep(eqx.Module):
 
     Attributes:
 
-    - `trajectory`: all motions as one `Trajectory` with leading axes; `t`, `q`, `u`, `u_dep`, `inputs` are its arrays.
-        None where `reduce` was given.
+    - `trajectory`: all motions as one `Trajectory` with leading axes, for whatever wants such (`constraint_forces`);
+        `t`, `q`, `u`, `u_dep`, `inputs`, `names` are its own. None where `reduce` was given.
     - `values`: what `reduce` made of every motion, with leading axes; else None.
     - `status`, `t_end` [s], `stats`: how, when and in how many steps each ended; `ok`, `reason`: as of a `Trajectory`.
     - `table`: what was swept; `dims`, `shape`: names and lengths of the leading axes.
@@ -88,6 +88,11 @@ class Sweep(eqx.Module):
     @property
     def inputs(self) -> dict[str, Any]:
         return self._ride.inputs
+
+    @property
+    def names(self) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+        """Of coordinates, independent and dependent speeds."""
+        return self._ride.names
 
     @property
     def ok(self) -> Any:
