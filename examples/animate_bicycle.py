@@ -10,8 +10,9 @@ open, turn and play, and a GIF.
     ride       roll, steer, yaw, place, ... over time                    rad, m
 
 Run:      python examples/animate_bicycle.py [--out FOLDER]
-Appears:  a few lines on the ride, the time to build the page, and the sizes of ride.html and ride.gif. In the page:
-          drag to turn, wheel to zoom, space to stop; "?" lists the keys.
+Appears:  a few lines on the ride, the time to build the page, and the sizes of ride.html and ride.gif; and
+          eigenvalues.png, which says where the bicycle rights itself. In the page: drag to turn, wheel to zoom, space
+          to stop; "?" lists the keys.
 Takes:    about half a minute, most of it compilation.
 """
 
@@ -34,6 +35,9 @@ def main(folder: Path) -> None:
     found = jk.stability.eigenvalues(bicycle, jnp.linspace(0.0, 10.0, 201))
     stable = np.asarray(found.values)[np.asarray(found.stable)]
     speed = 0.5 * (stable[0] + stable[-1])
+    ax = jk.plot.eigenvalues(found)
+    ax.axvline(speed, color="0.5", linestyle="--", linewidth=1.0)
+    ax.figure.savefig(folder / "eigenvalues.png", dpi=110)
     print(f"Rights itself from {stable[0]:.2f} to {stable[-1]:.2f} m/s: it rides at {speed:.2f} m/s.")
 
     pushed = jk.assemble(bicycle, {}, {"roll_rate": 0.6, "rear_wheel_rate": -speed / bicycle.rR})
@@ -48,7 +52,7 @@ def main(folder: Path) -> None:
     built = time.perf_counter() - started
     print(f"{page}: {page.stat().st_size / 1e3:.0f} kB, built in {built:.2f} s")
     started = time.perf_counter()
-    picture = animation.save(folder / "ride.gif", seconds=4.0, azimuth=-100.0, elevation=12.0)
+    picture = animation.save(folder / "ride.gif", size=(420, 260), fps=15, seconds=3.0, azimuth=-100.0, elevation=12.0)
     print(f"{picture}: {picture.stat().st_size / 1e3:.0f} kB, drawn in {time.perf_counter() - started:.2f} s")
 
 
