@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from .._native import is_on
 from .._simulate import Settings
 from .._system import State, System
 from ._fingerprint import digest
@@ -40,6 +41,7 @@ def manifest_of(
         "reduce": _shown(reduce),
         "layout": dict(layout),
         "device": jax.default_backend(),
+        "kernels": "native" if is_on() and jax.default_backend() == "cpu" else "XLA",  # they round differently
         "version": {name: version(name) for name in ("jaxkane", "jax", "jaxlib", "diffrax", "equinox")}
         | {"python": ".".join(python_version_tuple()[:2])},
     }

@@ -65,7 +65,8 @@ def sweep(
     - `folder`: keep every finished chunk there, as a file. A sweep that was stopped, or killed, goes on from there when
         it is called again, and gives the same bytes as one that was not. One process at a time.
     - `client`: a `dask.distributed.Client`: its workers, here or elsewhere, compute the chunks; workers of one thread
-        are best. A worker that dies costs its chunk's time. Needs Dask: pip install 'jaxkane[cluster]'.
+        are best. A worker that dies costs its chunk's time. Where workers have other processors or libraries than this
+        machine, the last bits differ. Needs Dask: pip install 'jaxkane[cluster]'.
     - `devices`: among which every chunk is divided; by default all of this process (`jax.local_devices()`).
     - `progress`: show a progress bar.
     - `options`: those of `simulate`: rtol, atol, solver, step, adjoint, max_steps, project, stabilize.
