@@ -1,5 +1,6 @@
 """Steady motions, linear models about them, eigenvalues, critical speeds, and their derivatives."""
 
+from ._bicycle import LATERAL as LATERAL
 from ._bicycle import Canonical as Canonical
 from ._bicycle import canonical as canonical
 from ._bicycle import straight_ahead as straight_ahead
