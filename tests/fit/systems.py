@@ -15,7 +15,7 @@ class Cart(jk.System):
     inputs = ("push",)
 
     def motion(self, t, q, u):
-        N, O = jk.inertial()
+        N, _ = jk.inertial()
         P = jk.Point.at(u[0] * N.x, q[0] * N.x, "P")
         return jk.Motion([jk.Body(self.mass, 0.0, P, name="cart")], frames={"N": N})
 

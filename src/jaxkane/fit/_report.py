@@ -156,12 +156,11 @@ def _channels(fit: Fit) -> tuple[Row, list[Row]]:
 
 
 def _tests(fit: Fit) -> tuple[Row, list[Row]]:
-    rows = [
-        [name, channel, str(t.n), f"{100 * t.accounted:.1f} %"]
-        + [f"{t.rms:.2f}", f"{t.mean:+.2f}", f"{t.ljung_box:.2g}", f"{t.runs:.2g}"]
-        for name, channels in fit.tests.items()
-        for channel, t in channels.items()
-    ]
+    rows = []
+    for name, channels in fit.tests.items():
+        for channel, t in channels.items():
+            row = [name, channel, str(t.n), f"{100 * t.accounted:.1f} %", f"{t.rms:.2f}", f"{t.mean:+.2f}"]
+            rows.append([*row, f"{t.ljung_box:.2g}", f"{t.runs:.2g}"])
     head = ("trial", "channel", "samples", "accounted for", "rms [σ]", "mean [σ]", "p, Ljung-Box", "p, runs")
     return head, rows
 

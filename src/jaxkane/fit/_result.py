@@ -260,7 +260,8 @@ class Fit:
                 f"The residuals are not noise: neighbours correlate by {lag:.2f}. The formal standard errors are too "
                 f"small by a factor of about {((1 + lag) / max(1 - lag, 0.01)) ** 0.5:.1f}; compare `clustered_errors`."
             )
-        notes += [*suspicions.impossible_bodies(self), *suspicions.far_from_start(self), *suspicions.only_priors(self)]
+        notes += [*suspicions.impossible_bodies(self), *suspicions.bodies_at_the_edge(self)]
+        notes += [*suspicions.far_from_start(self), *suspicions.only_priors(self)]
         notes += [*suspicions.empty_columns(self.problem), *suspicions.contrary_rates(self.problem)]
         return (*notes, *suspicions.contrary_signs(self))
 

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from .._check import check_system
+from ._bijections import PossibleBody
 from ._problem import Problem
 from ._steps import settle
 
@@ -98,6 +99,22 @@ def impossible_bodies(fit: Fit) -> list[str]:
     return notes + [f"Not a possible body: {warning.message}" for warning in caught]
 
 
+def bodies_at_the_edge(fit: Fit) -> list[str]:
+    """Bodies whose parameters are kept possible, and which went as far as that lets them."""
+    notes, first = [], 0
+    for bijection, size in zip(fit.parameters.bijections, fit.parameters.sizes, strict=True):
+        if isinstance(bijection, PossibleBody):
+            names = ", ".join(fit.names[first : first + size])
+            S = np.exp(np.asarray(bijection.factors(fit.point.x[first : first + size]))[4:7])
+            if S.min() < 1e-2 * S.max():
+                notes.append(
+                    f"{names}: the data want a body that cannot be; this one is at the edge, its mass in a plane or on "
+                    "a line. It is making up for what the model lacks."
+                )
+        first += size
+    return notes
+
+
 def trade_offs(fit: Fit) -> list[str]:
     """Pairs of parameters of which the data tell little more than a combination."""
     notes, correlation = [], fit.correlation
@@ -123,7 +140,7 @@ def far_from_start(fit: Fit) -> list[str]:
     notes = []
     for name, value in fit.estimates.items():
         start, error = fit.start[name], fit.standard_errors[name]
-        if start != 0 and not 1 / 3 <= value / start <= 3 and error < 0.2 * abs(value) and not name.startswith("gain"):
+        if start != 0 and not 1 / 2 <= value / start <= 2 and error < 0.2 * abs(value):
             notes.append(
                 f"{name} went to {value / start:.2g} times its first guess with a small formal error. Unless that "
                 "guess was worth nothing, it is implausible: it may be making up for what the model lacks."

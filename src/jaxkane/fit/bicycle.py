@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ..catalog import WhippleBicycle
+from ..catalog._bicycle_file import read_bicycle_file
 from ._fit import fit
-from ._parameters import parameters_of
+from ._parameters import Delay, Free, Gain, Inertia, Prior, parameters_of
 from ._result import Fit
 from ._trial import Trial
 
@@ -26,6 +29,7 @@ def fit_bicycle(
     unknown: Sequence[str] | Mapping[str, float | None] | None = None,
     window: float | None = None,
     input_bias: Sequence[str] | Mapping[str, float | None] = (),
+    priors: Mapping[str, Prior] | str | os.PathLike[str] | None = None,
     **options: Any,
 ) -> Fit:
     """The parameters of a bicycle from rides.
@@ -41,6 +45,8 @@ def fit_bicycle(
         windows the rear wheel's rate, near what is known of the speed (5 %): it changes as the bicycle rolls. Yaw and
         the place start at zero, pitch follows.
     - `input_bias`: inputs with a constant offset in every ride, as of a motor's calibration or a tilted road.
+    - `priors`: (mean, standard deviation) by name, or a text file of BicycleParameters, of which those count that were
+        measured with a deviation.
     - `window` and `options`: as in `fit`: `method`, `sensor_bias`, `steps`, `progress`, ...
 
     **Returns:** a `Fit`.
@@ -48,7 +54,10 @@ def fit_bicycle(
     **Raises:** `ValueError` for a ride without a speed, and what `fit` raises.
     """
     rides = (rides,) if isinstance(rides, Trial) else tuple(rides)
+    free = _with_units(bicycle, free)
     names = parameters_of(bicycle, free).names
+    if isinstance(priors, (str, os.PathLike)):
+        priors = bicycle_priors(priors)
     if "rR" in names and any("speed" in ride.initial for ride in rides):
         raise ValueError(
             "With rR free a speed does not give the rear wheel's rate: give that as initial={'rear_wheel_rate': rate}."
@@ -59,7 +68,41 @@ def fit_bicycle(
         if window is not None:
             known = [np.abs(ride.initial[WHEEL]).max() for ride in rides if WHEEL in ride.initial]
             unknown[WHEEL] = 0.05 * max(known) if known else None
-    return fit(bicycle, rides, free, unknown=unknown, input_bias=input_bias, window=window, **options)
+    return fit(bicycle, rides, free, unknown=unknown, input_bias=input_bias, window=window, priors=priors, **options)
+
+
+def bicycle_priors(path: str | os.PathLike[str]) -> dict[str, Prior]:
+    """What a text file of BicycleParameters says was measured: (value, standard deviation) by name.
+
+    Entries without a deviation are not among them: nobody says how well they are known.
+    """
+    values, deviations = read_bicycle_file(path)
+    return {name: (values[name], deviation) for name, deviation in deviations.items() if deviation > 0}
+
+
+def frame_inertia(part: str, **more: Any) -> Inertia:
+    """Mass centre and inertia of a part of the bicycle, kept possible: "B" (rear frame and rider), "H" (handlebar and
+    fork), both symmetric about the bicycle's plane, or the wheels "R" and "F". The mass stays, unless `fixed=()`."""
+    if part in ("R", "F"):
+        moments = (f"I{part}xx", f"I{part}yy", f"I{part}xx")
+        return Inertia(moments, mass=f"m{part}", **{"fixed": (f"m{part}",), **more})
+    moments, center = (f"I{part}xx", f"I{part}yy", f"I{part}zz"), (f"x{part}", None, f"z{part}")
+    products = (None, f"I{part}xz", None)
+    return Inertia(moments, products, mass=f"m{part}", center=center, **{"fixed": (f"m{part}",), **more})
+
+
+def _with_units(bicycle: WhippleBicycle, free: Any) -> list[Any]:
+    """The same, with units where Meijaard's names tell them."""
+    units = {"lam": "rad", "g": "m/s^2", "steer_damping": "N m s/rad", "w": "m", "c": "m"}
+    first = {"m": "kg", "I": "kg m^2", "x": "m", "z": "m", "r": "m"}
+    free = [free] if isinstance(free, (str, Free, Gain, Delay, Inertia)) or callable(free) else list(free)
+    found = []
+    for item in free:
+        item = Free(item) if isinstance(item, str) else item
+        if isinstance(item, Free) and isinstance(item.where, str) and not item.unit and hasattr(bicycle, item.where):
+            item = dataclasses.replace(item, unit=units.get(item.where, first.get(item.where[:1], "")))
+        found.append(item)
+    return found
 
 
 def _with_wheel_rate(ride: Trial, bicycle: WhippleBicycle) -> Trial:
