@@ -38,7 +38,7 @@ def ride(bicycle, speed, seconds, seed):
     h = 0.01
     t = h * np.arange(round(seconds / h))
     frequencies, phases = np.array([0.35, 0.8, 1.3, 2.1, 3.1]), rng.uniform(0.0, 2.0 * np.pi, 5)
-    pokes = jnp.asarray(1.5 * np.sin(2 * np.pi * frequencies * t[:, None] + phases).sum(axis=1))
+    pokes = jnp.asarray(min(1.5, 0.5 * speed) * np.sin(2 * np.pi * frequencies * t[:, None] + phases).sum(axis=1))
     gain, span = 25.0 + 60.0 / speed, jnp.linspace(0.0, h, 3)
     roll, steer = bicycle.coordinates.index("roll"), bicycle.coordinates.index("steer")
 
@@ -85,7 +85,7 @@ def coverage(repetitions):
     rides = [(ride(truth, speed, 8.0, seed), speed) for seed, speed in enumerate((1.0, 3.0, 5.0, 7.0))]
     guess = truth
     for i, name in enumerate(EIGHT):
-        value = getattr(truth, name) * (1.1 if i % 2 else 0.9)
+        value = getattr(truth, name) * (1.05 if i % 2 else 0.95)
         guess = eqx.tree_at(lambda b, name=name: getattr(b, name), guess, value)
     options = {"unknown": UNKNOWN, "sensor_bias": tuple(NOISE), "hold": ("steer_torque",)}
     first = None

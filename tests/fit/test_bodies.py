@@ -1,0 +1,110 @@
+"""Parameters as bijections: intervals, bodies that stay possible, their inverses and determinants."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane.catalog import RigidBody, WhippleBicycle
+from jaxkane.fit import Free, Inertia, PossibleBody, Problem, Trial, frame_inertia, least_squares
+from jaxkane.fit._parameters import parameters_of
+
+BICYCLE = WhippleBicycle.benchmark()
+MOMENTS = ("I11", "I22", "I33")
+
+
+def is_possible(values):
+    """Whether a mass distribution has [m, c, Ixx, Iyy, Izz, Ixy, Ixz, Iyz]: each moment below the sum of the others."""
+    m, (xx, yy, zz, xy, xz, yz) = values[0], values[4:]
+    moments = np.linalg.eigvalsh(np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
+    return m > 0 and moments[0] > 0 and moments[2] < moments[0] + moments[1]
+
+
+@pytest.mark.parametrize(
+    ("moves", "wheel"),
+    [
+        (tuple(range(10)), None),
+        ((1, 3, 4, 5, 6, 8), None),
+        ((4, 5, 6), None),
+        ((0, 4, 5), (0, 2)),
+    ],
+)
+def test_every_number_is_a_possible_body_and_back(moves, wheel):
+    tolerance = 1e-9
+    values = [12.0, 0.3, 0.0, -0.6, 1.4, 2.0, 1.4, 0.0, 0.0, 0.0]
+    body = PossibleBody.of(values, moves, wheel)
+    np.testing.assert_allclose(
+        body(jnp.zeros(len(moves))), np.array(values)[list(moves)], rtol=tolerance, atol=tolerance
+    )
+    everything, back = jax.jit(lambda x: body.all_values(body.factors(x))), jax.jit(lambda x: body.inverse(body(x)))
+    for x in np.random.default_rng(0).normal(0.0, 1.5, (200, len(moves))):
+        assert is_possible(np.asarray(everything(jnp.asarray(x))))
+        np.testing.assert_allclose(back(jnp.asarray(x)), x, rtol=1e-6, atol=1e-6)
+
+
+def test_intervals_and_their_inverse():
+    free = (
+        Free("IBxx", bounds=(5.0, 20.0)),
+        Free("zB", bounds=(None, -0.1)),
+        "mB",
+        Free("c", scale=0.02),
+        frame_inertia("H"),
+        frame_inertia("F", fixed=()),
+    )
+    parameters = parameters_of(BICYCLE, free)
+    assert parameters.names[4:] == ("xH", "zH", "IHxx", "IHyy", "IHzz", "IHxz", "mF", "IFxx", "IFyy")
+    rng = np.random.default_rng(1)
+    values, inverse = jax.jit(lambda x: parameters.values(x)), jax.jit(lambda v: parameters.inverse(v))
+    x = jnp.asarray(rng.normal(0.0, 1.0, len(parameters.names)))
+    np.testing.assert_allclose(inverse(values(x)), x, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(values(jnp.zeros_like(x)), parameters.start, rtol=1e-12)
+    system, _ = parameters.apply(BICYCLE, x)
+    assert 5.0 < float(system.IBxx) < 20.0
+    assert float(system.zB) < -0.1
+    # The logarithm of the determinant, against central differences.
+    h = 1e-6
+    slopes = np.stack([(values(x + h * e) - values(x - h * e)) / (2 * h) for e in jnp.eye(len(x))], axis=1)
+    assert float(parameters.log_determinant(x)) == pytest.approx(np.linalg.slogdet(slopes)[1], abs=1e-6)
+
+
+def test_what_is_no_body_is_refused():
+    with pytest.raises(ValueError, match=r"Inertia of I11, I22, I33: mass 2 kg .* no body has them"):
+        parameters_of(RigidBody(2.0, I33=4.0), Inertia(MOMENTS, mass="mass"))
+    with pytest.raises(ValueError, match="name all three `products`"):
+        parameters_of(BICYCLE, Inertia(("IBxx", "IByy", "IBzz"), ("IBxz", "IHxz", None)))
+    with pytest.raises(ValueError, match="`fixed` may name the mass"):
+        parameters_of(BICYCLE, Inertia(("IBxx", "IByy", "IBzz"), mass="mB", fixed=("mH",)))
+    with pytest.raises(ValueError, match="names IBxx twice"):
+        parameters_of(BICYCLE, (frame_inertia("B"), "IBxx"))
+
+
+def test_a_free_rotation_is_identified_by_possible_bodies_only():
+    # A thin plate turns freely under small known torques: its third moment is nearly the sum of the two others.
+    truth, rng = RigidBody(1.0, I11=1.0, I22=2.0, I33=2.97), np.random.default_rng(2)
+    guess = RigidBody(1.0, I11=2.0, I22=2.2, I33=2.4)
+    t, trials = np.arange(0.0, 3.0, 0.05), []
+    for k in range(2):
+        torque = {f"torque{i}": 0.5 * np.sin((i + k) * t) for i in (1, 2, 3)}
+        spin = dict(zip(("omega1", "omega2", "omega3"), rng.uniform(-2.0, 2.0, 3), strict=True))
+        motion = jk.simulate(truth, jk.assemble(truth, {"e4": 1.0}, spin), t, torque)
+        measured = {name: np.asarray(motion[name]) + rng.normal(0.0, 0.3, t.size) for name in spin}
+        trials.append(Trial(t, measured, torque, sigma=0.3, initial={"e4": 1.0}, name=f"throw {k}"))
+    options = {"unknown": ("omega1", "omega2", "omega3")}
+    seen = []
+
+    def watch(problem):
+        return lambda point, cost: seen.append(problem.parameters.apply(guess, point.x)[0])
+
+    problem = Problem.of(guess, trials, Inertia(MOMENTS, mass="mass", fixed=("mass",)), **options)
+    result = least_squares(problem, callback=watch(problem))
+    assert result.status == "converged"
+    assert len(seen) > 3
+    assert all(is_possible([1.0, 0, 0, 0, s.I11, s.I22, s.I33, 0, 0, 0]) for s in seen)
+    for name in MOMENTS:
+        assert abs(result.estimates[name] - float(getattr(truth, name))) < 4.0 * result.standard_errors[name] + 0.02
+    # Each moment by itself, positive as it is, leads to what no body can be.
+    seen.clear()
+    problem = Problem.of(guess, trials, MOMENTS, **options)
+    least_squares(problem, callback=watch(problem))
+    assert not all(is_possible([1.0, 0, 0, 0, s.I11, s.I22, s.I33, 0, 0, 0]) for s in seen)

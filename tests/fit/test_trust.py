@@ -1,0 +1,249 @@
+"""How far a fit can be trusted: errors, profiles, densities, trials left out, what looks wrong, and the report."""
+
+import html.parser
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from systems import Cart
+from test_transcriptions import GUESS, TRUTH, record
+
+from jaxkane.fit import (
+    Fit,
+    Free,
+    Problem,
+    Trial,
+    cross_validate,
+    design,
+    laplace,
+    least_squares,
+    log_density,
+    multi_start,
+    profile,
+)
+from jaxkane.fit._residual_tests import residual_test
+
+NAMES = ("mass", "stiffness", "damping")
+T = np.arange(0.0, 4.0, 0.1)
+UNKNOWN = {"unknown": ("x", "x_dot")}
+
+
+@pytest.fixture(scope="module")
+def trials():
+    return [record(T, seed) for seed in range(6)]
+
+
+@pytest.fixture(scope="module")
+def problem(trials):
+    return Problem.of(GUESS, trials, NAMES, **UNKNOWN)
+
+
+@pytest.fixture(scope="module")
+def result(problem) -> Fit:
+    return least_squares(problem)
+
+
+def again(problem, trials):
+    """The same fit of other data of the same shape."""
+    other = Problem.of(GUESS, trials, problem.parameters.names, **UNKNOWN)
+    return least_squares(other)
+
+
+def test_intervals_hold_the_truth_as_often_as_they_say(problem):
+    level, hits, n = 0.8, np.zeros(3), 40
+    rng = np.random.default_rng(11)
+    clean = [record(T, seed, noise=0.0) for seed in range(6)]
+    start = None
+    for _ in range(n):
+        noisy = [Trial(T, {"x": c.measured["x"] + rng.normal(0, 0.01, T.size)}, c.inputs, sigma=0.02) for c in clean]
+        other = Problem.of(GUESS, noisy, NAMES, **UNKNOWN)
+        found = least_squares(other, start=start)
+        start = start or found.point
+        hits += [low <= float(getattr(TRUTH, name)) <= high for name, (low, high) in found.intervals(level).items()]
+    # 32 of 40 are expected; a binomial count is outside 24 to 38 once in a hundred.
+    assert np.all((hits >= 24) & (hits <= 38)), hits
+
+
+def test_white_residuals_are_called_white(result):
+    tests = [t["x"] for t in result.tests.values()]
+    assert sum(t.is_white for t in tests) >= 5
+    assert result.variance_accounted_for["x"] > 0.99
+    assert not result.robust
+    assert not any("noise" in note for note in result.notes)
+
+
+def test_correlated_residuals_are_called_so():
+    rng = np.random.default_rng(0)
+    t = np.arange(300.0)
+    white = rng.normal(size=t.size)
+    walk = np.convolve(white, np.ones(8) / 8, mode="same")
+    assert residual_test(t, t + white, white).is_white
+    coloured = residual_test(t, t + walk, walk)
+    assert coloured.ljung_box < 1e-6
+    assert coloured.runs < 1e-6
+    assert coloured.autocorrelation > 0.7
+    assert residual_test(t, t, np.full(300, np.nan)).n == 0
+
+
+def test_clustered_errors_see_what_differs_from_trial_to_trial(problem, result):
+    # Every trial has its own stiffness: that is no noise of samples, and the formal error does not know it.
+    rng = np.random.default_rng(5)
+    varied = [
+        record(T, seed, system=Cart(mass=1.3, stiffness=5.0 * np.exp(rng.normal(0.0, 0.05)), damping=0.4))
+        for seed in range(6)
+    ]
+    found = again(problem, varied)
+    assert found.robust
+    assert found.clustered_errors["stiffness"] > 2.0 * found.standard_errors["stiffness"] / np.sqrt(found.variance)
+    assert 0.3 < result.clustered_errors["stiffness"] / result.standard_errors["stiffness"] < 3.0
+    assert any("not noise" in note for note in found.notes)
+
+
+def test_the_profile_of_a_nearly_linear_problem_is_its_interval(result):
+    likelihood = profile(result, "stiffness", n=7)
+    low, high = result.intervals()["stiffness"]
+    width = high - low
+    assert likelihood.interval == pytest.approx((low, high), abs=0.1 * width)
+    assert likelihood.costs.min() == pytest.approx(result.cost, rel=1e-4)
+    with pytest.raises(ValueError, match="gravity is not free"):
+        profile(result, "gravity")
+
+
+def test_trials_left_out(result):
+    left_out = cross_validate(result, folds=3)
+    assert np.all(np.isfinite(left_out.held_out))
+    # What was not fitted is worse, but hardly.
+    assert result.cost < left_out.held_out.sum() < 1.3 * result.cost
+    assert left_out.fitted.sum() == pytest.approx(result.cost, rel=1e-3)
+    assert 0.9 < left_out.score < 1.0
+    assert "held-out score" in str(left_out)
+
+
+def test_many_first_guesses(problem, result):
+    found = multi_start(problem, 4, candidates=8, spread=0.6, seed=1)
+    assert len(found.fits) == found.agreeing == 4
+    assert found.best.cost == pytest.approx(result.cost, rel=1e-4)
+    assert all(spread < 0.1 * result.standard_errors[name] for name, spread in found.spread.items())
+    assert "4 of 4 first guesses end at the best" in str(found)
+
+
+def test_the_density_is_that_of_the_residuals(problem, result):
+    density = log_density(result, over="x")
+    there = result.point
+    assert float(density(there)) == pytest.approx(-result.cost / 2, rel=1e-9)
+    rng = np.random.default_rng(3)
+    step = jax.tree.map(lambda x: jnp.asarray(rng.normal(0.0, 1e-4, x.shape)), there)
+    away = jax.tree.map(lambda x, d: x + 30 * d, there, step)
+    moved = [jax.tree.map(lambda x, d, s=s: x + s * d, away, step) for s in (-1.0, 1.0)]
+    difference = float(density(moved[1]) - density(moved[0])) / 2
+    forward = float(jax.jvp(density, (away,), (step,))[1])
+    backward = jax.grad(density)(away)
+    along = sum(float(jnp.sum(g * d)) for g, d in zip(jax.tree.leaves(backward), jax.tree.leaves(step), strict=True))
+    assert forward == pytest.approx(difference, rel=1e-5)
+    assert along == pytest.approx(forward, rel=1e-9)
+    over_values = log_density(problem)
+    extra = float(over_values(away) - density(away))
+    assert extra == pytest.approx(float(problem.parameters.log_determinant(away.x)), abs=1e-9)
+
+
+def test_laplace_has_the_errors_of_given_sigma(result):
+    gaussian = laplace(result)
+    draws = gaussian.sample(4000)
+    for name, error in result.standard_errors.items():
+        assert np.std(draws[name]) == pytest.approx(error / np.sqrt(result.variance), rel=0.1)
+        assert np.all(draws[name] > 0)
+    assert np.isfinite(gaussian.log_evidence)
+
+
+def test_priors_are_weighed_and_told(trials):
+    told = least_squares(
+        Problem.of(GUESS, trials[:1], NAMES, priors={"mass": (1.0, 1e-4), "other": (0.0, 1.0)}, **UNKNOWN)
+    )
+    assert told.estimates["mass"] == pytest.approx(1.0, abs=5e-4)
+    assert any("mass is known by its prior alone" in note for note in told.notes)
+
+
+# Suspicious data, each reported by name.
+
+
+def test_a_wrong_sign_of_an_input(problem, trials):
+    wrong = [Trial(t.t, t.measured, {"push": -t.inputs["push"]}, sigma=0.01, name=t.name) for t in trials]
+    assert any("the input push seems to have the wrong sign" in note for note in again(problem, wrong).notes)
+
+
+def test_a_rate_against_its_coordinate_and_a_column_of_zeros(trials):
+    rated = [
+        Trial(
+            t.t, {"x": t.measured["x"], "x_dot": -np.gradient(t.measured["x"], t.t)}, t.inputs, sigma=0.1, name=t.name
+        )
+        for t in trials[:2]
+    ]
+    rated[1].measured["x_dot"] = np.zeros(T.shape)
+    notes = least_squares(Problem.of(GUESS, rated, NAMES, **UNKNOWN), steps=3).notes
+    assert any("run 0: x_dot runs against the change of x" in note for note in notes)
+    assert any("run 1: x_dot is 0 throughout" in note for note in notes)
+
+
+def test_what_trades_off_is_told_in_units(trials):
+    # Without a push only the ratios of mass, stiffness and damping show.
+    quiet = [Trial(t.t, t.measured, sigma=0.01, name=t.name) for t in trials]
+    free = (Free("mass", unit="kg"), Free("stiffness", unit="N/m"), Free("damping", unit="N s/m"))
+    found = least_squares(Problem.of(GUESS, quiet, free, **UNKNOWN))
+    assert not found.ok
+    (note,) = found.identifiability.messages
+    assert "trade off" in note
+    assert "kg" in note
+    assert "N/m" in note
+
+
+# The report.
+
+
+class _Page(html.parser.HTMLParser):
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.kinds, self.outside = [], {}, []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.kinds[tag] = self.kinds.get(tag, 0) + 1
+        places = [v for k, v in attrs if k in ("src", "href", "xlink:href")]
+        self.outside += [v for v in places if not v.startswith(("#", "data:"))]
+
+
+def test_the_report_is_one_page_that_says_it_all(result, tmp_path):
+    left_out, likelihood = cross_validate(result, folds=2), profile(result, "mass", n=3)
+    path = result.save_report(
+        tmp_path / "a" / "report.html", truth=TRUTH, cross_validation=left_out, profiles=[likelihood], trials=2
+    )
+    text = path.read_text()
+    page = _Page(text)
+    assert page.kinds["svg"] >= 6
+    assert not page.outside
+    assert "Held-out score" in text
+    for words in (*NAMES, "Ljung-Box", "variance accounted for", "correlation", "singular value", "jax 0", "run 3"):
+        assert words in text, words
+    told = result.report(TRUTH)
+    assert "95 % interval" in told
+    assert "truth" in told
+
+
+def test_a_designed_push_tells_more():
+    t = np.arange(0.0, 4.0, 0.1)
+
+    def push(c, t):
+        return {"push": c[0] * jnp.sin(2.0 * jnp.pi * c[1] * t) + 1e-3}
+
+    plan = design(
+        TRUTH, t, push, jnp.array([1.0, 1.5]), NAMES, sigma={"x": 0.01}, rms={"push": 1.0}, limits={"x": 1.0},
+        unknown=("x", "x_dot"), steps=20,
+    )  # fmt: skip
+    assert plan.history[-1] < plan.history[0] - 3.0
+    assert all(plan.standard_errors[name] < plan.before[name] for name in NAMES)
+    assert np.abs(plan.trial.measured["x"]).max() < 1.1
+    assert np.sqrt(np.mean(plan.inputs["push"] ** 2)) == pytest.approx(1.0)
+    # It is what a fit of such a trial would find.
+    seen = least_squares(Problem.of(TRUTH, plan.trial, NAMES, unknown=("x", "x_dot")))
+    formal = {name: e / np.sqrt(seen.variance) for name, e in seen.standard_errors.items()}
+    assert formal == pytest.approx(plan.standard_errors, rel=0.02)
