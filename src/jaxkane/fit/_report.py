@@ -32,7 +32,7 @@ def text(fit: Fit, truth: Any = None) -> str:
         else str(fit.identifiability),
         _plain(*_correlations(fit)),
         _plain(*_channels(fit)),
-        *([_plain(*_biases(fit))] if fit.problem.model.nuisance.trial else []),
+        *([_plain(*_biases(fit, brief=True))] if fit.problem.model.nuisance.trial else []),
         "\n".join(f"- {note}" for note in fit.notes) or "Nothing to remark.",
         "; ".join(f"{key}: {value}" for key, value in _settings(fit)),
     ]
@@ -165,10 +165,12 @@ def _tests(fit: Fit) -> tuple[Row, list[Row]]:
     return head, rows
 
 
-def _biases(fit: Fit) -> tuple[Row, list[Row]]:
+def _biases(fit: Fit, brief: bool = False) -> tuple[Row, list[Row]]:
     names = [f"{kind.split()[0]} of {what}" for kind, what in fit.problem.model.nuisance.trial]
-    rows = [[name, *(f"{values[n]:.4g}" for n in names)] for name, values in fit.nuisance.items()]
-    return ["trial", *names], rows
+    table = np.array([[values[n] for n in names] for values in fit.nuisance.values()])
+    of_all = {"mean of all": table.mean(axis=0), "smallest": table.min(axis=0), "largest": table.max(axis=0)}
+    shown = of_all if brief and len(table) > 8 else dict(zip(fit.nuisance, table, strict=True))
+    return ["trial", *names], [[name, *(f"{value:.4g}" for value in row)] for name, row in shown.items()]
 
 
 def _settings(fit: Fit) -> Iterable[tuple[str, str]]:
