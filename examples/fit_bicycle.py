@@ -17,13 +17,10 @@ Appears:  a table (start, estimate, standard error, truth) and fit_bicycle.png: 
           how far every estimate is from the truth, with its uncertainty.
 Takes:    under a minute, half of it compilation.
 
-With `--data FOLDER` the same is done for a measured bicycle: FOLDER holds `free_responses.csv` (a steer-by-wire
-bicycle of TU Delft: pushed, then left to its controller) and `parameters.json`. There the steer damping [N m s/rad] is
-found from the first second of every ride.
+Measured rides: `identify_measured_bicycle.py`.
 """
 
 import argparse
-import json
 from pathlib import Path
 
 import equinox as eqx
@@ -33,7 +30,7 @@ import numpy as np
 
 import jaxkane as jk
 from jaxkane.catalog import WhippleBicycle
-from jaxkane.fit import Trial, fit_bicycle, read_trials
+from jaxkane.fit import Trial, fit_bicycle
 
 jax.config.update("jax_enable_x64", True)
 
@@ -87,39 +84,6 @@ def fit_simulated():
     return result, {name: float(getattr(truth, name)) for name in OFF}
 
 
-def fit_measured(folder):
-    values = json.loads((folder / "parameters.json").read_text())
-    values = {"IByy": 2.0, "IHyy": 0.01} | values  # hardly matter, and are not in the file
-    rides = read_trials(
-        folder / "free_responses.csv",
-        {"roll": "roll_angle", "steer": "steer_angle", "roll_rate": "roll_rate", "steer_rate": "steer_rate"},
-        inputs={"steer_torque": "steer_torque"},
-        initial={"speed": "speed_treadmill"},
-        sigma={"roll": 0.01, "steer": 0.02, "roll_rate": 0.1, "steer_rate": 0.2},
-        by="segment",
-    )
-    rides = [ride.between(0.0, 0.995) for ride in rides]
-    result = fit_bicycle(
-        rides,
-        WhippleBicycle.from_parameters(values),
-        ("steer_damping",),
-        input_bias=("roll_torque", "steer_torque"),
-        hold=("steer_torque",),  # a command, kept until the next
-        steps=60,
-        progress=True,
-    )
-    print(f"\n{result}\n")
-    formal, clustered = result.standard_errors["steer_damping"], result.clustered_errors["steer_damping"]
-    print(
-        f"What to believe: the damping, {result.estimates['steer_damping']:.3f} N m s/rad, is what these rides tell.\n"
-        f"Its formal standard error, {formal:.4f}, takes neighbouring samples for independent, which they are not:\n"
-        f"from ride to ride it is {clustered:.3f}. All this holds for this model, with the motor's command taken for\n"
-        "its torque. With more freed (IHzz, c, IBxx) the fit improves, but those go where no bicycle is: they make\n"
-        "up for what the model lacks."
-    )
-    return result, {}
-
-
 def draw(result, truth, path):
     """Measurements and fits, the cost, and the parameters."""
     plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False, "axes.titlesize": 10})
@@ -136,17 +100,15 @@ def draw(result, truth, path):
             )
             ax.plot(trial.t, np.degrees(fitted[name][channel]), color=LINE, linewidth=1.0, label="fitted")
             ax.grid(alpha=0.25)
-        speed = -trial.initial["rear_wheel_rate"][0] * float(result.system.rR)
-        column[0].set_title(name if "m/s" in name else f"{name.split(', ')[-1]}, {speed:.2g} m/s", loc="right")
+        column[0].set_title(name, loc="right")
         column[-1].set_xlabel("time [s]")
     for ax, channel in zip(axes[:, 0], problem.channels, strict=True):
         ax.set_ylabel(LABELS[channel])
     axes[0, 0].legend(loc="lower left", bbox_to_anchor=(-0.02, 0.98), frameon=False, ncols=2, markerscale=2)
     way, parameters = rows[1].subplots(1, 2, width_ratios=(1, 1.6))
     way.semilogy(result.history, color=LINE)
-    if truth:
-        way.axhline(problem.size[0] - problem.size[1], color="0.6", linestyle="--", linewidth=1)
-        way.annotate("noise alone", (len(result.history) - 1, problem.size[0]), color="0.4", ha="right", va="bottom")
+    way.axhline(problem.size[0] - problem.size[1], color="0.6", linestyle="--", linewidth=1)
+    way.annotate("noise alone", (len(result.history) - 1, problem.size[0]), color="0.4", ha="right", va="bottom")
     way.set(xlabel="step", ylabel="sum of squares", title=f"{result.method}, {len(result.history) - 1} steps")
     way.grid(alpha=0.25)
     draw_parameters(parameters, result, truth)
@@ -157,40 +119,33 @@ def draw(result, truth, path):
 def draw_parameters(ax, result, truth):
     """Start, estimate with three standard errors, and truth of every parameter."""
     names = result.names
-    if not truth:
-        value, error = result.estimates[names[0]], result.clustered_errors[names[0]]
-        ax.errorbar(value, 0, xerr=3 * error, fmt="o", color=LINE, capsize=4, label="estimate, 3 std. errors (by ride)")
-        ax.plot(result.start[names[0]], 0, "x", color=TRUE, markersize=8, label="start")
-        ax.set(yticks=[0], yticklabels=names, ylim=(-1, 1), xlabel="N m s/rad", title="parameter")
-    else:
-        for i, name in enumerate(names):
-            right = truth[name]
-            value = 100.0 * (result.estimates[name] / right - 1.0)
-            error = 300.0 * result.standard_errors[name] / abs(right)
-            first = i == 0
-            ax.errorbar(
-                value, i, xerr=error, fmt="o", color=LINE, capsize=4, label="estimate, 3 std. errors" if first else None
-            )
-            ax.annotate(
-                f"{result.start[name]:.4g} → {result.estimates[name]:.5g} ± {result.standard_errors[name]:.1g}\n"
-                f"truth {right:.5g}",
-                (1.02, i), xycoords=("axes fraction", "data"), color="0.3", va="center", annotation_clip=False,
-            )  # fmt: skip
-        ax.axvline(0.0, color=TRUE, linewidth=1.2, label="truth")
-        ax.set(yticks=range(len(names)), yticklabels=names, ylim=(len(names) + 0.4, -0.6))
-        ax.set(xlabel="difference from the truth [%]", title="parameters: all started 20 % off")
-        widest = max(abs(x) for x in ax.get_xlim())
-        ax.set_xlim(-1.1 * widest, 1.1 * widest)
+    for i, name in enumerate(names):
+        right = truth[name]
+        value = 100.0 * (result.estimates[name] / right - 1.0)
+        error = 300.0 * result.standard_errors[name] / abs(right)
+        first = i == 0
+        ax.errorbar(
+            value, i, xerr=error, fmt="o", color=LINE, capsize=4, label="estimate, 3 std. errors" if first else None
+        )
+        ax.annotate(
+            f"{result.start[name]:.4g} → {result.estimates[name]:.5g} ± {result.standard_errors[name]:.1g}\n"
+            f"truth {right:.5g}",
+            (1.02, i), xycoords=("axes fraction", "data"), color="0.3", va="center", annotation_clip=False,
+        )  # fmt: skip
+    ax.axvline(0.0, color=TRUE, linewidth=1.2, label="truth")
+    ax.set(yticks=range(len(names)), yticklabels=names, ylim=(len(names) + 0.4, -0.6))
+    ax.set(xlabel="difference from the truth [%]", title="parameters: all started 20 % off")
+    widest = max(abs(x) for x in ax.get_xlim())
+    ax.set_xlim(-1.1 * widest, 1.1 * widest)
     ax.grid(alpha=0.25)
     ax.legend(loc="lower left", frameon=False)
 
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, help="folder with free_responses.csv and parameters.json")
     parser.add_argument("--out", type=Path, default=Path("figures"), help="folder of the picture (default: figures)")
     arguments = parser.parse_args()
-    result, truth = fit_measured(arguments.data) if arguments.data else fit_simulated()
+    result, truth = fit_simulated()
     arguments.out.mkdir(parents=True, exist_ok=True)
     draw(result, truth, arguments.out / "fit_bicycle.png")
 

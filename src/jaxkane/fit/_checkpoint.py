@@ -25,7 +25,7 @@ class Checkpoint:
         """Keep the state, whole or not at all: a crash while writing leaves the one before."""
         if self.path is None:
             return
-        arrays = {"key": np.array(self.key)}
+        arrays: dict[str, Any] = {"key": np.array(self.key)}
         for name, tree in state.items():
             arrays |= {f"{name}/{i}": np.asarray(leaf) for i, leaf in enumerate(jax.tree.leaves(tree))}
         self.path.parent.mkdir(parents=True, exist_ok=True)

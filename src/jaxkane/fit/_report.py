@@ -91,7 +91,7 @@ def save_report(
 # What is told: a heading and rows of text for each table.
 
 
-def _parameters(fit: Fit, truth: Any) -> tuple[Row, list[Row]]:
+def _parameters(fit: Fit, truth: Any) -> tuple[Row, Sequence[Row]]:
     from ._result import known_values
 
     known, errors, robust = known_values(fit, truth), fit.standard_errors, fit.clustered_errors
@@ -123,7 +123,7 @@ def _how_sure(fit: Fit) -> str:
     return "Intervals are built on the formal errors, for independent residuals of equal size."
 
 
-def _directions(fit: Fit) -> tuple[Row, list[Row]]:
+def _directions(fit: Fit) -> tuple[Row, Sequence[Row]]:
     from ._identifiability import combination
 
     seen = fit.identifiability
@@ -134,12 +134,12 @@ def _directions(fit: Fit) -> tuple[Row, list[Row]]:
     return ("singular value", "deviation", "direction (scaled parameters)"), rows
 
 
-def _correlations(fit: Fit) -> tuple[Row, list[Row]]:
+def _correlations(fit: Fit) -> tuple[Row, Sequence[Row]]:
     rows = [[n, *(f"{c:.3f}" for c in row)] for n, row in zip(fit.names, fit.correlation, strict=True)]
     return ["correlation", *fit.names], rows
 
 
-def _channels(fit: Fit) -> tuple[Row, list[Row]]:
+def _channels(fit: Fit) -> tuple[Row, Sequence[Row]]:
     rows = []
     for channel, share in fit.variance_accounted_for.items():
         tests = [channels[channel] for channels in fit.tests.values() if channel in channels]
@@ -155,7 +155,7 @@ def _channels(fit: Fit) -> tuple[Row, list[Row]]:
     ), rows
 
 
-def _tests(fit: Fit) -> tuple[Row, list[Row]]:
+def _tests(fit: Fit) -> tuple[Row, Sequence[Row]]:
     rows = []
     for name, channels in fit.tests.items():
         for channel, t in channels.items():
@@ -165,7 +165,7 @@ def _tests(fit: Fit) -> tuple[Row, list[Row]]:
     return head, rows
 
 
-def _biases(fit: Fit, brief: bool = False) -> tuple[Row, list[Row]]:
+def _biases(fit: Fit, brief: bool = False) -> tuple[Row, Sequence[Row]]:
     names = [f"{kind.split()[0]} of {what}" for kind, what in fit.problem.model.nuisance.trial]
     table = np.array([[values[n] for n in names] for values in fit.nuisance.values()])
     of_all = {"mean of all": table.mean(axis=0), "smallest": table.min(axis=0), "largest": table.max(axis=0)}
