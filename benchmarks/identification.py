@@ -64,15 +64,20 @@ def unstable():
     truth, names = WhippleBicycle.benchmark(), ("IBxx", "zB", "c")
     trial = noisy(*ride(truth, 3.0, 10.0, 1), np.random.default_rng(0), "3 m/s", 3.0)
     options = {"unknown": UNKNOWN, "sensor_bias": tuple(NOISE), "hold": ("steer_torque",)}
-    for window in (1.0, None):
-        problem = Problem.of(truth, trial, names, window=window, **options)
+    tight = {"roll": 1e-4, "steer": 1e-4, "roll_rate": 1e-3, "steer_rate": 1e-3, "rear_wheel_rate": 1e-4}
+    for what, more in {
+        "windows of 1 s with free starts": {"window": 1.0},
+        "windows of 1 s, chained": {"window": 1.0, "continuity": tight},
+        "a single shoot": {},
+    }.items():
+        problem = Problem.of(truth, trial, names, **more, **options)
         began = time.perf_counter()
         try:
             found = multi_start(problem, 10, spread=0.3, seed=2)
         except ValueError as error:
-            print(f"\nwindow {window}: {error}")
+            print(f"\n{what}: {error}")
             continue
-        print(f"\nwindow {window} s: {time.perf_counter() - began:.1f} s with compilation\n{found}")
+        print(f"\n{what}: {time.perf_counter() - began:.1f} s with compilation\n{found}")
         right = [all(abs(f.estimates[n] / float(getattr(truth, n)) - 1) < 0.01 for n in names) for f in found.fits]
         print(f"all three within 1 %: {sum(right)} of 10\n{found.best.table(truth)}")
 

@@ -156,6 +156,31 @@ def test_laplace_has_the_errors_of_given_sigma(result):
     assert np.isfinite(gaussian.log_evidence)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("package", ["numpyro", "blackjax"])
+def test_samplers_find_the_laplace_approximation(trials, package):
+    sampler, key = pytest.importorskip(package), jax.random.key(0)
+    mode = least_squares(Problem.of(GUESS, trials[:2], NAMES, **UNKNOWN))
+    density = log_density(mode, over="x")
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        if package == "numpyro":
+            kernel = sampler.infer.NUTS(potential_fn=lambda point: -density(point))
+            run = sampler.infer.MCMC(kernel, num_warmup=200, num_samples=600, progress_bar=False)
+            run.run(key, init_params=mode.point)
+            x = run.get_samples().x
+        else:
+            warm, _ = sampler.window_adaptation(sampler.nuts, density).run(key, mode.point, num_steps=200)
+            step = jax.jit(sampler.nuts(density, **warm.parameters).step)
+            x, state = [], warm.state
+            for one in jax.random.split(key, 600):
+                state, _ = step(one, state)
+                x.append(state.position.x)
+    approximation = laplace(mode)
+    deviation = np.sqrt(approximation.covariance.diagonal())
+    np.testing.assert_allclose(np.mean(np.asarray(x), axis=0), approximation.mean, atol=0.5 * deviation.max())
+    np.testing.assert_allclose(np.std(np.asarray(x), axis=0), deviation, rtol=0.4)
+
+
 def test_priors_are_weighed_and_told(trials):
     told = least_squares(
         Problem.of(GUESS, trials[:1], NAMES, priors={"mass": (1.0, 1e-4), "other": (0.0, 1.0)}, **UNKNOWN)

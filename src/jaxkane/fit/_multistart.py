@@ -78,8 +78,9 @@ def multi_start(
 ) -> MultiStart:
     """Fit from many first guesses.
 
-    They are run one after another by one compiled program: on a processor without lanes to spare, a batch under `vmap`
-    runs until its slowest member is done, and needs a program of its own.
+    They are run one after another by one compiled program, which every fit of these trials shares. A batch of ten under
+    `vmap` was measured (ten windows of a bicycle, two cores): a step takes 0.27 s instead of 0.42 s, but a program of
+    its own is compiled for 3.5 s, and all wait for the slowest.
 
     **Arguments:**
 

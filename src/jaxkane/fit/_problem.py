@@ -233,6 +233,11 @@ class Problem:
         new = eqx.tree_at(lambda w: (w.weight, w.linked), self.windows, (weight, linked))
         return dataclasses.replace(self, windows=new)
 
+    def unchained(self) -> Problem:
+        """The same problem in which every window starts freely; nothing is compiled anew."""
+        windows = eqx.tree_at(lambda w: w.linked, self.windows, jnp.zeros_like(self.windows.linked))
+        return dataclasses.replace(self, windows=windows)
+
     def with_priors(self, priors: Mapping[str, Prior]) -> Problem:
         """The same problem with priors (mean, standard deviation) of parameters by name; nothing is compiled anew."""
         return dataclasses.replace(

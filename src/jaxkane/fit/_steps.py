@@ -28,10 +28,21 @@ def settle(problem: Problem, point: Point, steps: int = 8, rtol: float = 1e-2) -
     """The nuisance values that fit best with the parameters held: Gauss-Newton, damped where that fails.
 
     Windows that cannot be simulated to their end with the first guess (an unstable ride falls over) begin with a
-    shorter horizon, which is doubled as soon as it fits.
+    shorter horizon, which is doubled as soon as it fits. Where that fails for windows that are chained, each is first
+    settled by itself.
 
     **Raises:** `ValueError` that names a window which does not reach its end.
     """
+    try:
+        return _settle(problem, point, steps, rtol)
+    except ValueError:
+        if not problem.model.nuisance.chained:
+            raise
+    point, _ = _settle(problem.unchained(), point, steps, rtol)
+    return _settle(problem, point, steps, rtol)
+
+
+def _settle(problem: Problem, point: Point, steps: int, rtol: float) -> tuple[Point, Linearization]:
     whole = np.array([n for _, _, n in problem.places])
     samples = whole.copy()
     at = linearize(problem.shortened(samples), point)

@@ -140,7 +140,7 @@ def far_from_start(fit: Fit) -> list[str]:
     notes = []
     for name, value in fit.estimates.items():
         start, error = fit.start[name], fit.standard_errors[name]
-        if start != 0 and not 1 / 2 <= value / start <= 2 and error < 0.2 * abs(value):
+        if start != 0 and not 0.4 <= value / start <= 2.5 and error < 0.2 * abs(value):
             notes.append(
                 f"{name} went to {value / start:.2g} times its first guess with a small formal error. Unless that "
                 "guess was worth nothing, it is implausible: it may be making up for what the model lacks."
