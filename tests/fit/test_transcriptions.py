@@ -180,7 +180,7 @@ def test_a_start_from_which_the_end_is_out_of_reach():
 
 
 def test_process_noise_is_taken_for_what_it_is():
-    # A hidden force shakes the cart: one rigid motion through it is a wrong model, and its damping is biased.
+    # A hidden force shakes the cart: what it does in a window is what the motion may jump by at its end.
     t = np.arange(0.0, 8.0, 0.05)
     rng = np.random.default_rng(8)
     fine = np.arange(0.0, 8.0, 0.01)
@@ -195,9 +195,8 @@ def test_process_noise_is_taken_for_what_it_is():
     jump = {"x": 0.005, "x_dot": 0.05}
     names = ("mass", "stiffness", "damping")
     chained = least_squares(Problem.of(GUESS, trials, names, continuity=jump, **options))
-    single = least_squares(Problem.of(GUESS, trials, names, unknown=("x", "x_dot")))
     near(chained)
-    assert single.variance > 5 * chained.variance
+    assert 0.5 < chained.variance < 2.0
 
 
 def test_what_is_held_has_no_delay():

@@ -120,6 +120,15 @@ def test_trials_left_out(result):
     assert "held-out score" in str(left_out)
 
 
+def test_other_trials_are_looked_at_with_the_parameters_held(result):
+    others = [record(T, seed) for seed in (20, 21)]
+    held = result.applied_to(others)
+    assert held.status == "applied"
+    assert held.estimates == result.estimates
+    assert held.cost < 1.5 * 2 * T.size < held.history[0]
+    assert "not fitted" in str(held)
+
+
 def test_many_first_guesses(problem, result):
     found = multi_start(problem, 4, candidates=8, spread=0.6, seed=1)
     assert len(found.fits) == found.agreeing == 4

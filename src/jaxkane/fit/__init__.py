@@ -34,5 +34,6 @@ from ._uncertainty import cross_validate as cross_validate
 from ._uncertainty import laplace as laplace
 from ._uncertainty import profile as profile
 from .bicycle import bicycle_priors as bicycle_priors
+from .bicycle import bicycle_rides as bicycle_rides
 from .bicycle import fit_bicycle as fit_bicycle
 from .bicycle import frame_inertia as frame_inertia

@@ -45,6 +45,7 @@ class Problem:
     by_trial: Array
     trials: tuple[Trial, ...]
     places: tuple[Place, ...]
+    posed: Mapping[str, Any]  # the arguments of `of`, but for the trials
     processes: bool = False
 
     @classmethod
@@ -73,6 +74,7 @@ class Problem:
         processes: bool = False,
     ) -> Problem:
         """Pose a fit. The arguments are those of `jaxkane.fit.fit`."""
+        posed = {key: value for key, value in locals().items() if key not in ("cls", "trials")}
         trials = (trials,) if isinstance(trials, Trial) else tuple(trials)
         outputs = dict(outputs or {})
         channels = _checked_trials(system, trials, outputs)
@@ -120,7 +122,7 @@ class Problem:
             windows = eqx.tree_at(lambda w: w.step, windows, jnp.full_like(windows.step, step))
         if processes:
             check_same(model, windows)
-        problem = cls(model, windows, windows.by_trial, trials, places, processes)
+        problem = cls(model, windows, windows.by_trial, trials, places, posed, processes)
         return problem._finer() if fixed and step is None else problem
 
     def _finer(self) -> Problem:
@@ -232,6 +234,10 @@ class Problem:
         linked = jnp.where(counts, self.windows.linked, 0.0)
         new = eqx.tree_at(lambda w: (w.weight, w.linked), self.windows, (weight, linked))
         return dataclasses.replace(self, windows=new)
+
+    def with_trials(self, trials: Sequence[Trial] | Trial) -> Problem:
+        """The same question, asked of other trials."""
+        return Problem.of(trials=trials, **self.posed)
 
     def unchained(self) -> Problem:
         """The same problem in which every window starts freely; nothing is compiled anew."""

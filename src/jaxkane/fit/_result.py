@@ -19,6 +19,8 @@ from ._model import Point
 from ._parameters import Parameters
 from ._problem import Linearization, Problem
 from ._residual_tests import ResidualTest, residual_test
+from ._steps import settle
+from ._trial import Trial
 from ._uncertainty import clustered_covariance, t_quantile
 
 STATUS = {
@@ -26,6 +28,7 @@ STATUS = {
     "steps": "stopped after the last step, before it converged",
     "stuck": "stuck: no step lowers the cost",
     "interrupted": "interrupted: this is the best so far",
+    "applied": "not fitted: these are the parameters of another fit",
 }
 
 
@@ -264,6 +267,17 @@ class Fit:
         notes += [*suspicions.far_from_start(self), *suspicions.only_priors(self)]
         notes += [*suspicions.empty_columns(self.problem), *suspicions.contrary_rates(self.problem)]
         return (*notes, *suspicions.contrary_signs(self))
+
+    def applied_to(self, trials: Sequence[Trial] | Trial) -> Fit:
+        """These parameters on other trials, of which only starts and biases are found: a look at data held back.
+
+        `cost`, `variance_accounted_for`, `tests`, `report()` are then those of these trials.
+        """
+        problem = self.problem.with_trials(trials)
+        first = dataclasses.replace(problem.start, x=self.point.x)
+        before = settle(problem, problem.start)[1].cost
+        point, at = settle(problem, first, steps=20, rtol=1e-6)
+        return Fit.of(problem, point, at, (before, at.cost), "applied", self.method)
 
     def trajectories(self) -> list[tuple[str, Trajectory]]:
         """The fitted motion of every window, with its trial's name."""

@@ -62,13 +62,22 @@ def fit_bicycle(
         raise ValueError(
             "With rR free a speed does not give the rear wheel's rate: give that as initial={'rear_wheel_rate': rate}."
         )
-    rides = tuple(_with_wheel_rate(ride, bicycle) for ride in rides)
+    rides = bicycle_rides(rides, bicycle)
     if unknown is None:
         unknown = dict.fromkeys(("roll", "steer", "roll_rate", "steer_rate"))
         if window is not None:
             known = [np.abs(ride.initial[WHEEL]).max() for ride in rides if WHEEL in ride.initial]
             unknown[WHEEL] = 0.05 * max(known) if known else None
     return fit(bicycle, rides, free, unknown=unknown, input_bias=input_bias, window=window, priors=priors, **options)
+
+
+def bicycle_rides(rides: Sequence[Trial] | Trial, bicycle: WhippleBicycle) -> tuple[Trial, ...]:
+    """Rides with the rear wheel's rate in the place of their speed, as a fit takes them.
+
+    held_back = fit.applied_to(bicycle_rides(other_rides, bicycle))
+    """
+    rides = (rides,) if isinstance(rides, Trial) else tuple(rides)
+    return tuple(_with_wheel_rate(ride, bicycle) for ride in rides)
 
 
 def bicycle_priors(path: str | os.PathLike[str]) -> dict[str, Prior]:
