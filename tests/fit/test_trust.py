@@ -219,6 +219,14 @@ def test_a_rate_against_its_coordinate_and_a_column_of_zeros(trials):
     assert any("run 1: x_dot is 0 throughout" in note for note in notes)
 
 
+def test_what_runs_to_its_bound_is_told_so(trials):
+    bounds = (Free("damping", start=1.0, bounds=(0.8, None)), "stiffness")  # it is 0.4
+    found = least_squares(Problem.of(GUESS, trials, bounds, **UNKNOWN))
+    assert found.estimates["damping"] == pytest.approx(0.8, abs=1e-3)
+    assert not found.ok
+    assert any("damping has gone to its bound" in note for note in found.notes)
+
+
 def test_what_trades_off_is_told_in_units(trials):
     # Without a push only the ratios of mass, stiffness and damping show.
     quiet = [Trial(t.t, t.measured, sigma=0.01, name=t.name) for t in trials]

@@ -37,7 +37,8 @@ class Identifiability:
     - `names`, `units` (p,); `scales` (p,): what parameters are counted in, each in its unit.
     - `singular_values` (p,), largest first; `vectors` (p, p), a row for each, in scaled parameters.
     - `deviations` (p,): standard deviation along each row, in scaled units.
-    - `without_influence`: names of the parameters that change no residual at all.
+    - `without_influence`: names of the parameters that change no residual at all. `at_bound`: of those that went as far
+        as their bounds let them.
     - `undetermined`: the directions that the data do not tell, weakest first.
     - `covariance` (p, p) of the parameters in their units, infinite for those without influence.
     - `covariance_of_x` (p, p) of the free numbers behind them.
@@ -50,6 +51,7 @@ class Identifiability:
     vectors: np.ndarray
     deviations: np.ndarray
     without_influence: tuple[str, ...]
+    at_bound: tuple[str, ...]
     undetermined: tuple[Direction, ...]
     covariance: np.ndarray
     covariance_of_x: np.ndarray
@@ -105,7 +107,8 @@ def look(problem: Problem, point: Point, at: Linearization, flat: float = 0.5) -
     parameters = problem.parameters
     names, p = parameters.names, len(parameters.names)
     to_values = np.asarray(parameters.slopes(point.x))
-    scales = np.linalg.norm(to_values, axis=1)  # what a step of one in the free numbers does
+    # What a step of one in the free numbers does; at a bound, nothing at all.
+    scales = np.maximum(np.linalg.norm(to_values, axis=1), 1e-100)
     # From scaled parameters; at the edge of what a body can have, a free number moves nothing any more.
     to_x = np.linalg.pinv(to_values / scales[:, None], rcond=1e-9)
     eliminated = eliminate(at.blocks, 0.0)
@@ -141,9 +144,19 @@ def look(problem: Problem, point: Point, at: Linearization, flat: float = 0.5) -
         vectors=V,
         deviations=deviations,
         without_influence=tuple(name for name, quiet in zip(names, silent, strict=True) if quiet),
+        at_bound=(),
         undetermined=(),
         covariance=covariance,
         covariance_of_x=of_x,
+    )
+    # Beside a bound nothing moves any more: that is not a parameter which the data do not see.
+    alone = np.count_nonzero(to_values, axis=1) <= 1
+    edge = alone & (scales < 1e-3 * np.asarray(parameters.scale))
+    at_bound = tuple(name for name, there in zip(names, edge, strict=True) if there)
+    seen = dataclasses.replace(
+        seen,
+        at_bound=at_bound,
+        without_influence=tuple(name for name in seen.without_influence if name not in at_bound),
     )
     weak = [i for i in reversed(range(p)) if not deviations[i] <= flat]
     return dataclasses.replace(seen, undetermined=tuple(_direction(seen, i) for i in weak))
@@ -154,7 +167,9 @@ def _direction(seen: Identifiability, i: int) -> Direction:
     order = [j for j in np.argsort(-np.abs(row), kind="stable") if abs(row[j]) > 0.1]
     parts = tuple((seen.names[j], float(row[j])) for j in order)
     first = parts[0][0]
-    if len(parts) == 1 and first in seen.without_influence:
+    if len(parts) == 1 and first in seen.at_bound:
+        text = f"{first} has gone to its bound: the data want it beyond. It may be making up for what the model lacks."
+    elif len(parts) == 1 and first in seen.without_influence:
         text = f"{first} has no influence on these data; it stays at its start."
     elif len(parts) == 1 and s == 0:
         text = f"{first} cannot be told from the unknown starts and biases."
