@@ -68,7 +68,7 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
         raise ValueError(f"{name} is not free; {', '.join(fit.names)} are.")
     error, best = fit.standard_errors[name], fit.estimates[name]
     if not np.isfinite(error):
-        raise ValueError(f"{name} has no influence on these data: its likelihood is the same everywhere.")
+        raise ValueError(f"These data do not tell {name}: {fit.message}.")
     if span is None:
         low, high = fit.intervals(level)[name]
         span = 0.75 * (high - low) / error
@@ -210,11 +210,11 @@ def laplace(fit: Fit) -> Laplace:
 
         log evidence = -cost / 2 - 1/2 log det(information of all unknowns) + constant
 
-    **Raises:** `ValueError` where a parameter has no influence: nothing bounds its posterior.
+    **Raises:** `ValueError` that names the parameters that the data do not tell: nothing bounds their posterior.
     """
-    if fit.identifiability.without_influence:
-        names = ", ".join(fit.identifiability.without_influence)
-        raise ValueError(f"{names} has no influence on these data: give it a prior, or leave it out.")
+    untold = [name for name, error in fit.standard_errors.items() if not np.isfinite(error)]
+    if untold:
+        raise ValueError(f"These data do not tell {', '.join(untold)}: give a prior, or leave something out.")
     eliminated = eliminate(fit.linearization.blocks, 0.0)
     A = np.asarray(eliminated.rows[0])
     information = A.T @ A
