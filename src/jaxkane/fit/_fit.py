@@ -13,8 +13,9 @@ from .._trajectory import Trajectory
 from ._bfgs import bfgs
 from ._gradient_descent import gradient_descent
 from ._least_squares import gauss_newton, least_squares
+from ._names import Names
 from ._parameters import Prior
-from ._problem import Names, Problem
+from ._problem import Problem
 from ._result import Fit
 from ._trial import Trial
 

@@ -17,14 +17,12 @@ from .._simulate import settings_for
 from .._system import System
 from .._trajectory import Trajectory
 from ._blocks import Blocks
-from ._model import Model, Nuisance, Point, blocks_of, costs_of, rides_of, starts_of
+from ._model import Model, Point, blocks_of, costs_of, rides_of, starts_of
+from ._names import Names, checked_names, checked_trials, nuisance_of
 from ._parallel import blocks_of_all, check_same, costs_of_all
 from ._parameters import Delay, Parameters, Prior, parameters_of
 from ._trial import Trial
 from ._windows import Place, Windows, cut
-
-Names = Sequence[str] | Mapping[str, float | None]
-"""Names, or names with the standard deviation of a Gaussian prior around the first guess (None: no prior)."""
 
 STEP_TOLERANCE = 0.05
 """By how much halving the step of integration may move all residuals of a window together: it bounds the bias of an
@@ -77,22 +75,22 @@ class Problem:
         posed = {key: value for key, value in locals().items() if key not in ("cls", "trials")}
         trials = (trials,) if isinstance(trials, Trial) else tuple(trials)
         outputs = dict(outputs or {})
-        channels = _checked_trials(system, trials, outputs)
+        channels = checked_trials(system, trials, outputs)
         if window is not None and not window > 0:
             raise ValueError(f"`window` is a length of time [s], got {window}.")
         if continuity is not None and window is None:
             raise ValueError("`continuity` binds the windows of a trial together: give their length, `window` [s].")
         driven = tuple(name for name in system.inputs if any(name in trial.inputs for trial in trials))
         per_trial = {
-            "bias of sensor": _names(system, "sensor_bias", sensor_bias, channels),
-            "gain of sensor": _names(system, "sensor_gain", sensor_gain, channels),
-            "bias of input": _names(system, "input_bias", input_bias, system.inputs),
-            "gain of input": _names(system, "input_gain", input_gain, driven),
-            "delay of input": _names(system, "input_delay", input_delay, driven),
+            "bias of sensor": checked_names(system, "sensor_bias", sensor_bias, channels),
+            "gain of sensor": checked_names(system, "sensor_gain", sensor_gain, channels),
+            "bias of input": checked_names(system, "input_bias", input_bias, system.inputs),
+            "gain of input": checked_names(system, "input_gain", input_gain, driven),
+            "delay of input": checked_names(system, "input_delay", input_delay, driven),
         }
         items = [free] if isinstance(free, Delay) else free if isinstance(free, (list, tuple)) else ()
         late = [*per_trial["delay of input"], *(item.input for item in items if isinstance(item, Delay))]
-        held = tuple(_names(system, "hold", hold, system.inputs))
+        held = tuple(checked_names(system, "hold", hold, system.inputs))
         stuck = sorted(set(late) & set(held))
         if stuck:
             raise ValueError(f"{stuck[0]} is held from sample to sample: nothing changes smoothly with its delay.")
@@ -111,7 +109,7 @@ class Problem:
         model = Model(
             system=system,
             parameters=parameters,
-            nuisance=_nuisance(system, unknown, per_trial, continuity),
+            nuisance=nuisance_of(system, unknown, per_trial, continuity),
             settings=settings,
             channels=channels,
             driven=driven,
@@ -303,58 +301,3 @@ def _starts(problem: Problem, point: Point) -> tuple[Array, Array] | None:
         return starts_of(problem.model, problem.windows, point)
     except RuntimeError:  # Newton's linear solver raises on what is not finite
         return None
-
-
-def _checked_trials(system: System, trials: Sequence[Trial], outputs: Mapping[str, Any]) -> tuple[str, ...]:
-    """The channels of all trials."""
-    title = type(system).__name__
-    if not trials:
-        raise ValueError("There is no trial to fit.")
-    named = (*system.coordinates, *system.speeds, *system.dependent_speeds)
-    for trial in trials:
-        if not isinstance(trial, Trial):
-            raise TypeError(f"`trials` holds jaxkane.fit.Trial, got {type(trial).__name__}.")
-        for what, given, known in (
-            ("channel", trial.measured, (*named, *outputs)),
-            ("input", trial.inputs, system.inputs),
-            ("coordinate or independent speed", trial.initial, (*system.coordinates, *system.speeds)),
-        ):
-            unknown = sorted(set(given) - set(known))
-            if unknown:
-                raise ValueError(
-                    f"{trial.name}: {title} has no {what} {', '.join(unknown)}; there are {', '.join(known) or 'none'}."
-                )
-    return tuple(dict.fromkeys(channel for trial in trials for channel in trial.measured))
-
-
-def _names(system: System, what: str, given: Any, known: Sequence[str]) -> dict[str, float]:
-    """Names with the deviations of their priors."""
-    given = (given,) if isinstance(given, str) else given
-    given = dict(given) if isinstance(given, Mapping) else dict.fromkeys(given)
-    wrong = sorted(set(given) - set(known))
-    if wrong:
-        raise ValueError(
-            f"{type(system).__name__}: `{what}` names {', '.join(wrong)}; it may name {', '.join(known) or 'nothing'}."
-            + (" Dependent coordinates and speeds follow from the others." if what == "unknown" else "")
-        )
-    bad = [name for name, deviation in given.items() if deviation is not None and not deviation > 0]
-    if bad:
-        raise ValueError(f"`{what}`: the standard deviation of {bad[0]} must be positive, or None for no prior.")
-    return {name: float("inf") if deviation is None else float(deviation) for name, deviation in given.items()}
-
-
-def _nuisance(
-    system: System, unknown: Names, per_trial: Mapping[str, Mapping[str, float]], continuity: Mapping[str, float] | None
-) -> Nuisance:
-    held = tuple(c for c in system.coordinates if c not in system.dependent_coordinates)
-    start = _names(system, "unknown", unknown, (*held, *system.speeds))
-    jump = _names(system, "continuity", continuity or {}, tuple(start))
-    array = lambda numbers: jnp.asarray(np.array(list(numbers), float), jnp.result_type(float))  # noqa: E731
-    return Nuisance(
-        start=tuple(start),
-        trial=tuple((kind, name) for kind, names in per_trial.items() for name in names),
-        chained=continuity is not None,
-        start_deviation=array(start.values()),
-        trial_deviation=array(d for names in per_trial.values() for d in names.values()),
-        jump=array(jump.get(name, float("inf")) for name in start),
-    )
