@@ -7,7 +7,7 @@
     measured   31 rides of a steer-by-wire bicycle (`--data FOLDER`): damping alone, four parameters, trials left out
 
 Run:      python benchmarks/identification.py [unstable] [coverage] [measured] [--data FOLDER] [--repetitions 100]
-Takes:    on two cores a minute, half an hour, and a minute.
+Takes:    on two cores two minutes, two minutes, and one.
 """
 
 import argparse
