@@ -1,0 +1,1 @@
+"""jaxkane against its peers: `python -m benchmarks`."""
