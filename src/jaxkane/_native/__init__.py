@@ -1,0 +1,65 @@
+"""Scalar programs as machine code, through LLVM. Knows jaxprs and XLA's custom calls; no mechanics.
+
+A traced program of small arrays is unrolled into a graph of scalars, every node once, and written out as one straight
+function over vectors of lanes: members of a batch, or directions of a derivative. What all lanes share is computed
+once, ahead of them. XLA calls the function as a custom call, inside `jit` and inside loops.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+
+import jax
+import numpy as np
+from jax.extend.core import ClosedJaxpr
+
+from ._graph import CALLS, LIBRARY, Graph, NotScalarError, symbol, unrolled
+from ._handler import handler_text
+from ._llvm import Writer
+from ._machine import is_on, machine, use, why_not
+
+__all__ = ["CALLS", "NotScalarError", "Scalars", "is_on", "use", "why_not"]
+
+
+class Scalars:
+    """A program as a graph, and the targets compiled from it.
+
+    Raises `NotScalarError` where the program cannot be written so.
+    """
+
+    def __init__(self, program: ClosedJaxpr):
+        self.graph = Graph()
+        self.inputs = [
+            np.array([self.graph.add("input", (i, e, aval.size), str(aval.dtype)) for e in range(aval.size)], np.int64)
+            for i, aval in enumerate(program.in_avals)
+        ]
+        shaped = [x.reshape(aval.shape) for x, aval in zip(self.inputs, program.in_avals, strict=True)]
+        self.outputs = unrolled(program.jaxpr, program.consts, shaped, self.graph)
+        self.bytes_of = [a.size * a.dtype.itemsize for a in (*program.in_avals, *program.out_avals)]
+        for node in self.graph.nodes:
+            if node.operation in LIBRARY and not machine().has(symbol(node)):
+                raise NotScalarError(f"{symbol(node)} is not known to LLVM here")
+        self.kernel = functools.cache(self._kernel)
+        self.target = functools.cache(self._target)
+
+    def _kernel(self, varies: tuple[bool, ...], lanes: int) -> str:
+        writer = Writer(self.graph, varies, lanes, functools.partial(machine().of_lanes, lanes=lanes))
+        return machine().compile(writer.text(len(self.inputs), self.outputs))[1]
+
+    def _target(self, sizes: tuple[int, ...], where: tuple[tuple[bool, ...], ...]) -> str:
+        """The name under which XLA calls the program for a batch of `sizes`, of whose dimensions argument i has those
+        in `where[i]`."""
+        if all(all(w) or not any(w) for w in where):  # one long batch
+            sizes, where = (int(np.prod(sizes)),) if sizes else (), tuple((any(w),) if sizes else () for w in where)
+        lanes = min(machine().lanes, 1 << (sizes[-1] - 1).bit_length()) if sizes else 1
+        kernel = self.kernel(tuple(bool(w and w[-1]) for w in where), lanes)
+        address, name = machine().compile(handler_text(kernel, sizes, where, len(self.outputs), self.bytes_of))
+        _register(address, name)
+        return name
+
+
+@functools.cache
+def _register(address: int, name: str) -> None:
+    handler = ctypes.CFUNCTYPE(ctypes.c_void_p)(address)
+    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform="cpu")
