@@ -6,6 +6,9 @@ import sys
 
 import pytest
 
+from jaxkane import _native
+
+KERNELS = f"no native kernels ({_native.why_not()})" if _native.why_not() else "native kernels"
 HEAD = "import jaxkane as jk, numpy as np, jax\n"
 RIDE = """
 hits, misses = [], []
@@ -60,7 +63,7 @@ def first(cache):
 
 
 def test_it_says_what_it_did(first, cache):
-    assert first[0] == "jaxkane: float64"
+    assert first[0] == f"jaxkane: float64, {KERNELS}"
     assert first[1].startswith(f"  compiled programs are kept in {cache} (none there yet;")
     assert first[2].startswith("  numerical checks inside programs give NaN")
 
@@ -89,17 +92,18 @@ def test_child_processes_inherit_it_and_nothing_is_said_twice(cache):
         "e.EQX_ON_ERROR)'\nprint(subprocess.check_output([sys.executable, '-c', c], text=True).strip())"
     )
     lines = python(code).stdout.splitlines()
-    assert lines[0] == "jaxkane: float64, 3 CPU devices"
+    assert lines[0] == f"jaxkane: float64, 3 CPU devices, {KERNELS}"
     assert lines[3:] == ["3", f"True {cache} nan"]
 
 
 def test_without_a_cache_nothing_but_the_precision_changes():
     code = (
-        "print(jk.configure(cache=False))\nimport equinox._errors as e\nprint(e.EQX_ON_ERROR, jax.numpy.ones(1).dtype)"
+        "print(jk.configure(cache=False, native=False))\nimport equinox._errors as e\n"
+        "print(e.EQX_ON_ERROR, jax.numpy.ones(1).dtype)"
     )
     assert python(code).stdout.splitlines() == [
-        "jaxkane: float64; compiled programs are not kept.",
-        "Configuration(float64=True, cache=None, devices=None)",
+        "jaxkane: float64, no native kernels (switched off); compiled programs are not kept.",
+        "Configuration(float64=True, cache=None, devices=None, native=False)",
         "raise float64",
     ]
 
@@ -118,3 +122,22 @@ def test_it_warns_when_it_comes_too_late():
 
 def test_what_is_refused():
     assert "`devices` is a number of CPU devices" in python("jk.configure(devices=0)", status=1).stderr
+
+
+def test_without_llvm_xla_does_the_work_and_says_so():
+    code = (
+        "import sys, warnings\nsys.modules['llvmlite'] = sys.modules['llvmlite.binding'] = None\n"
+        "warnings.simplefilter('error')\njk.configure(cache=False)\n"
+        "P = jk.catalog.DoublePendulum(mass=1.0, length=1.0)\n"
+        "print(jk.accelerations(P, 0.0, np.array([0.5, -0.2]), np.zeros(2)).shape)\njk.configure(native=True)"
+    )
+    run = python(code, status=1)
+    why = "llvmlite is not installed: pip install 'jaxkane[native]'"
+    if sys.platform == "linux":
+        assert run.stdout.startswith(f"jaxkane: float64, no native kernels ({why});")
+        assert f"UserWarning: jaxkane.configure: no native kernels, XLA does their work: {why}." in run.stderr
+    assert run.stdout.splitlines()[1] == "(2,)"
+
+
+def test_the_environment_may_switch_native_kernels_off():
+    assert "switched off" in python("jk.configure(cache=False)", env={"JAXKANE_NATIVE": "0"}).stdout

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxkane import _native
 from jaxkane._fuse import fused, without_repetition
 
 
@@ -48,9 +49,19 @@ TRANSFORMATIONS = {
 }
 
 
+@pytest.fixture(scope="module", params=["native", "XLA"])
+def kernels(request):
+    was = _native.is_on()
+    if request.param == "native" and _native.why_not():
+        pytest.skip(_native.why_not())
+    _native.use(request.param == "native")
+    yield request.param
+    _native.use(was)
+
+
 @pytest.mark.parametrize("name", TRANSFORMATIONS)
 @pytest.mark.parametrize("compiled", [False, True], ids=["eager", "jit"])
-def test_the_same_as_plain_jax(name, compiled):
+def test_the_same_as_plain_jax(name, compiled, kernels):
     transform = TRANSFORMATIONS[name]
     ours, theirs = transform(program), transform(plain)
     if compiled:

@@ -13,15 +13,18 @@ import jax
 import numpy as np
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
+from . import _native
+
 
 @dataclasses.dataclass(frozen=True)
 class Configuration:
     """What `configure` has set: `float64`; the folder of the `cache`, or None; the number of CPU `devices`, or None
-    where JAX was left to choose."""
+    where JAX was left to choose; whether right-hand sides are `native` kernels."""
 
     float64: bool
     cache: Path | None
     devices: int | None
+    native: bool
 
 
 _last: Configuration | None = None
@@ -32,6 +35,7 @@ def configure(
     float64: bool = True,
     cache: bool | str | os.PathLike[str] = True,
     devices: int | None = None,
+    native: bool | None = None,
     verbose: bool = True,
 ) -> Configuration:
     """Set up this process: one call at the top of a script, before anything is computed.
@@ -46,12 +50,16 @@ def configure(
         own folder where one is set, else `jaxkane` in the user's folder of caches; or a folder; or False.
     - `devices`: split the CPU into this many devices, which a sweep then uses side by side; one for each core is
         plenty. By default JAX decides: one, unless XLA_FLAGS says otherwise.
+    - `native`: right-hand sides and their derivatives as machine code through LLVM (the extra `native`), called by XLA;
+        on the CPU only. By default where llvmlite is installed, unless the environment has JAXKANE_NATIVE=0. False
+        leaves all work to XLA. Both agree to rounding errors.
     - `verbose`: print in a few lines what was done; once, if it is called again.
 
-    **Returns:** a `Configuration`. Processes that are started from this one, such as Dask's workers, inherit precision
-    and cache by their environment.
+    **Returns:** a `Configuration`. Processes that are started from this one, such as Dask's workers, inherit precision,
+    cache and kernels by their environment.
 
-    **Warns:** when it comes too late: arrays have been made in float32, or JAX has started with other devices.
+    **Warns:** when it comes too late: arrays have been made in float32, or JAX has started with other devices; and
+    where `native=True` is asked of a machine that cannot.
 
     With a cache, a numerical check *inside* compiled programs can no longer raise (a program that may call back into
     Python cannot be stored): equinox's `EQX_ON_ERROR` becomes "nan". jaxkane's own errors are raised outside of
@@ -80,7 +88,12 @@ def configure(
         reset_cache()
     if devices is not None:
         _split_cpu(devices)
-    done = Configuration(bool(float64), folder, devices)
+    if native is not None:
+        _native.use(native)
+    if native and _native.why_not():
+        without = f"jaxkane.configure: no native kernels, XLA does their work: {_native.why_not()}."
+        warnings.warn(without, UserWarning, stacklevel=2)
+    done = Configuration(bool(float64), folder, devices, _native.is_on())
     if verbose and done != _last:
         print(_told(done))
     _last = done
@@ -161,6 +174,7 @@ def _told(done: Configuration) -> str:
     lines = [f"jaxkane: {'float64' if done.float64 else 'float32'}"]
     if done.devices is not None:
         lines[0] += f", {done.devices} CPU device{'s' if done.devices > 1 else ''}"
+    lines[0] += ", native kernels" if done.native else f", no native kernels ({_native.why_not() or 'switched off'})"
     if done.cache is None:
         return f"{lines[0]}; compiled programs are not kept."
     sizes = [entry.stat().st_size for entry in os.scandir(done.cache) if entry.name.endswith("-cache")]

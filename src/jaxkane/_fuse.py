@@ -212,7 +212,7 @@ def _inlined(*args, program, sizes, where):
 
 def _as_one_function(*args, program, sizes, where):
     program = program.batched(sizes, where) if sizes else program
-    if not program.is_plain:
+    if not program.is_plain or 0 in sizes:
         return program.evaluate(*args)
 
     # XLA aborts on a parameter that its simplified program no longer reads. The sum reads them all, and the barrier

@@ -133,6 +133,8 @@ def _operation(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.nda
     moved = _moved(name, params, xs, aval.shape)
     if moved is not None:
         return moved
+    if name == "convert_element_type" and dtype in TYPES and x_dtype not in TYPES:
+        return [_each(lambda v: graph.constant(v, dtype), xs[0])]  # whole numbers are constants here
     if x_dtype not in TYPES or dtype not in TYPES:
         raise NotScalarError(f"{name} of {x_dtype}")
     one = _full((), 1.0, graph, dtype) if dtype in FLOATS else xs[0]

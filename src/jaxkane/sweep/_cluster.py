@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .. import _native
 from ._solve import Job, Part
 
 _FLAGS = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_numpy_rank_promotion")
@@ -29,6 +30,7 @@ def on_cluster(
     # Arrays travel as numpy's: JAX's would be read before the worker knows their precision.
     common = cloudpickle.dumps(jax.tree.map(_as_numpy, dataclasses.replace(job, mesh=None)))
     flags = {name: getattr(jax.config, name) for name in _FLAGS}
+    kernels = _native.is_on()
     left, tasks = iter(starts), {}
     finished = as_completed()
 
@@ -39,7 +41,7 @@ def on_cluster(
             if start is None:
                 return
             own = cloudpickle.dumps(members_at(start))
-            task = client.submit(solve_elsewhere, common, own, size, flags, pure=False)
+            task = client.submit(solve_elsewhere, common, own, size, flags, kernels, pure=False)
             tasks[task.key] = start
             finished.add(task)
 
@@ -55,13 +57,19 @@ def on_cluster(
         client.cancel([task for task in finished.futures if task.key in tasks])
 
 
-def solve_elsewhere(common: bytes, own: bytes, size: int, flags: dict[str, Any]) -> Part:
+def solve_elsewhere(common: bytes, own: bytes, size: int, flags: dict[str, Any], native: bool) -> Part:
     """A chunk, on a worker; arrays of numpy go there and come back."""
     import cloudpickle
 
     for name, value in flags.items():
         if getattr(jax.config, name) != value:
             jax.config.update(name, value)
+    _native.use(native)
+    if native and not _native.is_on():
+        raise RuntimeError(
+            f"This worker has no native kernels, and would round differently: {_native.why_not()}. Or call "
+            "jaxkane.configure(native=False) where the sweep is started."
+        )
     part = _job(common).solve(cloudpickle.loads(own), size)
     return jax.tree.map(np.asarray, part)
 

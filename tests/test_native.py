@@ -1,0 +1,158 @@
+"""Native kernels: machine code through LLVM gives what XLA gives, in every shape of a batch."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane import _native
+from jaxkane._equations import _state_rates, state_rates
+from jaxkane._fuse import _Program, fused
+
+pytestmark = pytest.mark.skipif(bool(_native.why_not()), reason=f"no native kernels: {_native.why_not()}")
+
+LARGEST = 19
+
+
+@pytest.fixture(autouse=True)
+def native():
+    was = _native.is_on()
+    _native.use(True)
+    yield
+    _native.use(was)
+
+
+def on_x(*names):
+    return [(name, getattr(jnp, name)) for name in names]
+
+
+OPERATIONS = dict(
+    on_x("sin", "cos", "tan", "arctan", "sinh", "cosh", "tanh", "arcsinh", "exp", "exp2", "expm1", "cbrt", "sign")
+    + on_x("abs", "floor", "square", "negative", "isfinite")
+) | {
+    "arcsin": lambda x: jnp.arcsin(x / 4),
+    "arccos": lambda x: jnp.arccos(x / 4),
+    "arctanh": lambda x: jnp.arctanh(x / 4),
+    "arccosh": lambda x: jnp.arccosh(4 + x),
+    "log": lambda x: jnp.log(4 + x),
+    "log1p": lambda x: jnp.log1p(4 + x),
+    "sqrt": lambda x: jnp.sqrt(4 + x),
+    "rsqrt": lambda x: jax.lax.rsqrt(4 + x),
+    "erf": jax.scipy.special.erf,
+    "logistic": jax.nn.sigmoid,
+    "pow": lambda x: (4 + x) ** 1.7,
+    "atan2": lambda x: jnp.arctan2(x, x[::-1]),
+    "rem": lambda x: jax.lax.rem(x, jnp.asarray(0.7, x.dtype)),
+    "integer powers": lambda x: [x**n for n in (-3, -1, 0, 2, 7)],
+    "max and min": lambda x: [jnp.maximum(x, x[::-1]), jnp.minimum(x, 0.1), jnp.clip(x, -0.5, 0.5)],
+    "comparisons": lambda x: [x < x[::-1], x <= 0.0, x > 0.0, x >= x, x == x[::-1], x != x],
+    "logic": lambda x: [(x > 0.0) & (x < 1.0), (x > 0.0) | (x < -1.0), ~(x > 0.0), (x > 0.0) ^ (x < 1.0)],
+    "where": lambda x: jnp.where(x > 0.0, x, 2 * x),
+    "bool to float": lambda x: (x > 0.0).astype(x.dtype) * x,
+    "other precision": lambda x: x.astype(jnp.float32) * jnp.float32(3),
+    "sums": lambda x: [x.sum(), x[None, :].sum(0), x.reshape(3, 1).sum(1)],
+    "moving": lambda x: [jnp.concatenate([x[1:], x[:1]]), jnp.outer(x, x).T[::-1, ::2], jnp.pad(x, (1, 2))],
+    "constants": lambda x: [jnp.zeros_like(x) + 0 * x, 1 * x, x - 0, 0 - x, x / 1, -1 * x, jnp.array([1.0, jnp.inf])],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32], ids=["float64", "float32"])
+def test_every_operation(dtype):
+    f = lambda x: {name: operation(x) for name, operation in OPERATIONS.items()}  # noqa: E731
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(LARGEST, 3)), dtype)
+    program = fused(f)
+    assert _native.Scalars(jax.make_jaxpr(f)(x[0])).graph.nodes, "cannot be written as scalars"
+    tolerance = 1e-14 if dtype == jnp.float64 else 1e-6
+    check = lambda a, b: np.testing.assert_allclose(a, b, rtol=20 * tolerance, atol=tolerance)  # noqa: E731
+    alone = jax.jit(f)
+    expected = [alone(row) for row in x]
+    for n in (1, 2, 8, LARGEST):
+        found = jax.jit(jax.vmap(program))(x[:n])
+        for name in OPERATIONS:
+            rows = [row[name] for row in expected[:n]]
+            jax.tree.map(check, found[name], jax.tree.map(lambda *a: jnp.stack(a), *rows))
+
+
+def test_a_member_does_not_depend_on_its_place():
+    f = fused(lambda x, a: jnp.sin(a * x) / (1.0 + x * x))
+    x = jnp.linspace(-1.0, 1.0, LARGEST)
+    together = jax.jit(jax.vmap(f, (0, None)))(x, 0.3)
+    for n in (9, 16):
+        np.testing.assert_array_equal(jax.jit(jax.vmap(f, (0, None)))(x[:n], 0.3), together[:n])
+
+
+def test_batches_of_batches():
+    def plain(a, b, x):
+        return jnp.stack([jnp.sin(a) * x[0], b * x[1] + a, a / b])
+
+    f = fused(plain)
+    a, b = jnp.arange(1.0, 4.0), jnp.arange(1.0, 6.0)
+    x = jnp.asarray(np.random.default_rng(1).normal(size=(3, 5, 2)))
+    for axes in (((0, None, 0), (None, 0, 0)), ((None, 0, 1), (0, None, 0))):  # outer, inner
+        of = lambda g, axes=axes: jax.vmap(jax.vmap(g, axes[1]), axes[0])  # noqa: E731
+        np.testing.assert_allclose(jax.jit(of(f))(a, b, x), of(plain)(a, b, x), rtol=1e-14)
+    only_outer = lambda g: jax.vmap(jax.vmap(g, (None, 0, None)), (0, None, 0))  # noqa: E731
+    np.testing.assert_allclose(jax.jit(only_outer(f))(a, b, x[:, 0]), only_outer(plain)(a, b, x[:, 0]), rtol=1e-14)
+    assert jax.jit(jax.vmap(f, (0, None, None)))(jnp.zeros(0), 1.0, x[0, 0]).shape == (0, 3)
+
+
+def test_what_cannot_be_written_is_left_to_xla():
+    f = fused(lambda x: jnp.round(x) + jnp.sin(x))
+    with pytest.raises(_native.NotScalarError, match="round"):
+        _native.Scalars(jax.make_jaxpr(jnp.round)(1.0))
+    np.testing.assert_allclose(jax.jit(f)(1.7), 2.0 + np.sin(1.7))
+
+
+@pytest.fixture(scope="module")
+def bicycle():
+    system = jk.catalog.WhippleBicycle.benchmark()
+    state = jk.assemble(system, {"roll": 0.1, "steer": 0.2}, {"roll_rate": 0.3, "rear_wheel_rate": -12.0})
+    return system, jnp.array(0.0), state.q, state.u, {}
+
+
+def both(f, *args):
+    found = []
+    for native in (True, False):
+        _native.use(native)
+        found.append(jax.jit(f)(*args))
+    return found
+
+
+def close(a, b):
+    np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-11)
+
+
+def test_the_bicycle_and_its_derivatives_as_by_xla(bicycle):
+    def many(system, t, q, u, inputs):
+        return jax.vmap(lambda push: state_rates(system, t, q, u.at[0].set(push), inputs))(jnp.linspace(0.0, 0.5, 11))
+
+    moved = jax.tree.map(lambda x: 0.01 * jnp.ones_like(x), bicycle)
+    jax.tree.map(close, *both(many, *bicycle))
+    jax.tree.map(close, *both(lambda *args: jax.jvp(state_rates, args, moved), *bicycle))
+
+
+def test_a_derivative_costs_a_few_values(bicycle):
+    """Operations of the graphs; all directions of a derivative are lanes of one kernel, which share what they can."""
+    leaves, treedef = jax.tree.flatten(bicycle)
+    plain = _state_rates.__wrapped__
+    program = _Program(jax.make_jaxpr(lambda *x: plain(*jax.tree.unflatten(treedef, x)))(*leaves))
+    work = lambda scalars: sum(n.operation not in ("input", "constant") for n in scalars.graph.nodes)  # noqa: E731
+    value = work(program.scalars())
+    tangent = program.tangent((True,) * len(leaves)).scalars()
+    assert value < 1950
+    assert work(tangent) < 5 * value
+
+
+def test_kernels_are_kept_beside_the_cache_of_jax(tmp_path):
+    was = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    try:
+        f = fused(lambda x: jnp.sin(x) * 1.2345678)
+        np.testing.assert_allclose(jax.jit(f)(0.5), np.sin(0.5) * 1.2345678)
+        kept = sorted((tmp_path / "jaxkane").glob("jaxkane_*.o"))
+        assert len(kept) == 2  # the kernel, and the function that XLA calls
+        module = type("Module", (), {"name": kept[0].stem})
+        assert _native._machine._kept(tmp_path / "jaxkane", module) == kept[0].read_bytes()
+    finally:
+        jax.config.update("jax_compilation_cache_dir", was)
