@@ -248,3 +248,29 @@ def test_an_unknown_adjoint_and_an_unknown_name():
         jk.simulate(PENDULUM, START, TS, adjoint="backwards")
     with pytest.raises(KeyError, match="no 'theta3' in this trajectory; there are theta1"):
         _ = jk.simulate(PENDULUM, START, TS)["theta3"]
+
+
+class Pendulum(jk.System):
+    mass: jk.Scalar = jk.parameter(2.0)
+    length: jk.Scalar = jk.parameter(1.1)
+    coordinates, speeds, inputs = ("angle",), ("rate",), ("torque",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        rod = N.rotate(3, q[0], u[0])
+        return jk.Motion([jk.Body(self.mass, 0.0, O.fixed(-self.length * rod.y), rod)])
+
+    def loads(self, t, q, u, motion, inputs):
+        return [*jk.weight(motion, -9.81 * motion.N.y), jk.Torque(inputs["torque"] * motion.N.z, motion.bodies[0])]
+
+
+def test_a_step_that_ends_beside_a_sample():
+    """Steps of 2.5 ms by chance end a rounding error before samples; what is left was once too short a step."""
+    pendulum = Pendulum()
+    ts, start = jnp.linspace(0.0, 2.5, 51), jk.State(jnp.array([0.1]), jnp.zeros(1))
+    sampled = jk.simulate(pendulum, start, ts, inputs={"torque": 3.0 * jnp.sin(2.0 * ts)})
+    assert sampled.ok, sampled.reason
+    fine = jnp.linspace(0.0, 2.5, 2001)
+    smooth = jk.simulate(pendulum, start, fine, inputs={"torque": 3.0 * jnp.sin(2.0 * fine)})
+    np.testing.assert_allclose(sampled.q, smooth.q[::40], atol=2e-3)
+    assert sampled.stats["accepted"] < 4 * len(ts)

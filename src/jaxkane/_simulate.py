@@ -20,6 +20,7 @@ from ._drift import correction, has_configuration_constraints, projected
 from ._equations import dependent_speeds, state_rates
 from ._fuse import fused
 from ._kane import Instant, checked_inputs
+from ._kinks import ToKinks
 from ._linear import as_vector, determinant
 from ._signals import as_signals, evaluate, sample_times
 from ._system import State, System, parameter_info
@@ -204,8 +205,8 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
         smallest = 1e3 * jnp.finfo(ts.dtype).eps * (ts[-1] - ts[0])
         controller = diffrax.PIDController(rtol=settings.rtol, atol=settings.atol, dtmin=smallest, force_dtmin=False)
         kinks = sample_times(signals)
-        if kinks is not None:  # a step over a kink would be of first order, whatever the solver
-            controller = diffrax.ClipStepSizeController(controller, step_ts=kinks)
+        if kinks is not None:
+            controller = ToKinks(controller, kinks)
     else:
         controller = diffrax.ConstantStepSize()
     at_times = diffrax.SubSaveAt(ts=ts)
