@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -16,7 +17,7 @@ from ._check import check_system, is_concrete
 from ._components import matvec, sub
 from ._diagnose import diagnosis
 from ._fuse import fused
-from ._kane import Instant, as_array, checked_inputs, jvp
+from ._kane import Instant, as_array, as_row, checked_inputs, jvp
 from ._linear import as_vector, is_written_out, solve_positive_array, stack
 from ._system import System, kinetic_energy_of
 from ._types import Component
@@ -53,13 +54,36 @@ def equations_of_motion(
     **Raises:** `ValueError` for wrong shapes, an unknown input, as many velocity residuals as there are not dependent
     speeds, or a description that contradicts itself.
     """
-    return _equations(*_arrays(system, t, q, u, inputs))
+    return _equations(*_arrays(system, t, q, u, inputs))[1:]
+
+
+def _equations(system, t, q, u, inputs):
+    """q_dot, M and f."""
+    if is_written_out(len(system.speeds)):
+        return _equations_written_out(system, t, q, u, inputs)
+    # The columns of M are one program, whose lanes are the directions.
+    q_dot, f = _rates_and_forcing(system, t, q, u, inputs)
+    columns = jax.vmap(lambda direction: _mass_times(system, t, q, u, inputs, direction))
+    return q_dot, columns(jnp.eye(len(system.speeds), dtype=q.dtype)), f
 
 
 @fused
-def _equations(system, t, q, u, inputs):
-    M, f = Instant(system, t, q, u, inputs).equations()
-    return stack(M).astype(q.dtype), as_vector(f, q)
+def _equations_written_out(system, t, q, u, inputs):
+    now = Instant(system, t, q, u, inputs)
+    M, f = now.equations()
+    return as_vector(now.q_dot, q), stack(M).astype(q.dtype), as_vector(f, q)
+
+
+@fused
+def _rates_and_forcing(system, t, q, u, inputs):
+    now = Instant(system, t, q, u, inputs)
+    return as_vector(now.q_dot, q), as_vector(now.forcing(), q)
+
+
+@fused
+def _mass_times(system, t, q, u, inputs, direction):
+    now = Instant(system, t, q, u, inputs)
+    return as_vector(now.mass_times(as_row(direction, system.speeds, "direction")), q)
 
 
 def accelerations(system: System, t: Component, q: Any, u: Any, inputs: InputValues = None) -> Float[Array, " n"]:
@@ -83,7 +107,7 @@ def state_rates(
     """q_dot and u_dot: the right-hand side, from arrays that are known to fit."""
     if is_written_out(len(system.speeds)):
         return _state_rates(system, t, q, u, inputs)
-    q_dot, M, f = _state_rates_unsolved(system, t, q, u, inputs)
+    q_dot, M, f = _equations(system, t, q, u, inputs)
     return q_dot, solve_positive_array(M, f)
 
 
@@ -91,13 +115,6 @@ def state_rates(
 def _state_rates(system, t, q, u, inputs):
     now = Instant(system, t, q, u, inputs)
     return as_vector(now.q_dot, q), as_vector(now.accelerations(), q)
-
-
-@fused
-def _state_rates_unsolved(system, t, q, u, inputs):
-    now = Instant(system, t, q, u, inputs)
-    M, f = now.equations()
-    return as_vector(now.q_dot, q), stack(M).astype(q.dtype), as_vector(f, q)
 
 
 def mass_matrix(system: System, t: Component, q: Any, u: Any, inputs: InputValues = None) -> Float[Array, "n n"]:

@@ -11,6 +11,10 @@ With p_i = m_i v_i, H_i = I_i . omega_i and d/dt in the inertial frame (Kamman, 
 
 Partial velocities, C and the time derivatives are read off the description by `jax.jvp`. Only the directions that
 are needed are pushed: the residuals along every speed, the bodies along the n independent columns of [1; J].
+
+A few speeds are written out so, as scalars. For many, sums over bodies for every pair of speeds would be of order
+n^2 b. Then f and the columns of M are found without partial velocities, each in order b: vectors that stand on bodies
+are projected onto all speeds at once by the transpose of the map u -> (v, omega), which `jax.vjp` gives.
 """
 
 from __future__ import annotations
@@ -59,6 +63,23 @@ def jvp(f: Callable[..., Any], primals: Sequence[Component], tangents: Sequence[
     return jax.tree.unflatten(treedef, f_x), jax.tree.unflatten(treedef, f_dx)
 
 
+def transposed(f: Callable[..., Any], primals: Sequence[Component], cotangents: Any) -> Row:
+    """`jax.vjp` of a function of components: the derivative of `f` at `primals`, transposed, times `cotangents`.
+
+    `cotangents` stand as f's outputs do. What f returns exactly is constant, and what meets it is dropped.
+    """
+    moves: list[bool] = []
+
+    def arrays_only(*xs):
+        leaves = jax.tree.leaves(f(*xs))
+        moves[:] = [not is_exact(x) for x in leaves]
+        return [x for x in leaves if not is_exact(x)]
+
+    outputs, pull = jax.vjp(arrays_only, *primals)
+    leaves = [ct for ct, m in zip(jax.tree.leaves(cotangents), moves, strict=True) if m]
+    return pull([jnp.asarray(ct, dtype=x.dtype) for ct, x in zip(leaves, outputs, strict=True)])
+
+
 def unit(n: int, r: int) -> Row:
     """The r-th of n directions of the speeds."""
     return tuple(1.0 if i == r else 0.0 for i in range(n))
@@ -103,8 +124,10 @@ class Instant:
 
     def along_speeds(self, f: Callable[[Row], Any], direction: Row) -> Any:
         """The derivative of `f(u)` along a direction of speeds, at u = 0: all of it, since f is affine in them."""
-        zero = jnp.zeros((), jnp.result_type(*([x for x in (*self.q, *self.u) if not is_exact(x)] or [float])))
-        return jvp(lambda s: f(tuple(mul(s, x) for x in direction)), (zero,), (jnp.ones_like(zero),))[1]
+        return jvp(lambda s: f(tuple(mul(s, x) for x in direction)), (self._zero(),), (jnp.ones_like(self._zero()),))[1]
+
+    def _zero(self) -> Array:
+        return jnp.zeros((), jnp.result_type(*([x for x in (*self.q, *self.u) if not is_exact(x)] or [float])))
 
     def configuration(self, t: Component, q: Row) -> Row:
         residuals = self.system.configuration_constraints(t, q)
@@ -129,6 +152,8 @@ class Instant:
         # c = C_ind u + C_dep u_dep + c0
         n, k = self.n, self.k
         c0 = self.residuals(self.t, self.q, (0.0,) * (n + k))
+        if not k:
+            return [], [], c0
         along = [self.along_speeds(lambda u: self.residuals(self.t, self.q, u), unit(n + k, r)) for r in range(n + k)]
         rows = tuple(zip(*along, strict=True))
         return [row[:n] for row in rows], [row[n:] for row in rows], c0
@@ -145,6 +170,31 @@ class Instant:
         motion = self.motion(self.t, self.q, u)
         bodies = [(b.center.velocity.components, b.angular_velocity.components_in(b.frame)) for b in motion.bodies]
         return bodies, [load.velocity.components for load in self.loads(motion)]
+
+    def body_velocities(self, u: Row) -> list:
+        return self.velocities(u)[0]
+
+    def momenta(self, u: Row) -> list[tuple[Row, Row]]:
+        return [_momenta(body) for body in self.motion(self.t, self.q, u).bodies]
+
+    def with_dependent(self, direction: Row) -> Row:
+        """A direction of the independent speeds, with what the dependent ones do: [1; J] of it."""
+        return (*direction, *(dot(row, direction) for row in zip(*self.J, strict=True)))
+
+    def onto_speeds(self, f: Callable[[Row], Any], cotangents: Any) -> Row:
+        """For every independent speed, the derivative of `f(u)` along it times `cotangents`; at the cost of a few f."""
+        return transposed(lambda *u: f(self.with_dependent(u)), (self._zero(),) * self.n, cotangents)
+
+    def mass_times(self, direction: Row) -> Row:
+        """M times a direction of the independent speeds: the momenta along it, onto all speeds. Order b, not n b."""
+        along = self.along_speeds(self.momenta, self.with_dependent(direction))
+        return self.onto_speeds(self.body_velocities, along)
+
+    def forcing(self) -> Row:
+        """f of M u_dot = f, without partial velocities: all vectors onto all speeds at once."""
+        motion = self.motion(self.t, self.q, self.u_all)
+        inertia = [tuple(scale3(-1.0, rate) for rate in rates) for rates in self.momentum_rates(motion)]
+        return self.onto_speeds(self.velocities, (inertia, self.load_vectors(motion)))
 
     def bias(self) -> Row:
         """u_dep_dot at u_dot = 0: the residual is differentiated, never the solution of the solve.
@@ -171,13 +221,10 @@ class Instant:
         def momenta(t, *q):
             return [_momenta(body) for body in self.motion(t, q, self.u_all).bodies]
 
-        def momenta_of(u):
-            return [_momenta(body) for body in self.motion(self.t, self.q, u).bodies]
-
         now, drift = jvp(momenta, (self.t, *self.q), (1.0, *self.q_dot))
         if u_dot is None and self.k:
             u_dot = (*(0.0,) * self.n, *self.bias())
-        turning = None if u_dot is None else self.along_speeds(momenta_of, u_dot)
+        turning = None if u_dot is None else self.along_speeds(self.momenta, u_dot)
         rates = []
         for i, body in enumerate(motion.bodies):
             # dx/dt in N = derivative of the components + omega x
@@ -190,8 +237,11 @@ class Instant:
 
     def active_forces(self, motion: Motion, partials: list) -> Row:
         # F_r = sum F . V_r + T . W_r
-        vectors = [load.vector.components_in(load.velocity.frame) for load in self.loads(motion)]
+        vectors = self.load_vectors(motion)
         return tuple(_sum(dot(v, x) for v, x in zip(columns, vectors, strict=True)) for _, columns in partials)
+
+    def load_vectors(self, motion: Motion) -> list[Row]:
+        return [load.vector.components_in(load.velocity.frame) for load in self.loads(motion)]
 
     def inertia_forces(self, motion: Motion, partials: list) -> Row:
         # F*_r = -sum_i V_ir . dp_i/dt + W_ir . dH_i/dt

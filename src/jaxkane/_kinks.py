@@ -20,7 +20,7 @@ class ToKinks(diffrax.AbstractAdaptiveStepSizeController[Any, Any]):
     controller: diffrax.AbstractAdaptiveStepSizeController[Any, Any]
     times: Float[Array, " n"]
 
-    def __init__(self, controller: diffrax.AbstractAdaptiveStepSizeController[Any, Any], times: Float[Array, " n"]):
+    def __init__(self, controller: Any, times: Float[Array, " n"]):
         self.controller, self.times = controller, times
 
     @property

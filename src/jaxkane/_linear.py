@@ -18,7 +18,7 @@ from ._types import Component
 Rows = Sequence[Sequence[Component]]
 
 _CRAMER_UP_TO = 3
-_UNROLL_UP_TO = 8
+_UNROLL_UP_TO = 12
 
 
 def solve(A: Rows, *rights: Sequence[Component]) -> list[tuple[Component, ...]]:

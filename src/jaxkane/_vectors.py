@@ -225,7 +225,7 @@ class Vector:
     array of shape (3,).
     """
 
-    __slots__ = ("_resolved", "components", "frame", "mixed")
+    __slots__ = ("_above", "_resolved", "components", "frame", "mixed")
     __array_ufunc__ = None  # a NumPy number on the left leaves the product to __rmul__
 
     def __init__(self, frame: Frame, components: Triple, mixed: bool = False):
@@ -233,6 +233,7 @@ class Vector:
         self.components = components
         self.mixed = mixed  # summed from vectors of different frames: no frame in which it is fixed is known
         self._resolved: dict[Frame, Triple] | None = None
+        self._above: Vector | None = None  # the same vector in the parent frame
 
     def __repr__(self) -> str:
         a, b, c = self.components
@@ -246,8 +247,23 @@ class Vector:
         if self._resolved is None:
             self._resolved = {}
         if frame not in self._resolved:
-            self._resolved[frame] = _resolve(self.components, self.frame, frame)
+            self._resolved[frame] = self._resolve(frame)
         return self._resolved[frame]
+
+    def _resolve(self, frame: Frame) -> Triple:
+        # Step by step, and every step is remembered: a vector that all links of a chain need costs each one step.
+        if self.frame.root is not frame.root:
+            raise ValueError(
+                f"The frames {self.frame.name} and {frame.name} have no common inertial frame. Call "
+                "jaxkane.inertial() once in `motion`, and in `loads` take the frames from the motion it receives."
+            )
+        if frame.depth > self.frame.depth:
+            above = self.components_in(frame.parent)  # type: ignore[arg-type]
+            return matvec(frame._to_child, above)  # type: ignore[return-value]
+        if self._above is None:
+            to_parent = tuple(zip(*self.frame._to_child, strict=True))
+            self._above = Vector(self.frame.parent, matvec(to_parent, self.components))  # type: ignore[arg-type]
+        return self._above.components_in(frame)
 
     def to(self, frame: Frame) -> Float[Array, 3]:
         """Components in `frame`, an array of shape (3,)."""
@@ -313,25 +329,6 @@ def _meet(a: Vector, b: Vector) -> tuple[Frame, Triple, Triple]:
     # The deeper frame is where both are likely to be needed next: velocities are built from the root outwards.
     frame = a.frame if a.frame.depth >= b.frame.depth else b.frame
     return frame, a.components_in(frame), b.components_in(frame)
-
-
-def _resolve(components: Triple, source: Frame, target: Frame) -> Triple:
-    down: list[Frame] = []
-    while source is not target:
-        if source.depth >= target.depth:
-            if source.parent is None:
-                raise ValueError(
-                    f"The frames {source.name} and {target.name} have no common inertial frame. Call "
-                    "jaxkane.inertial() once in `motion`, and in `loads` take the frames from the motion it receives."
-                )
-            components = matvec(tuple(zip(*source._to_child, strict=True)), components)  # type: ignore[assignment]
-            source = source.parent
-        else:
-            down.append(target)
-            target = target.parent  # type: ignore[assignment]
-    for frame in reversed(down):
-        components = matvec(frame._to_child, components)  # type: ignore[assignment]
-    return components
 
 
 class Point:
