@@ -92,6 +92,28 @@ def mjcf(chain: Chain, timestep: float = 0.001) -> str:
     )
 
 
+def sdf(chain: Chain) -> str:
+    """The chain as an SDF model, which JaxSim reads; its first link stands on the ground."""
+    length, moments = float(chain.length), list(map(float, chain.inertia))
+    inertial = (
+        "<inertial><pose>0 0 {} 0 0 0</pose><mass>{!r}</mass><inertia><ixx>{!r}</ixx><iyy>{!r}</iyy><izz>{!r}</izz>"
+        "<ixy>0</ixy><ixz>0</ixz><iyz>0</iyz></inertia></inertial>"
+    )
+    parts = [
+        f'<link name="ground">{inertial.format(0.0, 1.0, 1.0, 1.0, 1.0)}</link>'
+        '<joint name="fixed" type="fixed"><parent>world</parent><child>ground</child></joint>'
+    ]
+    for i in range(chain.n):
+        parent, below = (f"link{i}", -length) if i else ("ground", 0.0)
+        parts.append(
+            f'<link name="link{i + 1}"><pose relative_to="{parent}">0 0 {below!r} 0 0 0</pose>'
+            f"{inertial.format(-length / 2, float(chain.mass), *moments)}</link>"
+            f'<joint name="q{i + 1}" type="revolute"><parent>{parent}</parent>'
+            f"<child>link{i + 1}</child><axis><xyz>{('1 0 0', '0 1 0')[i % 2]}</xyz></axis></joint>"
+        )
+    return f'<sdf version="1.10"><model name="chain">{"".join(parts)}</model></sdf>'
+
+
 def pinocchio_model(chain: Chain) -> Any:
     """The chain as a `pinocchio.Model`."""
     import pinocchio
