@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import subprocess
@@ -52,24 +53,17 @@ def child(module: str, arguments: Sequence[str] = (), *, cores: int | None = 1) 
     **Raises:** `RuntimeError` with what it said last, where it fails.
     """
     command = [sys.executable, "-m", module, *arguments]
-    bound = (lambda: bind(cores)) if cores is not None else None
-    with (
-        tempfile.TemporaryFile("w+", encoding="utf-8") as said,
-        subprocess.Popen(
-            command,
-            env=environment(cores),
-            cwd=ROOT,
-            stdout=subprocess.PIPE,
-            stderr=said,
-            text=True,
-            preexec_fn=bound if hasattr(os, "sched_setaffinity") else None,
-        ) as run,
-    ):
+    with tempfile.TemporaryFile("w+", encoding="utf-8") as said:
+        with bound(cores):
+            run = subprocess.Popen(
+                command, env=environment(cores), cwd=ROOT, stdout=subprocess.PIPE, stderr=said, text=True
+            )
         assert run.stdout is not None
-        for line in run.stdout:
-            if line.startswith(("{", "[")):
-                yield json.loads(line)
-        if run.wait():
+        with run:
+            for line in run.stdout:
+                if line.startswith(("{", "[")):
+                    yield json.loads(line)
+        if run.returncode:
             said.seek(0)
             raise RuntimeError(f"{' '.join(command[1:])} failed:\n{said.read()[-2000:]}")
 
@@ -80,9 +74,18 @@ def answer(module: str, arguments: Sequence[str] = (), *, cores: int | None = 1)
     return last
 
 
-def bind(cores: int) -> None:
-    """Bind this process to so many of its cores, the last ones: the first is where a system's own work is done."""
-    os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[-cores:])
+@contextlib.contextmanager
+def bound(cores: int | None) -> Iterator[None]:
+    """What is started meanwhile is bound to so many cores, where the system can do that."""
+    if cores is None or not hasattr(os, "sched_setaffinity"):
+        yield
+        return
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, sorted(before)[-cores:])  # not the first, where the system's own work is done
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
 
 
 def configure(setting: Setting, cache: str | bool = False) -> None:

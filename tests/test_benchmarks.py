@@ -1,0 +1,146 @@
+"""The suite of benchmarks without peers: the chain is right, what is absent is named, the table says what was met."""
+
+import importlib.util
+import os
+import subprocess
+import sys
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+from benchmarks import _peers, chain
+from benchmarks._figures import Figure, digits, line
+from benchmarks._picture import draw, times_faster
+from benchmarks._process import child
+from benchmarks._report import Results, markdown
+from benchmarks._timing import in_turns
+
+ROOT = Path(__file__).parents[1]
+CHAIN = chain.Chain(n=4)
+
+
+def rotation(axis, angle):
+    """exp(angle [axis]x), Rodrigues."""
+    K = np.cross(np.eye(3), axis)
+    return np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+
+
+def joint_torques(system, q, u, u_dot):
+    """Newton's and Euler's equations link by link, in the inertial frame: what the joints would have to give."""
+    axes = np.eye(3)
+    R, w, alpha, a = np.eye(3), np.zeros(3), np.zeros(3), np.array([0.0, 0.0, float(system.gravity)])
+    I, m, l = np.diag([float(x) for x in system.inertia]), float(system.mass), float(system.length)
+    links = []
+    for i in range(system.n):
+        axis = R @ axes[i % 2]
+        R = R @ rotation(axes[i % 2], q[i])
+        alpha = alpha + axis * u_dot[i] + np.cross(w, axis * u[i])
+        w = w + axis * u[i]
+        down = R @ np.array([0.0, 0.0, -l])
+        a_center, a = (a + np.cross(alpha, r) + np.cross(w, np.cross(w, r)) for r in (down / 2, down))
+        J = R @ I @ R.T
+        links.append((axis, down, m * a_center, J @ alpha + np.cross(w, J @ w)))
+    force, moment, torques = np.zeros(3), np.zeros(3), []
+    for axis, down, F, T in reversed(links):
+        moment = moment + np.cross(down, force) + np.cross(down / 2, F) + T
+        force = force + F
+        torques.append(axis @ moment)
+    return np.array(torques)
+
+
+def test_the_joints_of_a_free_chain_give_no_torque():
+    rtol = 1e-12
+    q, u = chain.states(CHAIN.n, 3)
+    u_dot = chain.accelerations_by_jaxkane(CHAIN, q, u)
+    for state in zip(q, u, u_dot):
+        held = joint_torques(CHAIN, *state[:2], np.zeros(CHAIN.n))
+        assert np.abs(joint_torques(CHAIN, *state)).max() < rtol * np.abs(held).max()
+
+
+@pytest.mark.parametrize("peer", ["mujoco", "pinocchio"])
+def test_engines_accelerate_the_chain_alike(peer):
+    rtol = 1e-9
+    pytest.importorskip(peer)
+    q, u = chain.states(CHAIN.n, 3)
+    ours, theirs = (getattr(chain, f"accelerations_by_{who}")(CHAIN, q, u) for who in ("jaxkane", peer))
+    np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=rtol * np.abs(ours).max())
+
+
+def test_files_for_engines_hold_the_same_chain():
+    bodies = list(ET.fromstring(chain.mjcf(CHAIN)).iter("body"))
+    links = [link for link in ET.fromstring(chain.sdf(CHAIN)).iter("link") if link.get("name") != "ground"]
+    assert (len(bodies), len(links)) == (CHAIN.n, CHAIN.n)
+    for i, (body, link) in enumerate(zip(bodies, links)):
+        inertial, joint, I = body.find("inertial"), body.find("joint"), link.find("inertial/inertia")
+        moments = [float(x) for x in inertial.get("diaginertia").split()]
+        assert moments == [float(I.find(name).text) for name in ("ixx", "iyy", "izz")]
+        assert moments == [float(x) for x in CHAIN.inertia]
+        assert joint.get("axis") == ("1 0 0", "0 1 0")[i % 2]
+        assert body.get("pos") == ("0 0 -0.2" if i else "0 0 0.0")
+
+
+def test_what_is_not_installed_is_named(monkeypatch):
+    found = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "pinocchio" else found(name))
+    assert "pip install pin" in _peers.missing()["Pinocchio"]
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setenv("CC", "no-such-compiler")
+    assert {"Pinocchio", "SymPy + C", "PyDy's Cython"} <= set(_peers.missing())
+
+
+def test_a_part_runs_without_its_peers(tmp_path):
+    blocked = "import sys; sys.modules.update(dict.fromkeys(['mujoco', 'pinocchio', 'jaxsim', 'rod']))\n"
+    (tmp_path / "sitecustomize.py").write_text(blocked)
+    command = [sys.executable, "-m", "benchmarks", "chains", "--quick", "--out", str(tmp_path / "out")]
+    run = subprocess.run(
+        command, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 0, run.stderr
+    assert "left out: MuJoCo (pip install mujoco)" in run.stdout
+    table = (tmp_path / "out" / "results.md").read_text()
+    assert "| 2 links, a state: jaxkane |" in table
+    assert "not installed, and left out: Pinocchio" in table
+    assert str(tmp_path) not in table
+
+
+def test_verdicts():
+    fast, slow = Figure("p", "a", 1.9, at_most=2.0), Figure("p", "a", 2.1, column="native", at_most=2.0)
+    more, none = Figure("p", "b", 5.0, "rides/s", at_least=6.0), Figure("p", "c", 5.0, "ms")
+    assert [f.met for f in (fast, slow, more, none)] == [True, False, False, None]
+    assert times_faster(Figure("p", "a", 0.25, at_most=0.5)) == (4.0, 2.0)
+    assert line(more).endswith("5 rides a second   at least 6: not met")
+    assert [digits(x) for x in (0.0, 2e-5, 0.01234, 12.345, 12345.6, 1e7)] == [
+        "0.00e+00", "2.00e-05", "0.0123", "12.3", "12346", "1.00e+07"
+    ]  # fmt: skip
+
+
+def test_the_table_puts_columns_side_by_side_and_keeps_what_was_measured_here(tmp_path):
+    results = Results({"cores": "2"}, {"MJX": "pip install mujoco-mjx"})
+    results.figures["rides"] = [
+        Figure("rides", "faster than odeint", 3.0, column="XLA", at_least=2.5),
+        Figure("rides", "faster than odeint", 7.0, column="native", at_least=8.0),
+    ]
+    results.words["eigenvalues"] = "nine a second\n"
+    text = markdown(results)
+    assert "| faster than odeint | 3 | at least 2.5: met | 7 | at least 8: **missed** |" in text
+    assert "left out: MJX (pip install mujoco-mjx)" in text
+    assert "```text\nnine a second\n```" in text
+    results.write(tmp_path / "results.json")
+    assert markdown(Results.read(tmp_path / "results.json", {"cores": "2"}, results.missing)) == text
+    assert not Results.read(tmp_path / "results.json", {"cores": "4"}, {}).figures
+    assert draw(results.figures["rides"], tmp_path / "speed.png")
+    assert not draw([], tmp_path / "speed.png")
+
+
+def test_rivals_run_in_turns():
+    order = []
+    best = in_turns({"a": lambda: order.append("a"), "b": lambda: order.append("b")}, seconds=0.0, rounds=2)
+    assert order == ["a", "b"] * 3  # once to warm up, and two rounds
+    assert set(best) == {"a", "b"}
+    assert all(0 <= seconds < 1 for seconds in best.values())
+
+
+def test_a_child_that_fails_says_why():
+    with pytest.raises(RuntimeError, match="No module named no_such_module"):
+        list(child("no_such_module"))
