@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxkane import _native
+from jaxkane import _fuse, _native
 from jaxkane._fuse import fused, without_repetition
 
 
@@ -68,6 +68,32 @@ def test_the_same_as_plain_jax(name, compiled, kernels):
         ours = jax.jit(ours)
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14), ours(*ARGUMENTS), theirs(*ARGUMENTS)
+    )
+
+
+@pytest.fixture
+def by_xla():
+    was = _native.is_on()
+    _native.use(False)
+    yield
+    _native.use(was)
+
+
+@pytest.mark.parametrize("name", ["jit", "reverse", "batch", "batch of gradients", "gradient of a loop"])
+def test_a_long_program_in_pieces(name, by_xla, monkeypatch):
+    monkeypatch.setattr(_fuse, "_WHOLE_UP_TO", 4)
+    monkeypatch.setattr(_fuse, "_PIECE", 3)
+
+    def chosen(a, b, x):
+        left = x[0] < a  # what is not a float goes from piece to piece too
+        y, z = plain(a, b, x)
+        return jnp.where(left, y, 2.0 * y), z
+
+    transform = TRANSFORMATIONS[name]
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14),
+        jax.jit(transform(fused(chosen)))(*ARGUMENTS),
+        transform(chosen)(*ARGUMENTS),
     )
 
 
