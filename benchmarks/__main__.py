@@ -68,7 +68,12 @@ def main(arguments: list[str] | None = None) -> None:
             if part in SCRIPTS:
                 results.words[part] = words_of(part)
             else:
-                results.figures[part] = list(figures_of(part, given.quick, given.out))
+                results.figures[part] = found = []
+                for figure in figures_of(part, given.quick, given.out):
+                    print(line(figure), flush=True)
+                    found.append(figure)
+                if not found:
+                    print("  what this needs is not here")
         except (RuntimeError, subprocess.CalledProcessError) as error:
             failed.append(part)
             print(error, file=sys.stderr)
@@ -112,9 +117,7 @@ def figures_of(part: str, quick: bool, out: Path) -> Iterator[Figure]:
         options = ["--devices", str(setting.devices), "--folder", str(out.absolute())]
         options += ["--native"] * setting.native + ["--quick"] * quick
         for kept in child("benchmarks._part", [part, *options], cores=setting.devices):
-            figure = Figure(**kept | {"at_most": None, "at_least": None} if quick else kept)
-            print(line(figure), flush=True)
-            yield figure
+            yield Figure(**kept | {"at_most": None, "at_least": None} if quick else kept)
 
 
 def words_of(part: str) -> str:

@@ -52,4 +52,4 @@ def line(figure: Figure) -> str:
     """As it is printed while the suite runs."""
     verdict = {True: "met", False: "not met", None: ""}[figure.met]
     told = f"{figure.target}: {verdict}" if figure.target else ""
-    return f"  {figure.what:66s}{figure.column:8s}{figure!s:>22s}   {told}".rstrip()
+    return f"  {figure.what:74s}{figure.column:8s}{figure!s:>22s}   {told}".rstrip()
