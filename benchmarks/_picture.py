@@ -40,6 +40,7 @@ def draw(figures: Sequence[Figure], path: Path) -> bool:
     ax.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
     ax.xaxis.set_minor_formatter(NullFormatter())
     ax.set_yticks([-i for i in range(len(rows))], [shortened(row) for row in rows])
+    ax.set_ylim(0.5 - len(rows), 0.5)
     ax.set_xlabel("times faster than the peer")
     ax.grid(alpha=0.3)
     ax.set_axisbelow(True)
@@ -63,4 +64,4 @@ def times_faster(figure: Figure) -> tuple[float, float | None]:
 def shortened(row: str) -> str:
     for words in (", time against", ", rides a second against", ", times faster than"):
         row = row.replace(words, ":")
-    return row
+    return row.replace("first trajectory,", "first trajectory:").replace(" against ours", "")
