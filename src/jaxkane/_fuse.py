@@ -14,6 +14,7 @@ never opens it, each is traced once, and each is compiled as one function.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -35,6 +36,7 @@ _PLAIN = frozenset(
     "stop_gradient sub tan tanh transpose unstack".split()
 )
 _LARGEST_SUM = 64  # XLA may hand larger ones to a library
+_MOST_LANES = 128  # in XLA's hands: with more, intermediates no longer stay in the cache
 # XLA's time to compile a function grows faster than its length, above all where values of the beginning are needed at
 # the end, as in a reverse derivative: 6000 equations take 17 s whole, and 2.5 s in pieces.
 _WHOLE_UP_TO = 2500
@@ -216,6 +218,8 @@ def _inlined(*args, program, sizes, where):
 
 
 def _as_one_function(*args, program, sizes, where):
+    if math.prod(sizes) > _MOST_LANES and sizes[0] > 1:
+        return _in_chunks(args, program, sizes, where)
     program = program.batched(sizes, where) if sizes else program
     if not program.is_plain or 0 in sizes:
         return program.evaluate(*args)
@@ -227,6 +231,22 @@ def _as_one_function(*args, program, sizes, where):
     for piece in _pieces(jaxpr):
         values.update(zip(piece.outputs, _one_function(piece, [values[v] for v in piece.inputs]), strict=True))
     return [v.val if isinstance(v, Literal) else values[v] for v in jaxpr.outvars]
+
+
+def _in_chunks(args, program, sizes, where):
+    """A large batch, some of its first axis at a time; the last chunk begins earlier, so that all are alike."""
+    n, others = sizes[0], sizes[1:]
+    size = max(1, min(n, _MOST_LANES // math.prod(others)))
+    bind = functools.partial(_program_p.bind, program=program, sizes=(size, *others), where=where)
+
+    def chunk(i, outputs):
+        start = jax.numpy.minimum(i * size, n - size)
+        part = [jax.lax.dynamic_slice_in_dim(x, start, size) if w[0] else x for x, w in zip(args, where, strict=True)]
+        put = functools.partial(jax.lax.dynamic_update_slice_in_dim, start_index=start, axis=0)
+        return [put(whole, found) for whole, found in zip(outputs, bind(*part), strict=True)]
+
+    empty = [jax.numpy.zeros((*sizes, *a.shape), a.dtype) for a in program.out_avals]
+    return jax.lax.fori_loop(0, -(-n // size), chunk, empty)
 
 
 def _one_function(f: Callable[..., Any], args: Sequence[Any]) -> Any:

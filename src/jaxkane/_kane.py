@@ -194,7 +194,7 @@ class Instant:
         """f of M u_dot = f, without partial velocities: all vectors onto all speeds at once."""
         motion = self.motion(self.t, self.q, self.u_all)
         inertia = [tuple(scale3(-1.0, rate) for rate in rates) for rates in self.momentum_rates(motion)]
-        return self.onto_speeds(self.velocities, (inertia, self.load_vectors(motion)))
+        return self.onto_speeds(self.velocities, (inertia, self.force_components(motion)))
 
     def bias(self) -> Row:
         """u_dep_dot at u_dot = 0: the residual is differentiated, never the solution of the solve.
@@ -237,10 +237,10 @@ class Instant:
 
     def active_forces(self, motion: Motion, partials: list) -> Row:
         # F_r = sum F . V_r + T . W_r
-        vectors = self.load_vectors(motion)
+        vectors = self.force_components(motion)
         return tuple(_sum(dot(v, x) for v, x in zip(columns, vectors, strict=True)) for _, columns in partials)
 
-    def load_vectors(self, motion: Motion) -> list[Row]:
+    def force_components(self, motion: Motion) -> list[Row]:
         return [load.vector.components_in(load.velocity.frame) for load in self.loads(motion)]
 
     def inertia_forces(self, motion: Motion, partials: list) -> Row:

@@ -114,7 +114,7 @@ class Reactions(Instant):
         u_dot = self.accelerations()
         u_dep_dot = self.dependent_accelerations(u_dot)
         self.momentum = self.momentum_rates(self.description, (*u_dot, *u_dep_dot))
-        self.load_vectors = [load.vector.components_in(load.velocity.frame) for load in self.loads(self.description)]
+        self.load_vectors = self.force_components(self.description)
         # R_dep + C_dep^T lambda = 0
         directions = [unit(self.n + self.k, self.n + r) for r in range(self.k)]
         R = [mul(-1.0, self.unbalanced(self.along_speeds(self.velocities, direction))) for direction in directions]

@@ -164,7 +164,7 @@ Load = Force | Torque
 
 def weight(motion: Motion, gravity: Vector) -> tuple[Force, ...]:
     """The weight of every body of a motion; `gravity` [m/s^2] is a Vector such as `9.81 * N.z`."""
-    return tuple(Force(body.mass * gravity.express(body.center.velocity.frame), body.center) for body in motion.bodies)
+    return tuple(Force(body.mass * gravity, body.center) for body in motion.bodies)
 
 
 def flatten_loads(loads: Any) -> tuple[Load, ...]:
