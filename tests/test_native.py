@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane import _fuse, _native
+from jaxkane import _native
 from jaxkane._equations import _state_rates, state_rates
 from jaxkane._fuse import _Program, fused
 
@@ -44,7 +44,7 @@ OPERATIONS = dict(
     "pow": lambda x: (4 + x) ** 1.7,
     "atan2": lambda x: jnp.arctan2(x, x[::-1]),
     "rem": lambda x: jax.lax.rem(x, jnp.asarray(0.7, x.dtype)),
-    "integer powers": lambda x: [x**n for n in (-3, -1, 0, 2, 7)],
+    "integer powers": lambda x: [jax.lax.integer_pow(x, n) for n in (-3, -1, 0, 2, 7)],
     "max and min": lambda x: [jnp.maximum(x, x[::-1]), jnp.minimum(x, 0.1), jnp.clip(x, -0.5, 0.5)],
     "comparisons": lambda x: [x < x[::-1], x <= 0.0, x > 0.0, x >= x, x == x[::-1], x != x],
     "logic": lambda x: [(x > 0.0) & (x < 1.0), (x > 0.0) | (x < -1.0), ~(x > 0.0), (x > 0.0) ^ (x < 1.0)],
@@ -72,16 +72,6 @@ def test_every_operation(dtype):
         for name in OPERATIONS:
             rows = [row[name] for row in expected[:n]]
             jax.tree.map(check, found[name], jax.tree.map(lambda *a: jnp.stack(a), *rows))
-
-
-def test_the_same_graph_in_numpy():
-    f = lambda x: {name: operation(x) for name, operation in OPERATIONS.items() if name != "erf"}  # noqa: E731
-    x = jnp.array([0.3, -1.2, 0.9])
-    check = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14)  # noqa: E731
-    found = _fuse.evaluated(f, x)
-    jax.tree.map(check, found, jax.jit(f)(x))
-    assert all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(found))
-    np.testing.assert_allclose(_fuse.evaluated(lambda A: jnp.linalg.inv(A), 2 * jnp.eye(2)), 0.5 * np.eye(2))
 
 
 def test_a_member_does_not_depend_on_its_place():

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from ._fuse import evaluated, fused
+from ._components import cross
+from ._fuse import fused
 from ._kane import Instant
 from ._linear import as_vector, stack
 from ._system import Motion, System, parameter_info
@@ -47,14 +48,13 @@ def check_system(system: System, t: Any, q: Any, u: Any, *, strict: bool = False
         return
     with jax.ensure_compile_time_eval(), np.errstate(invalid="ignore"):
         if type(system) not in _CHECKED:
-            if not np.all(np.isfinite(np.asarray(q, dtype=float))):
+            now = Instant(system, t, q, u)
+            if not np.all(np.isfinite([float(x) for x in now.q])):
                 return
-            velocities, u_all = evaluated(_trial_velocities, system, t, q, u)
-            eps = float(jnp.finfo(jnp.asarray(q).dtype).eps)
-            _check_affine(system, velocities, eps)
-            if not np.all(np.isfinite(u_all)):
+            _check_affine(now)
+            if not np.all(np.isfinite([float(x) for x in now.u_all])):
                 return
-            _check_rates(system, t, q, u, eps)
+            _check_rates(now)
             _CHECKED.add(type(system))
         _check_bodies(system, t, q, u, strict)
 
@@ -116,105 +116,91 @@ def _velocities(now: Instant, u) -> dict[str, Any]:
         found[f"the angular velocity of {body.name!r}"] = body.angular_velocity.components
     for name, rate in zip(now.system.coordinates, now.rates(now.t, now.q, u), strict=True):
         found[f"the rate of the coordinate {name!r}"] = [rate]
-    return {name: stack([values])[0] for name, values in found.items()}
+    return {name: np.array([float(x) for x in values]) for name, values in found.items()}
 
 
-def _trial_velocities(system: System, t: Any, q: Any, u: Any):
-    """All velocities at no speed, at all speeds, at each alone and at twice each; and the speeds at `u`."""
-    now = Instant(system, t, q, u)
-    n = now.n + now.k
+def _check_affine(now: Instant) -> None:
+    names = (*now.system.speeds, *now.system.dependent_speeds)
+    n = len(names)
     points = np.random.default_rng(0).uniform(0.5, 1.5, n)
-    at = lambda *places, by=1.0: tuple(by * float(points[i]) if i in places else 0.0 for i in range(n))  # noqa: E731
+    at = lambda *places: tuple(float(points[i]) if i in places else 0.0 for i in range(n))  # noqa: E731
     zero, full = _velocities(now, at()), _velocities(now, at(*range(n)))
     single = [_velocities(now, at(i)) for i in range(n)]
-    twice = [_velocities(now, at(i, by=2.0)) for i in range(n)]
-    return (zero, full, single, twice), stack([now.u_all])
-
-
-def _check_affine(system: System, velocities: Any, eps: float) -> None:
-    zero, full, single, twice = velocities
-    names = (*system.speeds, *system.dependent_speeds)
+    twice = [_velocities(now, tuple(2.0 * x for x in at(i))) for i in range(n)]
     for what in zero:
         curved = [
-            name
-            for name, one, two in zip(names, single, twice, strict=True)
-            if _differs(two[what] - 2.0 * one[what] + zero[what], one[what], eps)
+            names[i]
+            for i in range(n)
+            if _differs(now, twice[i][what] - 2.0 * single[i][what] + zero[what], single[i][what])
         ]
         sum_of_parts = zero[what] + sum(s[what] - zero[what] for s in single)
-        if curved or _differs(full[what] - sum_of_parts, full[what], eps):
+        if curved or _differs(now, full[what] - sum_of_parts, full[what]):
             which = f"in {', '.join(curved)}" if curved else "in the speeds: it holds products of two speeds"
             raise ValueError(
-                f"{type(system).__name__}: {what} is not affine {which}. Kane's method needs velocities that are "
-                "linear in the speeds, plus a term that may depend on time and coordinates."
+                f"{now.name}: {what} is not affine {which}. Kane's method needs velocities that are linear in the "
+                "speeds, plus a term that may depend on time and coordinates."
             )
 
 
-def _differs(difference: Any, size: Any, eps: float) -> bool:
+def _differs(now: Instant, difference: Any, size: Any) -> bool:
+    eps = float(jnp.finfo(jnp.result_type(*[x for x in now.q if not isinstance(x, float)] or [float])).eps)
     difference, size = np.max(np.abs(difference), initial=0.0), np.max(np.abs(size), initial=1.0)
     return bool(np.isfinite(difference) and difference > eps**0.5 * size)
 
 
-def _trial_rates(system: System, t: Any, q: Any, u: Any):
-    """By name and beside the given state: how frames and mass centres move by their places and by their velocities, in
-    N; and how bodies turn in their frames (spin, inertia)."""
+def _check_rates(now: Instant) -> None:
     rng = np.random.default_rng(1)
-    now = Instant(system, t, q, u)
-    beside = list(now.q)
+    q = [jnp.asarray(x) for x in now.q]
     if not now.configuration(now.t, now.q):  # free to look beside the given configuration
-        beside = [x + jnp.asarray(rng.uniform(-0.1, 0.1), x.dtype) for x in beside]
-    dtype = beside[0].dtype
-    now = Instant(system, now.t, beside, [jnp.asarray(rng.uniform(0.5, 1.5), dtype) for _ in now.u])
+        q = [x + jnp.asarray(rng.uniform(-0.1, 0.1), x.dtype) for x in q]
+    u = [jnp.asarray(rng.uniform(0.5, 1.5), x.dtype) for x in map(jnp.asarray, now.u)]
+    now = Instant(now.system, now.t, q, u)
 
     def geometry(t, *q):
         motion = now.motion(t, q, now.u_all)
-        points = [b.center.position.to(motion.N) for b in motion.bodies if b.center.has_position]
-        return [_rotation(f) for f in _frames(motion)], points
+        frames = [_rotation(f) for f in _frames(motion)]
+        points = [
+            b.center.position.to(motion.N) if b.center.has_position else jnp.zeros(3, q[0].dtype) for b in motion.bodies
+        ]
+        return frames, points
 
-    primals, tangents = ([jnp.asarray(x, dtype) for x in xs] for xs in ((now.t, *now.q), (1.0, *now.q_dot)))
-    (rotations, _), (rotations_dot, points_dot) = jax.jvp(geometry, primals, tangents)
+    tangents = (1.0, *now.q_dot)
+    primals = [jnp.asarray(x, dtype=q[0].dtype) for x in (now.t, *now.q)]
+    (rotations, _), (rotations_dot, points_dot) = jax.jvp(
+        geometry, primals, [jnp.asarray(x, dtype=q[0].dtype) for x in tangents]
+    )
     motion = now.motion(now.t, now.q, now.u_all)
-    # Keys are numbered, since two frames may have one name.
-    frames = {
-        (i, frame.name): (R, R_dot, frame.angular_velocity.to(motion.N))
-        for i, (frame, R, R_dot) in enumerate(zip(_frames(motion), rotations, rotations_dot, strict=True))
-    }
-    placed = [b for b in motion.bodies if b.center.has_position]
-    points = {
-        (i, b.name): (x_dot, b.center.velocity.to(motion.N))
-        for i, (b, x_dot) in enumerate(zip(placed, points_dot, strict=True))
-    }
-    bodies = {
-        (i, b.name, b.frame.name): ((b.angular_velocity - b.frame.angular_velocity).to(b.frame), stack(b.inertia))
-        for i, b in enumerate(motion.bodies)
-    }
-    return frames, points, bodies
-
-
-def _check_rates(system: System, t: Any, q: Any, u: Any, eps: float) -> None:
-    name = type(system).__name__
-    frames, points, bodies = evaluated(_trial_rates, system, t, q, u)
-    for (_, frame), (R, R_dot, stated) in frames.items():
+    for frame, R, R_dot in zip(_frames(motion), rotations, rotations_dot, strict=True):
         skew = R_dot.T @ R  # [omega x] in N, for R from N to the frame
         by_orientation = np.array([skew[2, 1], skew[0, 2], skew[1, 0]])
-        _compare(f"{name}: the frame {frame!r} turns", "rad/s", by_orientation, stated, eps)
-    for (_, body), (by_position, stated) in points.items():
-        _compare(f"{name}: the mass centre of {body!r} moves", "m/s", by_position, stated, eps)
-    for (_, body, frame), (spin, I) in bodies.items():
-        turned = np.cross(spin, I.T).T  # [spin x] I
-        if _differs(turned + turned.T, np.abs(I).max() * max(np.abs(spin).max(), 1.0), eps):
-            raise ValueError(
-                f"{name}: the body {body!r} turns in its frame {frame!r}, but its inertia is not symmetric about that "
-                "axis, so it is not constant there. Give the body a frame that turns with it."
-            )
+        _compare(now, f"frame {frame.name!r}", "turns", "rad/s", by_orientation, frame.angular_velocity.to(motion.N))
+    for body, by_position in zip(motion.bodies, points_dot, strict=True):
+        if body.center.has_position:
+            velocity = body.center.velocity.to(motion.N)
+            _compare(now, f"mass centre of {body.name!r}", "moves", "m/s", by_position, velocity)
+        _check_axisymmetry(now, body)
 
 
-def _compare(what: str, unit: str, by_position: Any, stated: Any, eps: float) -> None:
-    if _differs(by_position - stated, stated, eps):
+def _compare(now: Instant, what: str, verb: str, unit: str, by_position: Any, stated: Any) -> None:
+    by_position, stated = np.asarray(by_position), np.asarray(stated)
+    if _differs(now, by_position - stated, stated):
         show = lambda x: "(" + ", ".join(f"{a:.4g}" for a in x) + ")"  # noqa: E731
         raise ValueError(
-            f"{what} with {show(by_position)} {unit} by the rates of its coordinates, but with {show(stated)} {unit} "
-            "by its description (components in N, at a trial state). A rate that is given to a frame or a point "
-            "contradicts q_dot; or a point is called fixed in a frame in which it moves."
+            f"{now.name}: the {what} {verb} with {show(by_position)} {unit} by the rates of its coordinates, but with "
+            f"{show(stated)} {unit} by its description (components in N, at a trial state). A rate that is given to a "
+            "frame or a point contradicts q_dot; or a point is called fixed in a frame in which it moves."
+        )
+
+
+def _check_axisymmetry(now: Instant, body) -> None:
+    spin = body.angular_velocity - body.frame.angular_velocity
+    I = np.asarray(stack(body.inertia))
+    s = np.array([float(x) for x in spin.components_in(body.frame)])
+    turned = np.array([[float(x) for x in cross(tuple(s), tuple(column))] for column in I.T]).T  # [s x] I
+    if _differs(now, turned + turned.T, np.abs(I).max() * max(np.abs(s).max(), 1.0)):
+        raise ValueError(
+            f"{now.name}: the body {body.name!r} turns in its frame {body.frame.name!r}, but its inertia is not "
+            "symmetric about that axis, so it is not constant there. Give the body a frame that turns with it."
         )
 
 

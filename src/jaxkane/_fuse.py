@@ -19,7 +19,6 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import numpy as np
 from jax.experimental.xla_metadata import set_xla_metadata
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun
 from jax.interpreters import ad, batching, mlir
@@ -69,19 +68,6 @@ def fused(f: Callable[..., Any]) -> Callable[..., Any]:
         return jax.tree.unflatten(structure, program(*leaves))
 
     return call
-
-
-def evaluated(f: Callable[..., Any], *args: Any) -> Any:
-    """f(*args) of a pure function that is needed once: in NumPy, which compiles nothing, or else by JAX."""
-    leaves, treedef = jax.tree.flatten(args)
-    leaves = [np.asarray(x) for x in leaves]
-    leaves = [x if x.dtype == bool else x.astype(jax.numpy.result_type(float, x.dtype)) for x in leaves]
-    program, out = jax.make_jaxpr(lambda *leaves: f(*jax.tree.unflatten(treedef, leaves)), return_shape=True)(*leaves)
-    try:
-        found = native.evaluate(program, leaves)
-    except NotScalarError:
-        return jax.tree.map(np.asarray, f(*args))
-    return jax.tree.unflatten(jax.tree.structure(out), found)
 
 
 def _specs(avals: Sequence[Any]) -> list[jax.ShapeDtypeStruct]:

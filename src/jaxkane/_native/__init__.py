@@ -14,12 +14,12 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from ._graph import CALLS, LIBRARY, NotScalarError, evaluate, graph_of, symbol
+from ._graph import CALLS, LIBRARY, Graph, NotScalarError, symbol, unrolled
 from ._handler import handler_text
 from ._llvm import Writer
 from ._machine import is_on, machine, use, why_not
 
-__all__ = ["CALLS", "NotScalarError", "Scalars", "evaluate", "is_on", "use", "why_not"]
+__all__ = ["CALLS", "NotScalarError", "Scalars", "is_on", "use", "why_not"]
 
 
 class Scalars:
@@ -29,7 +29,13 @@ class Scalars:
     """
 
     def __init__(self, program: ClosedJaxpr):
-        self.graph, self.inputs, self.outputs = graph_of(program)
+        self.graph = Graph()
+        self.inputs = [
+            np.array([self.graph.add("input", (i, e, aval.size), str(aval.dtype)) for e in range(aval.size)], np.int64)
+            for i, aval in enumerate(program.in_avals)
+        ]
+        shaped = [x.reshape(aval.shape) for x, aval in zip(self.inputs, program.in_avals, strict=True)]
+        self.outputs = unrolled(program.jaxpr, program.consts, shaped, self.graph)
         self.bytes_of = [a.size * a.dtype.itemsize for a in (*program.in_avals, *program.out_avals)]
         for node in self.graph.nodes:
             if node.operation in LIBRARY and not machine().has(symbol(node)):

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import Jaxpr, Literal
 
 CALLS = ("jit", "pjit")
 
@@ -21,15 +21,6 @@ INTRINSICS = {"sqrt": "sqrt", "abs": "fabs", "floor": "floor", "max": "maximum",
 LIBRARY = frozenset(
     "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp exp2 expm1 log log1p pow cbrt erf".split()
 )
-_IN_NUMPY: dict[str, Callable[..., Any]] = {
-    **{name: getattr(np, name) for name in "abs sqrt floor sin cos tan sinh cosh tanh".split()},
-    **{name: getattr(np, name) for name in "exp exp2 expm1 log log1p cbrt".split()},
-    **{f"a{name}": getattr(np, f"arc{name}") for name in "sin cos tan tan2 sinh cosh tanh".split()},
-    **{"add": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "rem": np.fmod, "neg": np.negative},
-    **{"max": np.maximum, "min": np.minimum, "pow": np.power, "select": lambda c, x, y: x if c else y},
-    **{"and": np.logical_and, "or": np.logical_or, "xor": np.logical_xor, "eq": np.equal, "ne": np.not_equal},
-    **{"lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal},
-}
 _COMMUTES = frozenset("add mul max min and or xor".split())
 _SAME = frozenset("copy copy_p stop_gradient optimization_barrier".split())
 
@@ -99,39 +90,7 @@ class Graph:
         return None
 
 
-def graph_of(program: ClosedJaxpr) -> tuple[Graph, list[np.ndarray], list[np.ndarray]]:
-    """A program's graph, and the numbers of the nodes that are its inputs and outputs, in their shapes."""
-    graph, inputs = Graph(), []
-    for i, aval in enumerate(program.in_avals):
-        elements = [graph.add("input", (i, e, aval.size), str(aval.dtype)) for e in range(aval.size)]
-        inputs.append(np.array(elements, np.int64).reshape(aval.shape))
-    return graph, inputs, _unrolled(program.jaxpr, program.consts, inputs, graph)
-
-
-def evaluate(program: ClosedJaxpr, inputs: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """The program's outputs, node by node in NumPy."""
-    graph, _, outputs = graph_of(program)
-    values: list[Any] = []
-    with np.errstate(all="ignore"):
-        for node in graph.nodes:
-            kind = np.dtype(node.dtype).type
-            match node.operation:
-                case "input":
-                    argument, element, _ = node.operands
-                    values.append(inputs[argument].flat[element])
-                case "constant":
-                    values.append(kind(graph.value(len(values))))
-                case "convert":
-                    values.append(kind(values[node.operands[0]]))
-                case operation if operation in _IN_NUMPY:
-                    values.append(_IN_NUMPY[operation](*(values[i] for i in node.operands)))
-                case operation:
-                    raise NotScalarError(operation)
-    avals = zip(outputs, program.out_avals, strict=True)
-    return [np.array([values[k] for k in x.flat], aval.dtype).reshape(aval.shape) for x, aval in avals]
-
-
-def _unrolled(program: Jaxpr, consts: Sequence[Any], inputs: Sequence[np.ndarray], graph: Graph) -> list[np.ndarray]:
+def unrolled(program: Jaxpr, consts: Sequence[Any], inputs: Sequence[np.ndarray], graph: Graph) -> list[np.ndarray]:
     """The program's outputs as arrays of node numbers."""
 
     def constants(x: Any) -> np.ndarray:
@@ -147,7 +106,7 @@ def _unrolled(program: Jaxpr, consts: Sequence[Any], inputs: Sequence[np.ndarray
         xs = [constants(v.val) if isinstance(v, Literal) else values[v] for v in equation.invars]
         if equation.primitive.name in CALLS:
             inner = equation.params["jaxpr"]
-            outputs = _unrolled(inner.jaxpr, inner.consts, xs, graph)
+            outputs = unrolled(inner.jaxpr, inner.consts, xs, graph)
         else:
             found = _operation(equation, xs, graph)
             avals: list[Any] = [v.aval for v in equation.outvars]
