@@ -1,46 +1,25 @@
 """Systems of many speeds: columns of M and f by transposition, in the order of the bodies."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from benchmarks.chain import Chain
 
 import jaxkane as jk
 from jaxkane import _equations, _linear
 from jaxkane._fuse import _Program
 
 
-class Chain(jk.System):
-    """n cylinders, one below the other, on joints that turn about x, y, x, ...; a damper in the last."""
+class DampedChain(Chain):
+    """With a damper in the last joint."""
 
-    n: int = eqx.field(static=True, default=5)
-    mass: jk.Scalar = jk.parameter(0.3)
-    length: jk.Scalar = jk.parameter(0.2)
-    damping: jk.Scalar = jk.parameter(0.0)
-
-    @property
-    def coordinates(self):
-        return tuple(f"q{i}" for i in range(self.n))
-
-    @property
-    def speeds(self):
-        return tuple(f"u{i}" for i in range(self.n))
-
-    def motion(self, t, q, u):
-        link, joint = jk.inertial()
-        bodies = []
-        for i in range(self.n):
-            above, link = link, link.rotate(1 + i % 2, q[i], u[i])
-            inertia = tuple(self.mass * self.length**2 * x for x in (0.08, 0.083, 0.005))
-            bodies.append(jk.Body(self.mass, inertia, joint.fixed(-0.5 * self.length * link.z), link, name=f"{i}"))
-            joint = joint.fixed(-self.length * link.z)
-        return jk.Motion(bodies, frames={"above": above})
+    damping: jk.Scalar = jk.parameter(0.2)
 
     def loads(self, t, q, u, motion, inputs):
         last = motion.bodies[-1].frame
         torque = jk.Torque(-self.damping * u[self.n - 1] * (last.y if self.n % 2 == 0 else last.x), last)
-        return [*jk.weight(motion, -9.81 * motion.N.z), torque]
+        return [*super().loads(t, q, u, motion, inputs), torque]
 
 
 def at(system, n, seed=0):
@@ -55,7 +34,7 @@ def bicycle():
 
 
 SYSTEMS = {
-    "chain": lambda: at(Chain(n=5, damping=0.2), 5),
+    "chain": lambda: at(DampedChain(n=5), 5),
     "bicycle": bicycle,  # dependent speeds
     "double pendulum": lambda: at(jk.catalog.DoublePendulum(mass=1.0, length=0.7), 2),
 }

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxkane import _fuse, _native
+from jaxkane import _fuse
 from jaxkane._fuse import fused, without_repetition
 
 
@@ -49,16 +49,6 @@ TRANSFORMATIONS = {
 }
 
 
-@pytest.fixture(scope="module", params=["native", "XLA"])
-def kernels(request):
-    was = _native.is_on()
-    if request.param == "native" and _native.why_not():
-        pytest.skip(_native.why_not())
-    _native.use(request.param == "native")
-    yield request.param
-    _native.use(was)
-
-
 @pytest.mark.parametrize("name", TRANSFORMATIONS)
 @pytest.mark.parametrize("compiled", [False, True], ids=["eager", "jit"])
 def test_the_same_as_plain_jax(name, compiled, kernels):
@@ -69,14 +59,6 @@ def test_the_same_as_plain_jax(name, compiled, kernels):
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14), ours(*ARGUMENTS), theirs(*ARGUMENTS)
     )
-
-
-@pytest.fixture
-def by_xla():
-    was = _native.is_on()
-    _native.use(False)
-    yield
-    _native.use(was)
 
 
 @pytest.mark.parametrize("name", ["jit", "reverse", "batch", "batch of gradients", "gradient of a loop"])

@@ -10,17 +10,9 @@ from jaxkane import _native
 from jaxkane._equations import _state_rates, state_rates
 from jaxkane._fuse import _Program, fused
 
-pytestmark = pytest.mark.skipif(bool(_native.why_not()), reason=f"no native kernels: {_native.why_not()}")
+pytestmark = pytest.mark.usefixtures("native")
 
 LARGEST = 19
-
-
-@pytest.fixture(autouse=True)
-def native():
-    was = _native.is_on()
-    _native.use(True)
-    yield
-    _native.use(was)
 
 
 def on_x(*names):

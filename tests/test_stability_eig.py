@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane import _native
 from jaxkane.stability import linearize, straight_ahead
 from jaxkane.stability._eig import CHUNK, eig, eigvals
 from jaxkane.stability._qr import qr_eigenvalues
@@ -120,17 +119,7 @@ def test_a_batch_is_what_its_members_are(n):
     np.testing.assert_allclose(eigvals(A[0, 0]), single[0])
 
 
-@pytest.fixture(scope="module", params=["native", "LAPACK"])
-def way(request):
-    was = _native.is_on()
-    if request.param == "native" and _native.why_not():
-        pytest.skip(_native.why_not())
-    _native.use(request.param == "native")
-    yield request.param
-    _native.use(was)
-
-
-def test_a_batch_of_bicycles_against_the_literature(way):
+def test_a_batch_of_bicycles_against_the_literature(kernels):
     """Meijaard et al. (2007), Table 2, among three hundred others; and beside the double root, as LAPACK's."""
     atol = 1e-11
     speeds = jnp.concatenate([jnp.linspace(0.0, 10.0, 301), DOUBLE_ROOT + jnp.linspace(-1e-6, 1e-6, 21)])
@@ -147,7 +136,7 @@ def test_a_batch_of_bicycles_against_the_literature(way):
         np.testing.assert_allclose((pair[1] - pair[0]) ** 2, (other[1] - other[0]) ** 2, atol=1e-13)
 
 
-def test_derivatives_of_values_alone_are_those_of_both(way):
+def test_derivatives_of_values_alone_are_those_of_both(kernels):
     rtol = 1e-12
     A = np.random.default_rng(0).standard_normal((CHUNK, 3, 3))
     of_each = lambda f: jax.jit(jax.vmap(jax.jacrev(lambda a: jnp.sum(f(a).real ** 2))))(A)  # noqa: E731

@@ -212,8 +212,7 @@ UPRIGHT = {
 
 def which_way_is_up(forces: np.ndarray) -> str:
     """The axis of N that is nearest to the opposite of gravity: of the constant forces (n_t, l, 3) on mass centres."""
-    largest = np.abs(forces).max(initial=np.finfo(forces.dtype).tiny)
-    constant = np.ptp(forces, axis=0).max(axis=1, initial=0.0) <= np.finfo(forces.dtype).eps ** 0.5 * largest
+    constant = np.ptp(forces, axis=0).max(axis=1, initial=0.0) <= 1e-9 * (np.abs(forces).max(initial=0.0) + 1e-300)
     down = forces[0, constant].sum(axis=0)
     if not np.any(down):
         return "z"

@@ -29,13 +29,11 @@ class Scalars:
     """
 
     def __init__(self, program: ClosedJaxpr):
-        self.graph = Graph()
-        self.inputs = [
-            np.array([self.graph.add("input", (i, e, aval.size), str(aval.dtype)) for e in range(aval.size)], np.int64)
-            for i, aval in enumerate(program.in_avals)
-        ]
-        shaped = [x.reshape(aval.shape) for x, aval in zip(self.inputs, program.in_avals, strict=True)]
-        self.outputs = unrolled(program.jaxpr, program.consts, shaped, self.graph)
+        self.graph, inputs = Graph(), []
+        for i, aval in enumerate(program.in_avals):
+            elements = [self.graph.add("input", (i, e, aval.size), str(aval.dtype)) for e in range(aval.size)]
+            inputs.append(np.array(elements, np.int64).reshape(aval.shape))
+        self.outputs = unrolled(program.jaxpr, program.consts, inputs, self.graph)
         self.bytes_of = [a.size * a.dtype.itemsize for a in (*program.in_avals, *program.out_avals)]
         for node in self.graph.nodes:
             if node.operation in LIBRARY and not machine().has(symbol(node)):
@@ -45,7 +43,7 @@ class Scalars:
 
     def _kernel(self, varies: tuple[bool, ...], lanes: int) -> str:
         writer = Writer(self.graph, varies, lanes, functools.partial(machine().of_lanes, lanes=lanes))
-        return machine().compile(writer.text(len(self.inputs), self.outputs))[1]
+        return machine().compile(writer.text(len(varies), self.outputs))[1]
 
     def _target(self, sizes: tuple[int, ...], where: tuple[tuple[bool, ...], ...]) -> str:
         """The name under which XLA calls the program for a batch of `sizes`, of whose dimensions argument i has those
