@@ -1,0 +1,78 @@
+"""Values that do not exist: NaN, and so is their derivative. Knows arrays only.
+
+`jnp.where(missing, jnp.nan, x)` has the derivative zero where it is NaN, and an optimizer takes that for the end of its
+search. A factor NaN instead would be read in reverse mode even by who does not read what is missing: 0 * NaN is NaN.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+
+def nan_where(missing: Bool[Array, " *leading"], values: Any, origin: Any) -> Any:
+    """`values`, and NaN where they are missing, with derivatives of any order that are NaN there too.
+
+    **Arguments:**
+
+    - `missing` (*leading): where there is no value. `values`: arrays (*leading, ...).
+    - `origin`: all that the values follow from; its float arrays are what derivatives are taken by.
+
+    The derivative of what is missing is NaN along every direction in which `origin` moves, and zero where it does not.
+    In reverse mode, what is missing and not read adds exactly zero.
+    """
+    moved = [jnp.ravel(x) for x in jax.tree.leaves(origin) if eqx.is_inexact_array(x)]
+
+    def one(x: Array) -> Array:
+        real = jnp.finfo(x.dtype).dtype
+        there = jnp.broadcast_to(jnp.reshape(missing, (*missing.shape, *(1,) * (x.ndim - missing.ndim))), x.shape)
+        parts = [part.astype(real) for y in moved for part in ((y.real, y.imag) if jnp.iscomplexobj(y) else (y,))]
+        point = jnp.concatenate(parts) if parts else jnp.zeros(0, real)
+        if jnp.iscomplexobj(x):
+            return jax.lax.complex(_nan_where(there, x.real, point), _nan_where(there, x.imag, point))
+        return _nan_where(there, x, point)
+
+    return jax.tree.map(one, values)
+
+
+@jax.custom_jvp
+def _nan_where(missing: Array, x: Array, point: Array) -> Array:
+    return jnp.where(missing, jnp.nan, x)
+
+
+@_nan_where.defjvp
+def _(primals: Any, tangents: Any) -> Any:
+    (missing, x, point), (_, x_dot, point_dot) = primals, tangents
+    return _nan_where(missing, x, point), jnp.where(missing, _spread(point_dot, point, x.shape), x_dot)
+
+
+def _spread(point_dot: Array, point: Array, shape: tuple[int, ...]) -> Array:
+    """NaN everywhere if `point` moves. Twice, so that neither tangents nor cotangents cancel in the sum."""
+    moves = jnp.sum(_nan_if_not_zero(point_dot, point))
+    return _nan_if_not_zero(jnp.broadcast_to(moves, shape), point)
+
+
+def _nan_if_not_zero(b: Array, point: Array) -> Array:
+    """The x of 0 x = b: zero for b = 0, else there is none. Linear in b, and its own transpose.
+
+    The zero belongs to a `point`: where it moves, the derivative of an x that does not exist does not exist either.
+    """
+    return jax.lax.custom_linear_solve(
+        lambda x: _zero_times(x, point), b, lambda _, b: jnp.where(b == 0, jnp.zeros_like(b), jnp.nan), symmetric=True
+    )
+
+
+@jax.custom_jvp
+def _zero_times(x: Array, point: Array) -> Array:
+    return 0.0 * (x + jnp.sum(point))  # not a constant: what is batched in the derivative must be so in the value
+
+
+@_zero_times.defjvp
+def _(primals: Any, tangents: Any) -> Any:
+    (x, point), (_, point_dot) = primals, tangents
+    moved = _spread(point_dot, point, x.shape)
+    return _zero_times(x, point), jnp.where(x == 0, jnp.zeros_like(x), moved)
