@@ -15,7 +15,7 @@ SOURCE = Path(jk.__file__).parent
 
 # Each module may import from the lines above it, and within the same package.
 FLOORS = [
-    ["_types", "_components", "_linear", "_nan", "_native", "_fuse", "_kinks"],
+    ["_lookup", "_types", "_components", "_linear", "_nan", "_native", "_fuse", "_kinks"],
     ["rotations", "_vectors"],
     ["_system", "_trajectory"],
     ["loads"],

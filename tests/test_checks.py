@@ -220,7 +220,7 @@ def test_shapes_and_names():
         jk.accelerations(bike, 0.0, q[:7], u)
     with pytest.raises(ValueError, match=r"u must have the shape \(3,\): roll_rate, .*Got \(4, 3\).*vmap"):
         jk.accelerations(bike, 0.0, q, np.zeros((4, 3)))
-    with pytest.raises(ValueError, match=r"no input named brake. It has: roll_torque, drive_torque, steer_torque"):
+    with pytest.raises(ValueError, match=r"no input named brake; it has roll_torque, drive_torque, steer_torque"):
         jk.accelerations(bike, 0.0, q, u, {"brake": 1.0})
     with pytest.raises(ValueError, match=r"q has no lean; it has roll"):
         jk.accelerations(bike, 0.0, {"lean": 0.1}, u)

@@ -172,7 +172,7 @@ def test_mode_shapes_are_turned_to_their_largest_state():
     np.testing.assert_allclose(arrows[0], [(0.0, 1.0), (-np.pi / 2, 0.5)], atol=1e-12)
     np.testing.assert_allclose(arrows[1], [(0.0, 1.0), (np.pi, 0.5)], atol=1e-12)
     assert [ax.get_title() for ax in axes] == ["-1 ± 2i 1/s", "-3 1/s"]
-    with pytest.raises(ValueError, match="there is no pitch among the states roll, steer"):
+    with pytest.raises(ValueError, match="there is no state pitch; there are roll, steer"):
         jk.plot.mode_shapes(np.array([-3.0]), np.ones((2, 1)), ["roll", "steer"], only=("pitch",))
 
 

@@ -28,6 +28,7 @@ from jaxtyping import Array
 
 from ._components import add, add3, component, cross, dot, is_exact, is_zero, matvec, mul, scale3
 from ._linear import Rows, solve, solve_positive
+from ._lookup import refuse_unknown
 from ._system import Body, Load, Motion, System, flatten_loads
 from ._types import Component
 
@@ -309,9 +310,7 @@ def as_row(values: Any, names: Sequence[str], label: str) -> Row:
 def as_array(values: Any, names: Sequence[str], label: str) -> Array:
     """Numbers, in their order or by name, as a float array of shape (len(names),). Those not named are zero."""
     if isinstance(values, Mapping):
-        unknown = sorted(set(values) - set(names))
-        if unknown:
-            raise ValueError(f"{label} has no {', '.join(unknown)}; it has {', '.join(names)}.")
+        refuse_unknown(values, names, f"{label} has no", "it has")
         values = jnp.stack([jnp.asarray(values.get(name, 0.0), dtype=float) for name in names])
     array = jnp.asarray(values)
     if not jnp.issubdtype(array.dtype, jnp.inexact):
@@ -325,8 +324,5 @@ def as_array(values: Any, names: Sequence[str], label: str) -> Array:
 def checked_inputs(system: System, inputs: Mapping[str, Component] | None) -> dict[str, Component]:
     """All inputs of a system by name; those left out are exactly zero."""
     inputs = dict(inputs or {})
-    unknown = sorted(set(inputs) - set(system.inputs))
-    if unknown:
-        have = ", ".join(system.inputs) or "none"
-        raise ValueError(f"{type(system).__name__} has no input named {', '.join(unknown)}. It has: {have}.")
+    refuse_unknown(inputs, system.inputs, f"{type(system).__name__} has no input named", "it has")
     return {name: component(inputs.get(name, 0.0)) for name in system.inputs}

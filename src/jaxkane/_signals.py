@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ._lookup import refuse_unknown
 from ._types import Component, Inputs
 
 
@@ -41,11 +42,7 @@ def as_signals(inputs: Inputs, names: Sequence[str], ts: Array, system_name: str
         return inputs
     if not isinstance(inputs, Mapping):
         raise TypeError(f"`inputs` is a dict by name or a function (t, state) -> dict, got {type(inputs).__name__}.")
-    unknown = sorted(set(inputs) - set(names))
-    if unknown:
-        raise ValueError(
-            f"{system_name} has no input named {', '.join(unknown)}. It has: {', '.join(names) or 'none'}."
-        )
+    refuse_unknown(inputs, names, f"{system_name} has no input named", "it has")
     return {name: _as_signal(name, value, ts) for name, value in inputs.items()}
 
 

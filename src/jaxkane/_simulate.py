@@ -22,6 +22,7 @@ from ._fuse import fused
 from ._kane import Instant, checked_inputs
 from ._kinks import ToKinks
 from ._linear import as_vector, determinant
+from ._lookup import not_there
 from ._signals import as_signals, evaluate, sample_times
 from ._system import State, System, parameter_info
 from ._trajectory import Status, Trajectory
@@ -51,8 +52,7 @@ class Now(eqx.Module):
         if name in system.dependent_speeds:
             now = Instant(system, self.t, self.q, self.u)
             return jnp.asarray(now.u_dep[system.dependent_speeds.index(name)])
-        known = ", ".join((*system.coordinates, *system.speeds, *system.dependent_speeds))
-        raise KeyError(f"There is no {name!r} in the state; there are {known}.")
+        raise not_there(name, (*system.coordinates, *system.speeds, *system.dependent_speeds), "the state")
 
 
 def simulate(

@@ -15,6 +15,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from ._components import component, dot
+from ._lookup import not_there
 from ._types import Component, Triple
 from ._vectors import Frame, Point, Vector
 
@@ -214,7 +215,7 @@ class Motion:
     def __getitem__(self, name: str) -> Any:
         named: dict[str, Any] = {body.name: body for body in self.bodies} | self.points | self.frames
         if name not in named:
-            raise KeyError(f"{name!r} is no body, point or frame of this motion; it has {', '.join(named)}.")
+            raise not_there(name, named, "this motion, among its bodies, points and frames")
         return named[name]
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
+from ._lookup import by_name
 from ._system import State
 
 
@@ -61,13 +62,8 @@ class Trajectory(eqx.Module):
     adjoint: str = eqx.field(static=True)
 
     def __getitem__(self, name: str) -> Float[Array, "*batch n_t"]:
-        for names, values in zip(self.names, (self.q, self.u, self.u_dep), strict=True):
-            if name in names:
-                return values[..., names.index(name)]
-        if name in self.inputs:
-            return self.inputs[name]
-        known = [*(n for names in self.names for n in names), *self.inputs]
-        raise KeyError(f"There is no {name!r} in this trajectory; there are {', '.join(known)}.")
+        groups = zip(self.names, (self.q, self.u, self.u_dep), strict=True)
+        return by_name(name, groups, self.inputs, "this trajectory")
 
     @property
     def ok(self) -> Any:

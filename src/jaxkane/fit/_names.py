@@ -8,6 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
+from .._lookup import hint, refuse_unknown
 from .._system import System
 from ._model import Nuisance
 from ._trial import Trial
@@ -30,11 +31,7 @@ def checked_trials(system: System, trials: Sequence[Trial], outputs: Mapping[str
             ("input", trial.inputs, system.inputs),
             ("coordinate or independent speed", trial.initial, (*system.coordinates, *system.speeds)),
         ):
-            unknown = sorted(set(given) - set(known))
-            if unknown:
-                raise ValueError(
-                    f"{trial.name}: {title} has no {what} {', '.join(unknown)}; there are {', '.join(known) or 'none'}."
-                )
+            refuse_unknown(given, known, f"{trial.name}: {title} has no {what}")
     return tuple(dict.fromkeys(channel for trial in trials for channel in trial.measured))
 
 
@@ -42,10 +39,10 @@ def checked_names(system: System, what: str, given: Any, known: Sequence[str]) -
     """Names with the deviations of their priors."""
     given = (given,) if isinstance(given, str) else given
     given = dict(given) if isinstance(given, Mapping) else dict.fromkeys(given)
-    wrong = sorted(set(given) - set(known))
+    wrong = [name for name in given if name not in known]
     if wrong:
         raise ValueError(
-            f"{type(system).__name__}: `{what}` names {', '.join(wrong)}; it may name {', '.join(known) or 'nothing'}."
+            f"{type(system).__name__}: `{what}` names {', '.join(wrong)}; {hint(wrong, known, 'it may name')}"
             + (" Dependent coordinates and speeds follow from the others." if what == "unknown" else "")
         )
     bad = [name for name, deviation in given.items() if deviation is not None and not deviation > 0]

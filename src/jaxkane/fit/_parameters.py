@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._lookup import hint
 from .._system import System
 from ._bijections import Interval, PossibleBody
 
@@ -238,7 +239,7 @@ def _of_input(system: System, item: Gain | Delay):
     role = type(item).__name__.lower()
     if item.input not in system.inputs:
         raise ValueError(
-            f"{type(system).__name__} has no input {item.input!r}; it has {', '.join(system.inputs) or 'none'}."
+            f"{type(system).__name__} has no input {item.input!r}; {hint(item.input, system.inputs, 'it has')}"
         )
     entry = _Entry(item.name or f"{role} of {item.input}", item.unit, role=(role, item.input))
     return _scalar(entry, item, item.start, positive=False)
@@ -350,8 +351,8 @@ def _find(system: System, where: str | Callable[[Any], Any]) -> tuple[list[int],
     except (AttributeError, IndexError, KeyError, TypeError):
         chosen = []
     if not chosen or not all(isinstance(i, int) and 0 <= i < len(leaves) for i in chosen):
-        known = ", ".join(_path_name(path) for path, _ in leaves)
-        raise ValueError(f"{title} has no parameter {where!r}; it has {known}.")
+        known = [_path_name(path) for path, _ in leaves]
+        raise ValueError(f"{title} has no parameter {where!r}; {hint(str(where), known, 'it has')}")
     for i in chosen:
         path, leaf = leaves[i]
         if not (eqx.is_inexact_array(leaf) and not jnp.issubdtype(leaf.dtype, jnp.complexfloating)):

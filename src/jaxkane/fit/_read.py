@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from .._lookup import refuse_unknown
 from ._trial import Trial
 
 
@@ -56,9 +57,7 @@ def _read(path: Path, columns: list[str], by: str | None) -> dict[str, dict[str,
     with path.open(newline="") as file:
         lines = csv.reader(file)
         header = [cell.strip() for cell in next(lines, [])]
-        missing = [c for c in (*columns, *([by] if by else [])) if c not in header]
-        if missing:
-            raise ValueError(f"{path}: no column {', '.join(missing)}; there are {', '.join(header) or 'none'}.")
+        refuse_unknown((*columns, *([by] if by else [])), header, f"{path}: no column")
         places = [header.index(c) for c in columns]
         found: dict[str, list[list[float]]] = {}
         for line in lines:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
+from .._lookup import hint
 from ._blocks import eliminate
 from ._model import Point
 from ._problem import Problem
@@ -65,7 +66,7 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
     from ._least_squares import least_squares
 
     if name not in fit.names:
-        raise ValueError(f"{name} is not free; {', '.join(fit.names)} are.")
+        raise ValueError(f"{name} is not free; {hint(name, fit.names, 'free are')}")
     error, best = fit.standard_errors[name], fit.estimates[name]
     if not np.isfinite(error):
         raise ValueError(f"These data do not tell {name}: {fit.message}.")

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from .._lookup import hint, refuse_unknown
 from ._axes import SOFT, finish, panels
 from ._trajectories import unit_of
 
@@ -44,9 +45,9 @@ def fits(
     chosen = [_number(names, trial) for trial in trials] if trials is not None else _spread(len(names))
     all_channels = list(fit.problem.channels)
     channels = all_channels if channels is None else list(channels)
-    unknown = [channel for channel in channels if channel not in all_channels]
-    if unknown or not channels:
-        raise ValueError(f"fits: there is no channel {', '.join(unknown)}; there are {', '.join(all_channels)}.")
+    refuse_unknown(channels, all_channels, "fits: there is no channel")
+    if not channels:
+        raise ValueError(f"fits: `channels` is empty; {hint([], all_channels)}")
     each = 1 + residuals
     heights = {"height_ratios": [3, 1.2][:each] * len(channels)}
     axes = panels(axes, each * len(channels), len(chosen), size=(4.2, 1.5), sharex="col", sharey="row", **heights)
@@ -82,7 +83,7 @@ def _number(names: list[str], trial: str | int) -> int:
         return names.index(trial)
     if not isinstance(trial, str) and -len(names) <= trial < len(names):
         return range(len(names))[trial]
-    raise ValueError(f"fits: there is no trial {trial!r}; there are {len(names)}: {', '.join(names[:8])}.")
+    raise ValueError(f"fits: there is no trial {trial!r}; {hint(str(trial), names)}")
 
 
 def _spread(n: int) -> list[int]:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from .._lookup import refuse_unknown
 from ._axes import SOFT
 
 
@@ -42,9 +43,8 @@ def mode_shapes(
     import matplotlib.pyplot as plt
 
     lam, X, labels, names, where = _one_point(eigenvalues, vectors, states, at, modes)
+    refuse_unknown(labels if only is None else only, labels, "mode_shapes: there is no state")
     rows = [i for i, state in enumerate(labels) if only is None or state in only]
-    if not rows:
-        raise ValueError(f"mode_shapes: there is no {', '.join(only or ())} among the states {', '.join(labels)}.")
     drawn = [k for k in range(len(lam)) if lam[k].imag >= -1e-9 * abs(lam[k])]
     if axes is None:
         axes = plt.subplots(

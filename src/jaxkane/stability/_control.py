@@ -9,6 +9,7 @@ import numpy as np
 import scipy.linalg
 import scipy.signal
 
+from .._lookup import hint
 from ._linearize import LinearModel
 
 
@@ -86,7 +87,7 @@ def _single(model: LinearModel, input: str, output: str) -> tuple[np.ndarray, ..
 
 def _place(names: Sequence[str], name: str, what: str) -> int:
     if name not in names:
-        raise ValueError(f"The model has no {what} {name!r}; it has {', '.join(names) or 'none'}.")
+        raise ValueError(f"The model has no {what} {name!r}; {hint(name, names, 'it has')}")
     return list(names).index(name)
 
 

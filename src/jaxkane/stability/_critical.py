@@ -13,6 +13,7 @@ import optimistix as optx
 from jaxtyping import Array, Float, Int
 
 from .._check import is_concrete
+from .._lookup import not_there
 from .._system import System
 from ._eig import eig
 from ._eigenvalues import Eigenvalues, MotionAt, eigenvalues, family_of, matrix
@@ -37,7 +38,7 @@ class CriticalSpeeds(eqx.Module):
 
     def __getitem__(self, name: str) -> Float[Array, ""]:
         if name not in self.modes:
-            raise KeyError(f"There is no mode {name!r}; there are {', '.join(dict.fromkeys(self.modes))}.")
+            raise not_there(name, self.modes, "these modes")
         columns = np.array([i for i, mode in enumerate(self.modes) if mode == name])
         mine = jnp.any(self.mode[:, None] == columns[None, :], axis=1) & jnp.isfinite(self.values)
         if not mine.shape[0]:

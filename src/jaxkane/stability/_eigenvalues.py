@@ -13,6 +13,7 @@ from jaxtyping import Array, Complex, Float
 from scipy.optimize import linear_sum_assignment
 
 from .._check import is_concrete
+from .._lookup import not_there
 from .._system import State, System
 from ..catalog import WhippleBicycle
 from ._bicycle import LATERAL, MODES, mode_order, straight_ahead
@@ -44,7 +45,7 @@ class Eigenvalues(eqx.Module):
 
     def __getitem__(self, mode: str) -> Complex[Array, "m n_mode"]:
         if mode not in self.modes:
-            raise KeyError(f"There is no mode {mode!r}; there are {', '.join(dict.fromkeys(self.modes))}.")
+            raise not_there(mode, self.modes, "these modes")
         return self.eigenvalues[:, np.array([i for i, name in enumerate(self.modes) if name == mode])]
 
     @property

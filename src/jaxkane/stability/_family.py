@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._lookup import by_name, hint
 from .._system import System
 from ._solve import jacobian
 from ._steady import Problem, SteadyMotion, as_motion
@@ -38,13 +39,7 @@ class Family(eqx.Module):
         return SteadyMotion(self.q[i], self.u[i], self.u_dep[i], inputs, self.t, self.residual[i], self.names)
 
     def __getitem__(self, name: str) -> Float[Array, " m"]:
-        for names, values in zip(self.names, (self.q, self.u, self.u_dep), strict=True):
-            if name in names:
-                return values[:, names.index(name)]
-        if name in self.inputs:
-            return self.inputs[name]
-        known = ", ".join([*(n for names in self.names for n in names), *self.inputs])
-        raise KeyError(f"There is no {name!r} in this family; there are {known}.")
+        return by_name(name, zip(self.names, (self.q, self.u, self.u_dep), strict=True), self.inputs, "this family")
 
     def __len__(self) -> int:
         return len(self.arclength)
@@ -203,7 +198,8 @@ def _residual_and_slope(problem: Problem, z, args):
 def _side(problem: Problem, system: System, towards, tangent, curve: _Curve, y) -> float:
     (name, sign), *more = towards.items()
     if more or name not in problem.names:
-        raise ValueError(f"family: `towards` is one of {', '.join(problem.names)} with +1 or -1, got {dict(towards)}.")
+        one_of = hint(name, problem.names, "it is one of")
+        raise ValueError(f"family: `towards` is one name with +1 or -1, got {dict(towards)}; {one_of}")
     s = np.linalg.svd(curve.evaluate(y)[1], compute_uv=False)
     if s[-1] > 1e-8 * s[0]:
         raise ValueError(

@@ -16,6 +16,7 @@ from .._equations import dependent_speeds, state_rates
 from .._fuse import fused
 from .._kane import as_array, checked_inputs
 from .._linear import as_vector, solve, stack
+from .._lookup import hint, refuse_unknown
 from .._system import State, System, Values
 from .._types import Component
 from ._cyclic import cyclic_coordinates
@@ -116,9 +117,7 @@ def linearize(
     rows = tuple(kept) if outputs is None else tuple(outputs)
     functions = dict(outputs) if isinstance(outputs, Mapping) else {}
     known = (*system.coordinates, *system.speeds, *system.dependent_speeds)
-    unknown = [k for k in rows if k not in known and k not in functions]
-    if unknown:
-        raise ValueError(f"{name} has no output {', '.join(unknown)}; it has {', '.join(known)}. Or give functions.")
+    refuse_unknown(rows, (*known, *functions), f"{name}: outputs are functions, or by name; it has no output", "it has")
     if steady and is_concrete(system, t, q, u, w):
         _check_steady(system, t, q, u, w)
     A, B, C, D = _derivatives((system, t, q, u, w), _Choice(dependent, kept, rows), _Functions(functions))
@@ -133,8 +132,8 @@ def _states(system: System, states: Sequence[str] | None, dependent: tuple[str, 
     unknown = [k for k in states if k not in (*free, *system.speeds)]
     if unknown:
         raise ValueError(
-            f"{type(system).__name__}: {', '.join(unknown)} cannot be a state; independent coordinates and speeds are "
-            f"{', '.join((*free, *system.speeds))}."
+            f"{type(system).__name__}: {', '.join(unknown)} cannot be a state; "
+            f"{hint(unknown, (*free, *system.speeds), 'independent coordinates and speeds are')}"
         )
     return tuple(states)
 

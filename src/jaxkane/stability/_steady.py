@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from .._check import check_system, configuration_residual, is_concrete
 from .._equations import dependent_speeds, state_rates
 from .._kane import as_array, checked_inputs
+from .._lookup import by_name, hint
 from .._system import State, System
 from .._types import Component
 from ._cyclic import cyclic_coordinates
@@ -42,13 +43,7 @@ class SteadyMotion(eqx.Module):
         return State(self.q, self.u)
 
     def __getitem__(self, name: str) -> Any:
-        for names, values in zip(self.names, (self.q, self.u, self.u_dep), strict=True):
-            if name in names:
-                return values[..., names.index(name)]
-        if name in self.inputs:
-            return self.inputs[name]
-        known = ", ".join([*(n for names in self.names for n in names), *self.inputs])
-        raise KeyError(f"There is no {name!r} in this motion; there are {known}.")
+        return by_name(name, zip(self.names, (self.q, self.u, self.u_dep), strict=True), self.inputs, "this motion")
 
 
 def equilibrium(
@@ -110,7 +105,7 @@ def steady_turn(
     known = {k: jnp.asarray(x, q.dtype) for k, x in checked_inputs(system, inputs).items()}
     unknown = sorted(set(find) - set(system.inputs))
     if unknown:
-        raise ValueError(f"{name} has no input {', '.join(unknown)} to find. It has: {', '.join(system.inputs)}.")
+        raise ValueError(f"{name} has no input {', '.join(unknown)} to find; {hint(unknown, system.inputs, 'it has')}")
     problem = Problem(system, tuple(find), tuple(values))
     for k, x in values.items():
         if x is not None and k in system.coordinates:
@@ -146,8 +141,8 @@ class Problem(eqx.Module):
         unknown = [k for k in held if k not in known]
         if unknown:
             raise ValueError(
-                f"{type(system).__name__} has no {', '.join(unknown)} to hold; it has {', '.join(known)}. Inputs are "
-                "held unless they are in `find`; parameters always."
+                f"{type(system).__name__} has no {', '.join(unknown)} to hold; {hint(unknown, known, 'it has')} Inputs "
+                "are held unless they are in `find`; parameters always."
             )
 
     def unknowns(self, q, u, inputs) -> Array:

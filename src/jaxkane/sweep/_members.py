@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._assembly import assemble
+from .._lookup import not_there
 from .._signals import Samples, as_signals
 from .._simulate import checked_state
 from .._system import State, System, parameter_info
@@ -29,7 +30,7 @@ class Row(dict):
 
     def __getitem__(self, name: str) -> Any:
         if name not in self:
-            raise KeyError(f"The sweep's table has no column {name!r}; it has {', '.join(self) or 'no numbers'}.")
+            raise not_there(name, self, "the columns of the sweep's table")
         self.read.add(name)
         return super().__getitem__(name)
 

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
+from .._lookup import not_there
 from .._trajectory import Status, Trajectory, reason
 from ._solve import Part
 from ._table import Table
@@ -115,8 +116,7 @@ class Sweep(eqx.Module):
             return column.reshape(*self.shape, *column.shape[1:])
         known = list(self.values) if isinstance(self.values, Mapping) else []
         known += _names(self.trajectory) if self.trajectory is not None else []
-        listed = ", ".join(dict.fromkeys([*known, *self.table.columns]))
-        raise KeyError(f"There is no {name!r} in this sweep; there are {listed or 'no names'}.")
+        raise not_there(name, [*known, *self.table.columns], "this sweep")
 
     def member(self, *place: int) -> Trajectory:
         """The motion of one member, by its place along every axis."""

@@ -8,6 +8,8 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from .._lookup import not_there
+
 
 class Table(eqx.Module):
     """Members of a sweep by name: `table["speed"]`.
@@ -22,7 +24,7 @@ class Table(eqx.Module):
 
     def __getitem__(self, name: str) -> np.ndarray:
         if name not in self.columns:
-            raise KeyError(f"There is no {name!r} in this table; there are {', '.join(self.columns) or 'no columns'}.")
+            raise not_there(name, self.columns, "this table")
         return self.columns[name]
 
     def __len__(self) -> int:

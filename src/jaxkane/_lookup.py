@@ -1,0 +1,52 @@
+"""Names that are looked up, and what to say where one is not there. Knows words, and nothing of mechanics."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+_LISTED = 12  # more names than this are not read by anybody
+
+
+def hint(wrong: str | Iterable[str], known: Iterable[str], have: str = "there are") -> str:
+    """The end of a message about names that are not there: what was probably meant, or else what there is.
+
+    "did you mean 'steer'?", or "there are roll, steer."; `have` are the words before the list.
+    """
+    wrong = [wrong] if isinstance(wrong, str) else list(wrong)
+    known = list(dict.fromkeys(known))
+    near = {name: difflib.get_close_matches(name, known, n=2) for name in map(str, wrong)}
+    near = {name: matches for name, matches in near.items() if matches}
+    if near:
+        one = lambda name: " or ".join(map(repr, near[name]))  # noqa: E731
+        return f"did you mean {', '.join(one(n) if len(wrong) == 1 else f'{one(n)} for {n!r}' for n in near)}?"
+    more = f", ... ({len(known)} in all)" if len(known) > _LISTED else ""
+    return f"{have} {', '.join(known[:_LISTED]) or 'none'}{more}."
+
+
+def refuse_unknown(given: Iterable[str], known: Iterable[str], message: str, have: str = "there are") -> None:
+    """`ValueError` for names that are not known; `message` stands before them: "Bicycle: q has no"."""
+    known = tuple(known)
+    wrong = [str(name) for name in dict.fromkeys(given) if name not in known]
+    if wrong:
+        raise ValueError(f"{message} {', '.join(wrong)}; {hint(wrong, known, have)}")
+
+
+def not_there(name: Any, known: Iterable[str], where: str) -> KeyError:
+    """The error for a name that is looked up in vain; `where` as in "this trajectory"."""
+    return KeyError(f"There is no {name!r} in {where}; {hint(str(name), known)}")
+
+
+def by_name(name: str, groups: Iterable[tuple[Sequence[str], Any]], more: Mapping[str, Any], where: str) -> Any:
+    """An entry of arrays whose last axis is named, or of a dict.
+
+    **Raises:** `KeyError` with what was probably meant.
+    """
+    groups = tuple(groups)
+    for names, values in groups:
+        if name in names:
+            return values[..., names.index(name)]
+    if name in more:
+        return more[name]
+    raise not_there(name, [*(n for names, _ in groups for n in names), *more], where)
