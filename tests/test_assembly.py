@@ -1,4 +1,4 @@
-"""`assemble`: what is named is held, what is left out is found, and what cannot be found is NaN with its derivatives."""
+"""`assemble` holds what is named and finds what is left out; what cannot be found is NaN with its derivatives."""
 
 import re
 from pathlib import Path

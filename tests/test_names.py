@@ -1,5 +1,6 @@
 """A name that is not there is answered with what was probably meant, wherever names are looked up."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -46,3 +47,66 @@ def test_every_look_up_says_what_was_meant(ride):
         jk.simulate(PENDULUM, state, TS, {"sholder_torque": 1.0})
     with pytest.raises(KeyError, match="did you mean 'theta2_dot'"):
         jk.simulate(PENDULUM, state, TS, {"elbow_torque": lambda t, state: state["theta2_dott"]})
+
+
+class OnACircle(jk.System):
+    coordinates, speeds = ("x", "y"), ("x_dot",)
+    dependent_speeds, dependent_coordinates = ("y_dot",), ("y",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(q["x"] * N.x + q["y"] * N.y, u["x_dot"] * N.x + u["y_dot"] * N.y)
+        return jk.Motion([jk.Body(1.0, 0.0, P)], points={"P": P})
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+
+    def configuration_constraints(self, t, q):
+        return [q["x"] ** 2 + q["y"] ** 2 - 1.0]
+
+
+class Undeclared(OnACircle):
+    """The same, which does not say which of its coordinates depends."""
+
+    dependent_coordinates = ()
+
+
+def test_dicts_wherever_coordinates_and_speeds_are_taken():
+    circle, at, moving = OnACircle(), {"y": -0.8, "x": 0.6}, {"x_dot": 0.5}
+    q, u = np.array([0.6, -0.8]), np.array([0.5])
+    for function in (jk.accelerations, jk.equations_of_motion, jk.dependent_speeds, jk.constraint_forces):
+        by_name, by_place = function(circle, 0.0, at, moving), function(circle, 0.0, q, u)
+        for one, other in zip(jax.tree.leaves(by_name), jax.tree.leaves(by_place), strict=True):
+            np.testing.assert_array_equal(one, other)
+    assert jk.best_dependent_speeds(circle, 0.0, at).current == ("y_dot",)
+    by_name, by_place = (jk.simulate(circle, state, TS) for state in (jk.State(at, moving), jk.State(q, u)))
+    np.testing.assert_array_equal(by_name.q, by_place.q)
+    several = jk.sweep.sweep(PENDULUM, jk.State({"theta1": np.array([0.1, 0.2])}, {}), TS)
+    np.testing.assert_array_equal(several["theta1"][:, 0], [0.1, 0.2])
+    model = jk.stability.linearize(PENDULUM, jk.State({}, {}))
+    np.testing.assert_array_equal(model.A, jk.stability.linearize(PENDULUM, jk.State([0.0, 0.0], [0.0, 0.0])).A)
+
+
+def test_a_dependent_coordinate_that_is_left_out_is_no_zero():
+    circle, match = OnACircle(), r"OnACircle: y is left out of q.*jaxkane\.assemble"
+    for evaluate in (
+        lambda: jk.accelerations(circle, 0.0, {"x": 1.0}, {}),
+        lambda: jax.jit(lambda x: jk.accelerations(circle, 0.0, {"x": x}, {}))(1.0),
+        lambda: jk.constraint_forces(circle, 0.0, {"x": 1.0}, {}),
+        lambda: jk.simulate(circle, jk.State({"x": 1.0}, {}), TS),
+        lambda: jk.best_dependent_speeds(circle, 0.0, {"x": 1.0}),
+        lambda: jk.stability.linearize(circle, jk.State({"x": 0.0}, {})),
+        lambda: jk.sweep.sweep(circle, jk.State({"x": np.array([0.1, 0.2])}, {}), TS),
+    ):
+        with pytest.raises(ValueError, match=match):
+            evaluate()
+    with pytest.raises(ValueError, match=r"y_dot is a dependent speed.* leave it out"):
+        jk.accelerations(circle, 0.0, {"x": 0.6, "y": -0.8}, {"y_dot": 1.0})
+
+
+def test_what_is_left_out_and_violates_a_constraint_is_refused():
+    with pytest.raises(ValueError, match=r"Undeclared: with y left out of q.*violated by \[-0\.64\]"):
+        jk.accelerations(Undeclared(), 0.0, {"x": 0.6}, {})
+    at = jax.jit(lambda x: jk.accelerations(Undeclared(), 0.0, {"y": x}, {"x_dot": 0.5}))
+    np.testing.assert_allclose(at(1.0), 0.0, atol=1e-15)
+    assert np.isnan(at(0.9)).all()

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import warnings
 import weakref
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -18,6 +19,7 @@ from ._components import cross
 from ._fuse import fused
 from ._kane import Instant
 from ._linear import as_vector, stack
+from ._nan import nan_where
 from ._system import Motion, System, parameter_info
 from ._vectors import Frame
 
@@ -229,6 +231,24 @@ def check_state(system: System, t: Any, q: Any) -> None:
             f"{type(system).__name__}: the coordinates violate the configuration constraints by "
             f"{np.array2string(np.asarray(residual), precision=3)}. Find {adjust} with jaxkane.assemble(system, q, u)."
         )
+
+
+def met_or_refused(system: System, t: Any, q: Any, left_out: Sequence[str]) -> Any:
+    """Coordinates of which some were left out and taken as zero, unless that violates a configuration constraint.
+
+    **Raises:** `ValueError` that names them; under a trace the coordinates become NaN.
+    """
+    residual = configuration_residual(system, t, q)
+    if not residual.size:
+        return q
+    met = jnp.max(jnp.abs(residual)) <= configuration_tolerance(residual.dtype)
+    if is_concrete(met) and not met:
+        raise ValueError(
+            f"{type(system).__name__}: with {', '.join(left_out)} left out of q, and taken as zero, the configuration "
+            f"constraints are violated by {np.array2string(np.asarray(residual), precision=3)}. Find the state with "
+            "jaxkane.assemble(system, q, u), and give its state.q; or name them."
+        )
+    return nan_where(~met, q, (system, t, q))
 
 
 def configuration_tolerance(dtype: Any) -> float:

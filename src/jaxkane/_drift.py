@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from ._check import configuration_residual
 from ._fuse import fused
-from ._kane import Instant, as_array
+from ._kane import Instant, as_array, refuse_incomplete
 from ._linear import as_vector, solve, stack
 from ._system import System
 from ._types import Component
@@ -113,6 +113,7 @@ def best_dependent_speeds(system: System, t: Component, q: Any) -> DependentSpee
     name = type(system).__name__
     if not system.dependent_speeds:
         raise ValueError(f"{name} has no dependent speeds.")
+    refuse_incomplete(system, q, {})
     q = as_array(q, system.coordinates, f"{name}: q")
     C, c0 = (np.asarray(x, dtype=float) for x in constraint_rows(system, jnp.asarray(t, q.dtype), q))
     return dependent_speeds_from(C, c0, (*system.speeds, *system.dependent_speeds), system.dependent_speeds, name)

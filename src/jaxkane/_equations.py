@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from ._check import check_system, is_concrete
+from ._check import check_system, is_concrete, met_or_refused
 from ._components import matvec, sub
 from ._diagnose import diagnosis
 from ._fuse import fused
-from ._kane import Instant, as_array, as_row, checked_inputs, jvp
+from ._kane import Instant, as_array, as_row, checked_inputs, jvp, refuse_incomplete
 from ._linear import as_vector, is_written_out, solve_positive_array, stack
 from ._system import System, kinetic_energy_of
 from ._types import Component
@@ -28,10 +28,14 @@ InputValues = Mapping[str, Component] | None
 def _arrays(system: System, t: Component, q: Any, u: Any, inputs: InputValues = None):
     """The arguments of a public function as arrays of one type, checked."""
     name = type(system).__name__
+    refuse_incomplete(system, q, u)
+    left_out = [c for c in system.coordinates if c not in q] if isinstance(q, Mapping) else []
     q = as_array(q, system.coordinates, f"{name}: q")
     u = as_array(u, system.speeds, f"{name}: u")
     t = jnp.asarray(t, dtype=q.dtype)
     checked_inputs(system, inputs)
+    if left_out:
+        q = met_or_refused(system, t, q, left_out)
     check_system(system, t, q, u)
     return system, t, q, u, {name: jnp.asarray(x, dtype=q.dtype) for name, x in (inputs or {}).items()}
 

@@ -309,16 +309,40 @@ def as_row(values: Any, names: Sequence[str], label: str) -> Row:
 
 def as_array(values: Any, names: Sequence[str], label: str) -> Array:
     """Numbers, in their order or by name, as a float array of shape (len(names),). Those not named are zero."""
-    if isinstance(values, Mapping):
-        refuse_unknown(values, names, f"{label} has no", "it has")
-        values = jnp.stack([jnp.asarray(values.get(name, 0.0), dtype=float) for name in names])
-    array = jnp.asarray(values)
+    array = by_names(values, names, label) if isinstance(values, Mapping) else jnp.asarray(values)
     if not jnp.issubdtype(array.dtype, jnp.inexact):
         array = array.astype(float)
     if array.shape != (len(names),):
         hint = " For a batch use jax.vmap." if array.ndim > 1 else ""
         raise ValueError(f"{label} must have the shape ({len(names)},): {', '.join(names)}. Got {array.shape}.{hint}")
     return array
+
+
+def by_names(values: Mapping[str, Any], names: Sequence[str], label: str) -> Array:
+    """Numbers by name as an array (*batch, len(names)); those not named are zero."""
+    refuse_unknown(values, names, f"{label} has no", "it has")
+    columns = [jnp.asarray(values.get(name, 0.0), dtype=float) for name in names]
+    return jnp.stack(jnp.broadcast_arrays(*columns), axis=-1) if columns else jnp.zeros(0)
+
+
+def refuse_incomplete(system: System, q: Any, u: Any) -> None:
+    """Refuse dicts of coordinates and speeds that leave out a dependent coordinate, or name a dependent speed.
+
+    Where nothing is solved for, a dependent coordinate left out is no zero: it is not known.
+    """
+    name = type(system).__name__
+    missing = [c for c in system.dependent_coordinates if c not in q] if isinstance(q, Mapping) else []
+    if missing:
+        raise ValueError(
+            f"{name}: {', '.join(missing)} is left out of q, and follows from the other coordinates: find the state "
+            "with jaxkane.assemble(system, q, u), and give its state.q; or name the value here."
+        )
+    given = [s for s in system.dependent_speeds if s in u] if isinstance(u, Mapping) else []
+    if given:
+        raise ValueError(
+            f"{name}: {', '.join(given)} is a dependent speed, which follows from the others: leave it out of u. "
+            "(jaxkane.assemble compares it with what the velocity residuals say.)"
+        )
 
 
 def checked_inputs(system: System, inputs: Mapping[str, Component] | None) -> dict[str, Component]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Mapping
 from typing import Any, Literal, cast
 
 import diffrax
@@ -19,7 +20,7 @@ from ._diagnose import diagnosis
 from ._drift import correction, has_configuration_constraints, projected
 from ._equations import dependent_speeds, state_rates
 from ._fuse import fused
-from ._kane import Instant, checked_inputs
+from ._kane import Instant, by_names, checked_inputs, refuse_incomplete
 from ._kinks import ToKinks
 from ._linear import as_vector, determinant
 from ._lookup import not_there
@@ -339,6 +340,7 @@ def checked_state(system: System, state: Any) -> State:
         raise TypeError(
             f"{name}: the state must be a jaxkane.State(q, u), as assemble gives it; got {type(state).__name__}."
         )
+    state = as_state(system, state)
     for label, value, names in (("q", state.q, system.coordinates), ("u", state.u, system.speeds)):
         if value.shape != (len(names),):
             raise ValueError(
@@ -346,3 +348,17 @@ def checked_state(system: System, state: Any) -> State:
                 + (" For a batch use jaxkane.sweep or jax.vmap." if value.ndim > 1 else "")
             )
     return state
+
+
+def as_state(system: System, state: State) -> State:
+    """A state in arrays, of one in dicts by name. Coordinates and speeds that are left out are zero.
+
+    **Raises:** `ValueError` for an unknown name, a dependent coordinate left out, a dependent speed that is named.
+    """
+    refuse_incomplete(system, state.q, state.u)
+    title = type(system).__name__
+    q, u = (
+        by_names(values, names, f"{title}: state.{label}") if isinstance(values, Mapping) else values
+        for label, values, names in (("q", state.q, system.coordinates), ("u", state.u, system.speeds))
+    )
+    return State(q, u.astype(q.dtype) if isinstance(state.u, Mapping) else u)

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from .._check import check_system, configuration_residual, is_concrete
 from .._equations import dependent_speeds, state_rates
 from .._fuse import fused
-from .._kane import as_array, checked_inputs
+from .._kane import as_array, checked_inputs, refuse_incomplete
 from .._linear import as_vector, solve, stack
 from .._lookup import hint, refuse_unknown
 from .._system import State, System, Values
@@ -99,6 +99,7 @@ def linearize(
     if isinstance(motion, SteadyMotion):
         inputs = motion.inputs if inputs is None else inputs
         t = motion.t if t is None else t
+    refuse_incomplete(system, motion.q, motion.u)
     q = as_array(motion.q, system.coordinates, f"{name}: q")
     u = as_array(motion.u, system.speeds, f"{name}: u")
     t = jnp.asarray(0.0 if t is None else t, q.dtype)

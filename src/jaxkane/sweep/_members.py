@@ -13,7 +13,7 @@ import numpy as np
 from .._assembly import assemble
 from .._lookup import not_there
 from .._signals import Samples, as_signals
-from .._simulate import checked_state
+from .._simulate import as_state, checked_state
 from .._system import State, System, parameter_info
 from .._types import Inputs
 from ._table import Table
@@ -85,7 +85,7 @@ def _system(system: Any, row: Row) -> tuple[System, dict[str, Any]]:
 
 def _start(system: Any, state: Any, row: Row, t: Any) -> State:
     system, parameters = _system(system, row)
-    state = state if isinstance(state, State) else state(system, row)
+    state = as_state(system, state if isinstance(state, State) else state(system, row))
     q, u = ({n: dict.__getitem__(row, n) for n in names if n in row} for names in (system.coordinates, system.speeds))
     state = State(_set(state.q, q, system.coordinates), _set(state.u, u, system.speeds))
     if system.dependent_coordinates and (q or parameters):  # they follow from the others
@@ -165,7 +165,7 @@ def _batches(tree: Tree) -> dict[int, str]:
                 found[id(value)] = name
     if isinstance(state, State):
         for name, value in (("q", state.q), ("u", state.u)):
-            if value.ndim == 2:
+            if np.ndim(value) == 2:
                 found[id(value)] = f"state.{name}"
     if isinstance(signals, dict):
         for name, signal in signals.items():

@@ -13,7 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from .._check import is_concrete
-from .._simulate import checked_times, settings_for
+from .._simulate import as_state, checked_times, settings_for
 from .._system import State, System
 from .._trajectory import Status, Trajectory
 from .._types import Inputs
@@ -79,7 +79,9 @@ def sweep(
     folder holds another sweep: the message says in what it differs.
     """
     table = as_table(table)
-    ts = checked_times(ts, state.q.dtype if isinstance(state, State) else float)
+    if isinstance(state, State) and isinstance(system, System):
+        state = as_state(system, state)
+    ts = checked_times(ts, getattr(state.q, "dtype", float) if isinstance(state, State) else float)
     settings = settings_for(ts, progress=False, **options)
     members, shared, n = members_of(system, state, inputs, table, ts)
     found = table if table is not None else Table({}, ("member",), (n,))
