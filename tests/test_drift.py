@@ -8,6 +8,7 @@ from test_other_systems import FourBarLinkage
 
 import jaxkane as jk
 from jaxkane import best_dependent_speeds
+from jaxkane._drift import relative_condition
 
 HELD = 1e-9
 
@@ -150,3 +151,29 @@ def test_locked_angles_are_met_by_an_event_or_an_error_with_advice():
     ride = jk.simulate(system, falling, jnp.linspace(0.0, 1.0, 11))
     assert ride.reason in ("gimbal lock 1", "gimbal lock 2")
     assert "Euler parameters" in repr(ride)
+
+
+class Wedge(jk.System):
+    """A particle in a plane whose residual is `small` * vx + vy, solved for vx."""
+
+    small: jk.Scalar = jk.parameter(1e-9)
+    coordinates, speeds, dependent_speeds = ("x", "y"), ("vy",), ("vx",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(N.vector(q["x"], q["y"], 0.0), N.vector(u["vx"], u["vy"], 0.0))
+        return jk.Motion([jk.Body(1.0, 0.0, P)], [self.small * u["vx"] + u["vy"]])
+
+    def q_dot(self, t, q, u):
+        return u["vx"], u["vy"]
+
+
+def test_one_residual_is_weighed_against_the_other_speeds():
+    q = jnp.array([0.1, 0.2])
+    wedge = best_dependent_speeds(Wedge(), 0.0, q)
+    np.testing.assert_allclose([x for _, x in wedge.choices], [1.0, 1e9], rtol=1e-9)  # sqrt(1 + 1e-18) / 1e-9
+    assert wedge.best == ("vy",)
+    assert "for vy it would be 1" in str(wedge)
+    assert "well chosen" in str(best_dependent_speeds(Wedge(small=2.0), 0.0, q))
+    scaled = relative_condition(1e6 * np.array([[[1e-9, 1.0]], [[0.0, 1.0]], [[3.0, 4.0]]]), [0])
+    np.testing.assert_allclose(scaled, [1e9, np.inf, 5 / 3], rtol=1e-9)  # the unit of a residual does not matter

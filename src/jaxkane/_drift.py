@@ -6,6 +6,7 @@ Knows the constraints of a description; knows no mechanism and no integrator.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -53,8 +54,9 @@ class DependentSpeeds(eqx.Module):
 
     Attributes:
 
-    - `choices`: pairs of names and the condition number of their C_dep, at most 3000 of them, the best first; infinite
-        where the residuals cannot be solved for these speeds. It compares speeds of one unit best.
+    - `choices`: pairs of names and the condition number of their C_dep, beside the coefficients of the other speeds, at
+        most 3000 of them, the best first; infinite where the residuals cannot be solved for these speeds. It compares
+        speeds of one unit best.
     - `current`: the names that the system chose, and `condition` their condition number.
     - `n_residuals`; `rank`: the number of them that are independent.
     - `redundant`: places of residuals that follow from those before them, and `conflicting`: those among them that no
@@ -143,14 +145,28 @@ def dependent_speeds_from(
             conflicting.append(i)
     choices = list(itertools.islice(itertools.combinations(range(len(speeds)), k), _MOST_CHOICES))
     own = tuple(speeds.index(s) for s in current)
-    conditions = {c: _condition(C[:, c]) for c in {*choices, own}}
-    ranked = sorted(((tuple(speeds[i] for i in c), x) for c, x in conditions.items()), key=lambda pair: pair[1])
-    return DependentSpeeds(tuple(ranked), current, conditions[own], k, ranks[-1], redundant, tuple(conflicting), name)
+    conditions = {c: relative_condition(C, c) for c in {*choices, own}}
+    ranked = sorted(((tuple(speeds[i] for i in c), float(x)) for c, x in conditions.items()), key=lambda pair: pair[1])
+    return DependentSpeeds(
+        tuple(ranked), current, float(conditions[own]), k, ranks[-1], redundant, tuple(conflicting), name
+    )
 
 
-def _condition(matrix: np.ndarray) -> float:
-    s = np.linalg.svd(matrix, compute_uv=False)
-    return float(s[0] / s[-1]) if s[-1] > 1e-14 * s[0] else float("inf")
+def relative_condition(C: np.ndarray, dependent: Sequence[int]) -> Any:
+    """How badly the residuals' rows C (*n_t, k, n) are solved for the columns `dependent` (k,), as a number (*n_t).
+
+        largest singular value of C / smallest of C_dep,   each row of C divided by its largest entry
+
+    At least the condition number of C_dep. C_dep alone would not tell that all of its entries are small beside those of
+    the other speeds, so that these are multiplied by a large number: one residual has always the condition number 1.
+    Infinite where the residuals cannot be solved.
+    """
+    size = np.abs(C).max(axis=-1, keepdims=True)
+    C = C / np.where(size > 0, size, 1.0)
+    largest = np.linalg.svd(C, compute_uv=False)[..., 0]
+    smallest = np.linalg.svd(C[..., list(dependent)], compute_uv=False)[..., -1]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.where(smallest > 1e-14 * largest, largest / smallest, np.inf)[()]
 
 
 def _size(x: np.ndarray) -> float:

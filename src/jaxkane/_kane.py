@@ -331,6 +331,12 @@ def refuse_incomplete(system: System, q: Any, u: Any) -> None:
     Where nothing is solved for, a dependent coordinate left out is no zero: it is not known.
     """
     name = type(system).__name__
+    for label, values, names in (
+        ("q", q, system.coordinates),
+        ("u", u, (*system.speeds, *system.dependent_speeds)),
+    ):
+        if isinstance(values, Mapping):
+            refuse_unknown(values, names, f"{name}: {label} has no", "it has")
     missing = [c for c in system.dependent_coordinates if c not in q] if isinstance(q, Mapping) else []
     if missing:
         raise ValueError(
