@@ -1,22 +1,53 @@
-"""Settings of all tests: float64, and no silent promotion of dtypes or shapes."""
+"""Settings of all tests: float64, no silent promotion of dtypes or shapes, and programs that are compiled once for all.
+
+How to run them:
+
+    pytest                        everything, in as many processes as there are cores, four at most
+    pytest tests/test_vectors.py  a file or a test, in this process
+    JAXKANE_TEST_CACHE=FOLDER     keeps the compiled programs for the next run; by default they go with this one
+    JAXKANE_TEST_CACHE=0          keeps none, as in a process without `jaxkane.configure`
+"""
 
 import contextlib
+import os
+import shutil
+import tempfile
 
 import jax
+import psutil
 import pytest
+import touched
 
+import jaxkane as jk
 from jaxkane import _native
 
-jax.config.update("jax_enable_x64", True)
-jax.config.update("jax_numpy_dtype_promotion", "strict")
-jax.config.update("jax_numpy_rank_promotion", "raise")
+CACHE = "JAXKANE_TEST_CACHE"
+
+
+def pytest_xdist_auto_num_workers(config):
+    """Four processes at most, since each traces its tests' programs anew; and none for single files."""
+    folders = any(os.path.isdir(argument) for argument in config.args)
+    return min(4, psutil.cpu_count() or 1) if folders else 0
+
+
+def pytest_configure(config):
+    # Set by the process that the user started, and inherited by those that pytest-xdist starts.
+    if CACHE not in os.environ:
+        os.environ[CACHE] = folder = tempfile.mkdtemp(prefix="jaxkane-programs-")
+        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+    kept = os.environ[CACHE]
+    jk.configure(cache=False if kept == "0" else kept, verbose=False)
+    jax.config.update("jax_numpy_dtype_promotion", "strict")
+    jax.config.update("jax_numpy_rank_promotion", "raise")
+    touched.watch(config)
 
 
 @pytest.fixture(autouse=True, scope="module")
 def _programs_are_forgotten():
-    """Hundreds of compiled programs would fill the memory of a small machine."""
+    """Thousands of compiled programs would fill the memory of a small machine."""
     yield
-    jax.clear_caches()
+    if psutil.Process().memory_info().rss > psutil.virtual_memory().total / 8:
+        jax.clear_caches()
 
 
 @contextlib.contextmanager

@@ -48,3 +48,5 @@ from ._vectors import Frame as Frame
 from ._vectors import Point as Point
 from ._vectors import Vector as Vector
 from ._vectors import inertial as inertial
+
+__version__ = "0.1.0"

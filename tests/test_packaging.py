@@ -1,0 +1,61 @@
+"""What is published: one version everywhere, types, a citation, floors that are said, and every Python that we name."""
+
+import importlib.metadata
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import jaxkane as jk
+
+ROOT = Path(__file__).parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+PYTHONS = re.findall(r"Python :: (3\.\d+)", " ".join(PROJECT["classifiers"]))
+yaml = pytest.importorskip("yaml")
+
+
+def test_there_is_one_version():
+    assert re.fullmatch(r"\d+\.\d+\.\d+((a|b|rc)\d+)?(\.dev\d+)?", jk.__version__)
+    assert importlib.metadata.version("jaxkane") == jk.__version__, "installed from other sources: pip install -e ."
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert re.search(r"^## \[(.+?)\]", changes, re.MULTILINE)[1] in (jk.__version__, "Unreleased")
+
+
+def test_the_citation_is_of_this_version_and_says_what_it_stands_on():
+    """Required keys of the Citation File Format 1.2.0; a reference has at least its kind, title and authors."""
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
+    assert citation["cff-version"] == "1.2.0"
+    assert (str(citation["version"]), citation["license"]) == (jk.__version__, PROJECT["license"])
+    assert {"message", "title", "authors"} <= set(citation)
+    assert all({"type", "title", "authors"} <= set(reference) for reference in citation["references"])
+    assert {reference.get("doi") for reference in citation["references"]} >= {
+        "10.1098/rspa.2007.1857", "10.1098/rspa.2007.1849"
+    }  # fmt: skip
+
+
+def test_the_library_is_typed():
+    assert (Path(jk.__file__).parent / "py.typed").is_file()
+    assert "Typing :: Typed" in PROJECT["classifiers"]
+
+
+def test_every_python_that_is_named_is_checked():
+    checks = yaml.safe_load((ROOT / ".github/workflows/checks.yml").read_text(encoding="utf-8"))
+    assert checks["jobs"]["tests"]["strategy"]["matrix"]["python"] == PYTHONS
+    assert PROJECT["requires-python"] == f">={PYTHONS[0]}"
+    script = (ROOT / ".ci/run").read_text(encoding="utf-8")
+    assert f"OLDEST={PYTHONS[0]} NEWEST={PYTHONS[-1]}" in script
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert f"Python {PYTHONS[0]} to {PYTHONS[-1]}" in readme
+
+
+def test_every_requirement_says_its_lowest_version_and_jax_its_ceiling():
+    run = subprocess.run([sys.executable, ROOT / ".ci/lowest"], capture_output=True, text=True, check=True)
+    floors = dict(line.split("==") for line in run.stdout.splitlines())
+    named = {re.match(r"[\w.-]+", entry)[0] for entry in PROJECT["dependencies"]}
+    assert named <= set(floors)
+    jax = next(entry for entry in PROJECT["dependencies"] if entry.startswith("jax>"))
+    assert re.fullmatch(r"jax>=[\d.]+,<[\d.]+", jax)
+    assert floors["jax"] == re.match(r"jax>=([\d.]+)", jax)[1]
