@@ -141,7 +141,7 @@ class Settings(eqx.Module):
     solver: diffrax.AbstractSolver
     step: Any  # a number, or an array where it may change without another compilation
     adjoint: diffrax.AbstractAdjoint
-    max_steps: int = eqx.field(static=True)
+    max_steps: int | None = eqx.field(static=True)  # None: as many as it takes
     progress: bool = eqx.field(static=True)
     project: bool = eqx.field(static=True)
     stabilize: float = eqx.field(static=True)
@@ -157,7 +157,7 @@ def settings_for(
     project: bool = False,
     stabilize: float = 0.0,
     adjoint: str | diffrax.AbstractAdjoint = "auto",
-    max_steps: int = 16384,
+    max_steps: int | None = 16384,
     progress: bool = False,
 ) -> Settings:
     """The options of `simulate`, with defaults that follow the type of the times."""

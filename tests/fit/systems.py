@@ -22,3 +22,22 @@ class Cart(jk.System):
     def loads(self, t, q, u, motion, inputs):
         force = inputs["push"] - self.stiffness * q["x"] - self.damping * u["x_dot"]
         return (jk.Force(force * motion.N.x, motion["cart"]),)
+
+
+class Track(jk.System):
+    """x'' = gain push + drift: linear in both parameters and in the start, so least squares has a closed form."""
+
+    gain: jk.Scalar = jk.parameter(1.0)  # [1/kg]
+    drift: jk.Scalar = jk.parameter(0.0)  # [m/s^2]
+
+    coordinates = ("x",)
+    speeds = ("x_dot",)
+    inputs = ("push",)
+
+    def motion(self, t, q, u):
+        N, _ = jk.inertial()
+        P = jk.Point.at(u[0] * N.x, q[0] * N.x, "P")
+        return jk.Motion([jk.Body(1.0, 0.0, P, name="cart")], frames={"N": N})
+
+    def loads(self, t, q, u, motion, inputs):
+        return (jk.Force((self.gain * inputs["push"] + self.drift) * motion.N.x, motion["cart"]),)

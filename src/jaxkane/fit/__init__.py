@@ -11,6 +11,8 @@ from ._gradient_descent import gradient_descent as gradient_descent
 from ._identifiability import Direction as Direction
 from ._identifiability import Identifiability as Identifiability
 from ._identifiability import identifiability as identifiability
+from ._laplace import Laplace as Laplace
+from ._laplace import laplace as laplace
 from ._least_squares import gauss_newton as gauss_newton
 from ._least_squares import least_squares as least_squares
 from ._model import Model as Model
@@ -28,10 +30,8 @@ from ._residual_tests import ResidualTest as ResidualTest
 from ._result import Fit as Fit
 from ._trial import Trial as Trial
 from ._uncertainty import CrossValidation as CrossValidation
-from ._uncertainty import Laplace as Laplace
 from ._uncertainty import Profile as Profile
 from ._uncertainty import cross_validate as cross_validate
-from ._uncertainty import laplace as laplace
 from ._uncertainty import profile as profile
 from .bicycle import bicycle_priors as bicycle_priors
 from .bicycle import bicycle_rides as bicycle_rides

@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+from scipy.special import log_ndtr
 
 
 class Interval(eqx.Module):
@@ -50,9 +51,29 @@ class Interval(eqx.Module):
         width, share = self._share(start)
         return (_logit(self._share(value)[1]) - _logit(share)) * width * share * (1 - share) / scale
 
+    def log_prior_constants(self, mean: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+        """log p(value) + (value - mean)^2 / (2 deviation^2), (1,): the Gaussian is cut off at the bounds; without one
+        (an infinite deviation) the density is uniform between both bounds, or NaN where one is open."""
+        lower, upper = float(self.lower), float(self.upper)
+        if np.all(np.isfinite(deviation)):
+            return _gaussian_constant(deviation) - log_gaussian_mass(
+                (lower - mean) / deviation, (upper - mean) / deviation
+            )
+        return np.array([-np.log(upper - lower) if all(self.bounded) else np.nan])
+
     def _share(self, value: Array) -> tuple[Array, Array]:
         width = self.upper - self.lower
         return width, (value - self.lower) / width
+
+
+def _gaussian_constant(deviation: np.ndarray) -> np.ndarray:
+    return -np.log(deviation) - 0.5 * np.log(2 * np.pi)
+
+
+def log_gaussian_mass(a: Any, b: Any) -> Any:
+    """log (Phi(b) - Phi(a)) for a < b, without cancellation on either side."""
+    a, b = np.where(a > 0, -b, a), np.where(a > 0, -a, b)
+    return log_ndtr(b) + np.log1p(-np.exp(log_ndtr(a) - log_ndtr(b)))
 
 
 def _logit(share: Array) -> Array:
@@ -113,6 +134,18 @@ class PossibleBody(eqx.Module):
             a, b = self.wheel
             full = full.at[4 + b].set(full[4 + a])
         return ((_factors(full) - self.start) / self.scale)[np.array(self.moves)]
+
+    def log_prior_constants(self, mean: np.ndarray, deviation: np.ndarray) -> np.ndarray:
+        """As of an `Interval`. The Gaussians are cut off where no body is; how much of them that leaves is counted
+        among draws, to about a per cent. NaN where a value has no prior."""
+        if not np.all(np.isfinite(deviation)):
+            return np.where(np.isfinite(deviation), 0.0, np.nan)
+        draws = np.random.default_rng(0).normal(mean, deviation, (10_000, len(mean)))
+        x = jax.vmap(self.inverse)(jnp.asarray(draws, self.start.dtype))
+        share = np.mean(np.all(np.isfinite(np.asarray(x)), axis=1))
+        constants = _gaussian_constant(deviation)
+        constants[0] -= np.log(share) if share > 0 else np.nan
+        return constants
 
     @staticmethod
     def all_values(factors: Float[Array, " 10"]) -> Float[Array, " 10"]:

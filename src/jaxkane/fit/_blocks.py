@@ -76,11 +76,26 @@ class Eliminated(eqx.Module):
     @property
     def log_determinant(self) -> Array:
         """log det of the information about z and b, those without any left out."""
+        logs = [jnp.sum(jnp.log(jnp.where(told, d, 1.0))) for d, told in zip(self._diagonals, self.told, strict=True)]
+        return 2 * (logs[0] + logs[1])
+
+    @property
+    def told(self) -> tuple[Array, Array]:
+        """Whether there is information about z (T, m, n_z) and b (T, n_b): elimination leaves rounding errors of a
+        column that others can stand for, and less of one that moves no residual."""
+
+        def of(d: Array, squares: Array) -> Array:
+            norm, eps, tiny = _safe(squares), jnp.finfo(d.dtype).eps, jnp.finfo(d.dtype).tiny
+            return (d > 1e5 * eps * norm) & (norm > tiny**0.25)
+
+        (of_z, of_b), (z, b) = _column_squares(self.blocks), self._diagonals
+        return of(z, of_z), of(b, of_b)
+
+    @property
+    def _diagonals(self) -> tuple[Array, Array]:
         n_z, n_b = self.z_rows.shape[2], self.b_rows.shape[1]
-        diagonals = [jnp.diagonal(self.z_rows[..., :n_z], axis1=-2, axis2=-1).ravel()]
-        diagonals.append(jnp.diagonal(self.b_rows[..., :n_b], axis1=-2, axis2=-1).ravel())
-        d = jnp.abs(jnp.concatenate(diagonals))
-        return 2 * jnp.sum(jnp.where(d > jnp.finfo(d.dtype).tiny ** 0.25, jnp.log(jnp.maximum(d, 1e-300)), 0.0))
+        of = lambda R: jnp.abs(jnp.diagonal(R, axis1=-2, axis2=-1))  # noqa: E731
+        return of(self.z_rows[..., :n_z]), of(self.b_rows[..., :n_b])
 
     @jax.jit
     def step(self, damping: Array | float) -> tuple[Array, Array]:
@@ -116,10 +131,7 @@ def eliminate(blocks: Blocks, damping: Array | float) -> Eliminated:
     # What has no influence has rounding errors; a step along them would lead anywhere.
     silent = jnp.zeros(R.shape[-1], bool).at[-1 - n_x : -1].set(blocks.silent)
     R = jnp.where(silent[None, None, :], 0.0, R)
-    squares = _by_trial(jnp.sum(R**2, axis=1), blocks.windows)  # (T, m, k)
-    of_z = squares[:, :, :n_z]
-    if n_next:
-        of_z = of_z.at[:, 1:].add(squares[:, :-1, n_z : 2 * n_z])
+    of_z, of_b = _column_squares(blocks)
     # Never quite zero: an unknown without influence then stays where it is, instead of becoming NaN.
     damping = jnp.maximum(jnp.asarray(damping, R.dtype), 1e3 * jnp.finfo(R.dtype).eps)
     c = n_next + n_b + n_x + 1
@@ -136,10 +148,19 @@ def eliminate(blocks: Blocks, damping: Array | float) -> Eliminated:
         return rest[:, n_next:], z_rows  # after a trial's last window there is no next
 
     rest, z_rows = jax.vmap(of_trial)(_by_trial(R, blocks.windows), damping * _safe(of_z))
-    of_b = jnp.sum(squares, axis=1)[:, n_z + n_next : n_z + n_next + n_b]
     b_rows, rest = jax.vmap(lambda rows, d: _triangle(rows, n_b, d))(rest, damping * _safe(of_b))
-    scale = _safe(jnp.sum(squares, axis=(0, 1))[-1 - n_x : -1])
+    scale = _safe(jnp.sum(R**2, axis=(0, 1))[-1 - n_x : -1])
     return Eliminated(rest, z_rows, b_rows, scale, blocks)
+
+
+def _column_squares(blocks: Blocks) -> tuple[Array, Array]:
+    """Of the columns of z (T, m, n_z) and b (T, n_b)."""
+    n_z, n_next = blocks.n_z, blocks.n_next
+    squares = _by_trial(jnp.sum(blocks.R**2, axis=1), blocks.windows)  # (T, m, k)
+    of_z = squares[:, :, :n_z]
+    if n_next:
+        of_z = of_z.at[:, 1:].add(squares[:, :-1, n_z : 2 * n_z])
+    return of_z, jnp.sum(squares, axis=1)[:, n_z + n_next : n_z + n_next + blocks.n_b]
 
 
 def _by_trial(x: Array, windows: Array) -> Array:

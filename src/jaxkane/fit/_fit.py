@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal
 
 import diffrax
+import numpy as np
 from jaxtyping import Array
 
 from .._system import System
@@ -48,7 +50,7 @@ def fit(
     atol: float | None = None,
     step: float | None = None,
     solver: diffrax.AbstractSolver | None = None,
-    max_steps: int = 4096,
+    max_steps: int | None = None,
     processes: bool = False,
     **options: Any,
 ) -> Fit:
@@ -78,9 +80,11 @@ def fit(
     - `outputs`: channels that are functions of the `Trajectory`, by name: values (n_t,).
     - `method`: "gradient_descent", "least_squares" (Levenberg-Marquardt), "gauss_newton" or "bfgs"; `options` go to it
         (`steps`, `start`, `checkpoint`, `progress`, ...).
-    - `rtol`, `atol`, `step`, `solver`, `max_steps`: of the simulation. By default one step of Bosh3 between
-        neighbouring samples where there are inputs, or two or four where that changes what is simulated; and Tsit5
-        with a tolerance of 1e-6 elsewhere.
+    - `rtol`, `atol`, `step`, `solver`, `max_steps`: of the simulation. By default, where inputs vary and neither
+        tolerances nor a step are given, one step of Bosh3 between neighbouring samples, halved until that changes what
+        is simulated by less than a share of the noise, at the first guess and again where the fit ended; elsewhere
+        Tsit5 with a tolerance of 1e-6. `Fit.step_error` says what is left. `max_steps`: by default as many as fixed
+        steps take, and 4096 with tolerances.
     - `processes`: let all processes of `jax.distributed` simulate together. Each is started with the same script,
         calls `jax.distributed.initialize(...)` before anything else, and this with all trials; each simulates a share
         of the windows, all take the same steps and return the same `Fit`, that of one process alone.
@@ -113,4 +117,21 @@ def fit(
         max_steps=max_steps,
         processes=processes,
     )
-    return METHODS[method](problem, **options)
+    return _with_fine_steps(METHODS[method](problem, **options), METHODS[method], options)
+
+
+def _with_fine_steps(result: Fit, method: Callable[..., Fit], options: Mapping[str, Any]) -> Fit:
+    """The fit gone on with from where it ended, as long as the steps of integration are too coarse there."""
+    if result.problem.posed["step"] is not None:
+        return result
+    # The file is that of the first steps: what follows begins near its end.
+    options = {key: value for key, value in options.items() if key not in ("start", "checkpoint", "horizons")}
+    for _ in range(3):
+        if result.status != "converged" or not result.too_coarse:
+            break
+        problem = result.problem.finer(result.point)
+        if np.array_equal(problem.windows.step, result.problem.windows.step):
+            break
+        again = method(problem, start=result.point, **options)
+        result = dataclasses.replace(again, history=(*result.history, *again.history[1:]))
+    return result

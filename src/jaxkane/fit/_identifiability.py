@@ -102,6 +102,12 @@ def identifiability(
     return look(problem, point, linearization, flat)
 
 
+def residual_variance(problem: Problem, cost: float) -> float:
+    """The sum of squares by residuals less unknowns; NaN where there are no more residuals than unknowns."""
+    n_r, n_unknown = problem.size
+    return cost / (n_r - n_unknown) if n_r > n_unknown else float("nan")
+
+
 def look(problem: Problem, point: Point, at: Linearization, flat: float = 0.5) -> Identifiability:
     """Identifiability at a point where the problem has been linearized."""
     parameters = problem.parameters
@@ -116,8 +122,9 @@ def look(problem: Problem, point: Point, at: Linearization, flat: float = 0.5) -
     before = np.linalg.norm(np.asarray(at.blocks.R)[:, :, -1 - p : -1] @ to_x, axis=(0, 1))
     eps = float(jnp.finfo(eliminated.R.dtype).eps)
     silent = before <= 1e4 * eps * before.max()
-    n_r, n_unknown = problem.size
-    variance = at.cost / max(n_r - n_unknown, 1)  # of a residual; one where `sigma` is right
+    variance = residual_variance(problem, at.cost)
+    # Without a degree of freedom nothing says that `sigma` is wrong.
+    deviation = 1.0 if np.isnan(variance) else variance**0.5
     heard = np.flatnonzero(~silent)
     s, V = np.zeros(p), np.zeros((p, p))
     if heard.size:
@@ -127,7 +134,7 @@ def look(problem: Problem, point: Point, at: Linearization, flat: float = 0.5) -
     V[np.arange(heard.size, p), np.flatnonzero(silent)] = 1.0
     s = np.where(s <= 1e3 * eps * before.max(), 0.0, s)  # elimination leaves rounding errors of what it removed
     with np.errstate(divide="ignore"):
-        deviations = np.sqrt(variance) / s
+        deviations = deviation / s
         inverse = np.where(s > 0, 1 / s, 0.0)
     V = V * np.sign(V[np.arange(p), np.abs(V).argmax(axis=1)])[:, None]
     told = ~silent & np.all((np.abs(V) < 1e-6) | (s[:, None] > 0), axis=0)

@@ -160,8 +160,9 @@ class Parameters(eqx.Module):
         pairs = zip(self.bijections, self._parts(x), strict=True)
         return sum((jnp.linalg.slogdet(jax.jacfwd(f)(part))[1] for f, part in pairs), jnp.zeros((), x.dtype))
 
-    def _parts(self, x: Array) -> list[Array]:
-        return jnp.split(x, np.cumsum(self.sizes)[:-1])
+    def _parts(self, x: Any) -> list[Any]:
+        split = np.split if isinstance(x, np.ndarray) else jnp.split
+        return split(x, np.cumsum(self.sizes)[:-1])
 
     def apply(self, system: System, x: Float[Array, " p"]) -> tuple[System, dict[tuple[str, str], Array]]:
         """The system with these parameters, and gains and delays by ("gain", input)."""
@@ -181,6 +182,14 @@ class Parameters(eqx.Module):
     def prior_residuals(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
         """(value - mean) / deviation; zero without a prior."""
         return (self.values(x) - self.prior_mean) / self.prior_deviation
+
+    @property
+    def log_prior_constants(self) -> np.ndarray:
+        """log p(value) + prior_residual^2 / 2 of every entry (p,), with p its prior's density in its unit: the Gaussian
+        inside the bounds, or uniform between them; NaN where it has neither."""
+        parts = [self._parts(np.asarray(x, float)) for x in (self.prior_mean, self.prior_deviation)]
+        constants = [f.log_prior_constants(*pair) for f, *pair in zip(self.bijections, *parts, strict=True)]
+        return np.concatenate(constants)
 
     def with_priors(self, priors: Mapping[str, Prior]) -> Parameters:
         """The same parameters with priors (mean, standard deviation) by name; names that are not free are left out."""

@@ -100,9 +100,9 @@ def _parameters(fit: Fit, truth: Any) -> tuple[Row, Sequence[Row]]:
 
     known, errors, robust = known_values(fit, truth), fit.standard_errors, fit.clustered_errors
     head = ["parameter", "unit", "start", "estimate", "std. error", "by trial", "95 % interval"]
-    rows = []
+    rows, intervals = [], fit.intervals()
     for name, unit in zip(fit.names, fit.parameters.units, strict=True):
-        low, high = fit.intervals()[name]
+        low, high = intervals[name]
         row = [name, unit, f"{fit.start[name]:.5g}", f"{fit.estimates[name]:.5g}", f"{errors[name]:.2g}"]
         row += [f"{robust[name]:.2g}", f"{low:.4g} to {high:.4g}"]
         rows.append([*row, *([f"{known[name]:.5g}" if name in known else ""] if known else [])])
@@ -180,7 +180,9 @@ def _biases(fit: Fit, brief: bool = False) -> tuple[Row, Sequence[Row]]:
 def _settings(fit: Fit) -> Iterable[tuple[str, str]]:
     problem, s = fit.problem, fit.problem.model.settings
     steps = np.asarray(problem.windows.step)
-    fixed = f"steps of {steps.min():.3g} to {steps.max():.3g} s" if s.step is not None else f"rtol {s.rtol:g}"
+    fixed = f"rtol {s.rtol:g}"
+    if s.step is not None:
+        fixed = f"steps of {steps.min():.3g} to {steps.max():.3g} s, halved: {fit.step_error:.2g} standard deviations"
     yield "simulation", f"{type(s.solver).__name__}, {fixed}"
     lengths = np.asarray(problem.windows.t[:, -1] - problem.windows.t[:, 0])
     kind = "chained" if problem.model.nuisance.chained else "with free starts"

@@ -22,10 +22,10 @@ def _figure(width: float, height: float) -> Any:
 def draw_estimates(fit: Fit) -> Any:
     """Estimates with their intervals, and where they started."""
     figure = _figure(8, 0.9 + 0.45 * len(fit.names))
-    ax = figure.subplots()
+    ax, intervals = figure.subplots(), fit.intervals()
     for i, name in enumerate(fit.names):
         scale = abs(fit.estimates[name]) or 1.0
-        low, high = ((x - fit.estimates[name]) / scale * 100 for x in fit.intervals()[name])
+        low, high = ((x - fit.estimates[name]) / scale * 100 for x in intervals[name])
         start = (fit.start[name] - fit.estimates[name]) / scale * 100
         if np.isfinite(low) and np.isfinite(high):
             ax.plot([low, high], [i, i], color="C0", linewidth=3, solid_capstyle="butt")

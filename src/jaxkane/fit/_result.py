@@ -7,6 +7,7 @@ import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +15,7 @@ import numpy as np
 from .._system import System
 from .._trajectory import Trajectory
 from . import _suspicions as suspicions
-from ._identifiability import Identifiability, look
+from ._identifiability import Identifiability, look, residual_variance
 from ._model import Point
 from ._parameters import Parameters
 from ._problem import Linearization, Problem
@@ -85,9 +86,9 @@ class Fit:
 
     @property
     def variance(self) -> float:
-        """Of a residual: the sum of squares by the degrees of freedom; one where `sigma` and the model are right."""
-        n_r, n_unknown = self.problem.size
-        return self.cost / max(n_r - n_unknown, 1)
+        """Of a residual: the sum of squares by residuals less unknowns; one where `sigma` and the model are right, and
+        NaN where there are no more residuals than unknowns."""
+        return residual_variance(self.problem, self.cost)
 
     @property
     def system(self) -> System:
@@ -110,12 +111,29 @@ class Fit:
         words = STATUS[self.status]
         if self.status == "converged" and not self.identifiability.ok:
             words = "the cost has converged, but not every parameter is determined"
-        return "; ".join([words, *(note.rstrip(".") for note in self.identifiability.messages)])
+        notes = (*self.identifiability.messages, *suspicions.coarse_steps(self))
+        return "; ".join([words, *(note.rstrip(".") for note in notes)])
 
     @property
     def ok(self) -> bool:
-        """Whether it converged and every parameter is determined."""
-        return self.status == "converged" and self.identifiability.ok
+        """Whether it converged, every parameter is determined, and the steps of integration are fine enough."""
+        return self.status == "converged" and self.identifiability.ok and not self.too_coarse
+
+    @functools.cached_property
+    def _step_errors(self) -> np.ndarray:
+        return self.problem.step_errors(self.point, np.asarray(self.linearization.simulated))
+
+    @property
+    def step_error(self) -> float:
+        """By how much halving the fixed step of integration moves all residuals together, in standard deviations: about
+        by as many of its standard errors an estimate can be off at most. NaN where the step follows from tolerances."""
+        return float(np.linalg.norm(self._step_errors))
+
+    @property
+    def too_coarse(self) -> bool:
+        """Whether halving the fixed step moves a window's residuals by more than a share of what noise does."""
+        noise = max(1.0, np.nan_to_num(self.variance, nan=1.0)) ** 0.5
+        return bool(np.any(self._step_errors > noise * self.problem.step_tolerance))
 
     @property
     def singular_values(self) -> np.ndarray:
@@ -146,32 +164,34 @@ class Fit:
         known = np.all(np.isfinite(self.clustered_covariance.diagonal()))
         return bool(known and abs(self.autocorrelation) > 0.2)
 
-    def quantile(self, level: float = 0.95) -> float:
-        """Of Student's distribution, two-sided, with the degrees of freedom of all residuals."""
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom of all intervals: trials less one where `robust`, else residuals less unknowns."""
         n_r, n_unknown = self.problem.size
-        return t_quantile(level, n_r - n_unknown)
+        return self.problem.clusters - 1 if self.robust else n_r - n_unknown
+
+    def quantile(self, level: float = 0.95) -> float:
+        """Of Student's distribution, two-sided, with as many degrees of freedom as `freedom`."""
+        return t_quantile(level, self.freedom)
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Confidence intervals by name, inside a parameter's bounds: symmetric in the free numbers.
 
-        From the clustered errors where `robust`, with as many degrees of freedom as there are trials less one; from
-        the formal ones else.
+        From the clustered errors where `robust`, from the formal ones else; `freedom` says with how many degrees.
+
+        **Raises:** `ValueError` for a level that is not between 0 and 1.
         """
         errors = self.clustered_errors if self.robust else self.standard_errors
-        T = len(self.problem.trials)
-        quantile = t_quantile(level, T - 1) if self.robust else self.quantile(level)
-        values = np.asarray(self.parameters.values(self.point.x))
-        slopes = np.asarray(self.parameters.slopes(self.point.x))
-        found = {}
-        for i, name in enumerate(self.names):
-            alone = np.count_nonzero(slopes[i]) == 1
-            if alone and np.isfinite(errors[name]):
-                x = [self.point.x.at[i].add(side * quantile * errors[name] / abs(slopes[i, i])) for side in (-1, 1)]
-                low, high = sorted(float(self.parameters.values(at)[i]) for at in x)
-            else:
-                low, high = values[i] - quantile * errors[name], values[i] + quantile * errors[name]
-            found[name] = (float(low), float(high))
-        return found
+        quantile = self.quantile(level)
+        values, slopes = (np.asarray(f(self.parameters, self.point.x)) for f in (_values, _slopes))
+        alone = (np.count_nonzero(slopes, axis=1) == 1) & (slopes.diagonal() != 0)
+        half = quantile * np.array(list(errors.values()))
+        # What moves with others, as a body's values do, is taken as linear.
+        in_x = np.where(alone & np.isfinite(half), half / np.where(alone, np.abs(slopes.diagonal()), 1.0), 0.0)
+        ends = [np.asarray(_values(self.parameters, self.point.x + jnp.asarray(s * in_x, self.point.x.dtype)))
+                for s in (-1, 1)]  # fmt: skip
+        low, high = (np.where(in_x > 0, end, values + s * half) for s, end in zip((-1, 1), ends, strict=True))
+        return {name: (float(min(a, b)), float(max(a, b))) for name, a, b in zip(self.names, low, high, strict=True)}
 
     @property
     def correlation(self) -> np.ndarray:
@@ -256,6 +276,12 @@ class Fit:
 
     @functools.cached_property
     def notes(self) -> tuple[str, ...]:
+        """What a reader should know. Where a channel fits badly, a few steps of a fit with each sign turned round."""
+        return (*self.short_notes, *suspicions.contrary_signs(self))
+
+    @functools.cached_property
+    def short_notes(self) -> tuple[str, ...]:
+        """The notes for which nothing is fitted anew."""
         notes = [*self.identifiability.messages, *suspicions.trade_offs(self)]
         lag = self.autocorrelation
         if lag > 0.3:
@@ -263,10 +289,11 @@ class Fit:
                 f"The residuals are not noise: neighbours correlate by {lag:.2f}. The formal standard errors are too "
                 f"small by a factor of about {((1 + lag) / max(1 - lag, 0.01)) ** 0.5:.1f}; compare `clustered_errors`."
             )
+        notes += [*suspicions.no_freedom(self), *suspicions.coarse_steps(self)]
         notes += [*suspicions.impossible_bodies(self), *suspicions.bodies_at_the_edge(self)]
         notes += [*suspicions.far_from_start(self), *suspicions.only_priors(self)]
         notes += [*suspicions.empty_columns(self.problem), *suspicions.contrary_rates(self.problem)]
-        return (*notes, *suspicions.contrary_signs(self))
+        return (*notes, *suspicions.doubled_trials(self.problem))
 
     def applied_to(self, trials: Sequence[Trial] | Trial) -> Fit:
         """These parameters on other trials, of which only starts and biases are found: a look at data held back.
@@ -275,6 +302,8 @@ class Fit:
         """
         problem = self.problem.with_trials(trials)
         first = dataclasses.replace(problem.start, x=self.point.x)
+        if problem.posed["step"] is None and problem.model.settings.step is not None:
+            problem = problem.finer(first)
         before = settle(problem, problem.start)[1].cost
         point, at = settle(problem, first, steps=20, rtol=1e-6)
         return Fit.of(problem, point, at, (before, at.cost), "applied", self.method)
@@ -313,7 +342,9 @@ class Fit:
 
     def __str__(self) -> str:
         end = f"sum of squares {self.history[0]:.6g} -> {self.cost:.6g} by {self.method}: {STATUS[self.status]}"
-        return "\n".join([self.title, self.table(), end, *self.notes])
+        # Printing a fit must not start others.
+        signs = ["A channel fits badly: `notes` tries whether a sign is wrong."] * suspicions.fits_badly(self)
+        return "\n".join([self.title, self.table(), end, *self.short_notes, *signs])
 
     @property
     def title(self) -> str:
@@ -325,6 +356,16 @@ class Fit:
         )
 
     __repr__ = __str__
+
+
+@eqx.filter_jit
+def _values(parameters: Parameters, x: Any) -> Any:
+    return parameters.values(x)
+
+
+@eqx.filter_jit
+def _slopes(parameters: Parameters, x: Any) -> Any:
+    return parameters.slopes(x)
 
 
 def known_values(fit: Fit, truth: Any) -> dict[str, float]:

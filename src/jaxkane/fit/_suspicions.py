@@ -52,10 +52,48 @@ def contrary_rates(problem: Problem) -> list[str]:
     return notes
 
 
+def fits_badly(fit: Fit) -> bool:
+    """Whether less than half of a channel's variance is accounted for, and noise does not explain that."""
+    tests = [t for channels in fit.tests.values() for t in channels.values()]
+    return fit.variance >= 2 and not all(t.accounted > 0.5 or np.isnan(t.accounted) for t in tests)
+
+
+def coarse_steps(fit: Fit) -> list[str]:
+    """Steps of integration that bias the estimates."""
+    if not fit.too_coarse:
+        return []
+    steps = np.asarray(fit.problem.windows.step)
+    return [
+        f"The step of integration ({steps.max():.3g} s) is too coarse where the fit ended: half of it moves the "
+        f"residuals by {fit.step_error:.2g} standard deviations together. Give a smaller `step`, or `rtol`."
+    ]
+
+
+def no_freedom(fit: Fit) -> list[str]:
+    """Fits that meet every measurement because there are no more of them than unknowns."""
+    n_r, n_unknown = fit.problem.size
+    if n_r > n_unknown:
+        return []
+    return [
+        f"There are {n_r} residuals for {n_unknown} unknowns: nothing is left that says how large errors are. The "
+        "standard errors are NaN; `laplace` has those for `sigma` as it was given."
+    ]
+
+
+def doubled_trials(problem: Problem) -> list[str]:
+    """Trials with the same samples, which count as if they had been measured twice."""
+    notes, first = [], {}
+    for trial in problem.trials:
+        key = b"".join([trial.t.tobytes(), *(c.encode() + y.tobytes() for c, y in sorted(trial.measured.items()))])
+        if key in first:
+            notes.append(f"{trial.name} has the samples of {first[key]}: what is measured once counts twice.")
+        first.setdefault(key, trial.name)
+    return notes
+
+
 def contrary_signs(fit: Fit) -> list[str]:
     """Where a channel fits badly: inputs and channels with which the opposite sign would fit much better."""
-    tests = [t for channels in fit.tests.values() for t in channels.values()]
-    if all(t.accounted > 0.5 or np.isnan(t.accounted) for t in tests) or fit.variance < 2:
+    if not fits_badly(fit):
         return []
     notes, problem = [], fit.problem
     for i, name in enumerate(problem.system.inputs):

@@ -1,4 +1,4 @@
-"""How far estimates can be trusted: robust errors, profile likelihood, trials left out, a Gaussian posterior."""
+"""How far estimates can be trusted: robust errors, profile likelihood, trials left out."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import dataclasses
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from scipy import stats
@@ -23,28 +24,33 @@ if TYPE_CHECKING:
 def clustered_covariance(fit: Fit) -> np.ndarray:
     """Covariance (p, p) of the free numbers, robust to residuals that are correlated within a trial.
 
-        T / (T - 1)  (A^T A)^-1  sum_t (A_t^T r_t) (A_t^T r_t)^T  (A^T A)^-1
+        B (T / (T - 1) sum_t (A_t^T r_t) (A_t^T r_t)^T + P) B,   B = (A^T A)^-1
 
-    (Liang and Zeger 1986; White's sandwich with a trial as the unit.) NaN with fewer trials than parameters plus two.
+    (Liang and Zeger 1986; White's sandwich with a trial as the unit.) The parameters' priors, of information P, are
+    measurements of their own with the deviations they were given, and no part of any trial. NaN with fewer trials than
+    parameters plus two.
     """
-    blocks = np.asarray(eliminate(fit.linearization.blocks, 0.0).R)  # (T, p+1, p+1)
-    blocks = blocks[np.any(blocks != 0, axis=(1, 2))]
-    T, p = len(blocks), len(fit.names)
-    A, r = blocks[:, :, :-1], blocks[:, :, -1]
-    information = np.einsum("tmi,tmj->ij", A, A)
+    blocks = np.asarray(eliminate(fit.linearization.blocks, 0.0).R, float)  # (T, p+1, p+1)
+    T, p = fit.problem.clusters, len(fit.names)
     if p + 2 > T or not np.all(np.isfinite(fit.covariance)):
         return np.full((p, p), np.nan)
-    scores = np.einsum("tmi,tm->ti", A, r)
+    A, r = blocks[:, :, :-1], blocks[:, :, -1]
+    information, scores = np.einsum("tmi,tmj->ij", A, A), np.einsum("tmi,tm->ti", A, r)
+    parameters, x = fit.parameters, fit.point.x
+    of_prior = np.asarray(parameters.slopes(x), float) / np.asarray(parameters.prior_deviation, float)[:, None]
+    # The rows of the priors stand among those of the first window's trial.
+    scores[int(fit.problem.windows.trial[0])] -= of_prior.T @ np.asarray(parameters.prior_residuals(x), float)
     bread = np.linalg.inv(information)
-    return T / (T - 1) * bread @ (scores.T @ scores) @ bread
+    return bread @ (T / (T - 1) * scores.T @ scores + of_prior.T @ of_prior) @ bread
 
 
 @dataclasses.dataclass(frozen=True)
 class Profile:
     """The sum of squares with one parameter held at values (n,), all others found anew.
 
-    `interval`: where `costs` exceed their minimum by no more than chance does at `level`, as much more as the clustered
-    error exceeds the formal one where `Fit.robust`; infinite on a side where they do not come so far.
+    `interval`: where `costs` exceed their minimum by no more than chance does at `level`, with the quantile and the
+    errors of `Fit.intervals` (where `Fit.robust`, as much more as the clustered error exceeds the formal one);
+    infinite on a side where they do not come so far. A parabola has the interval of `Fit.intervals`.
     """
 
     name: str
@@ -67,6 +73,8 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
 
     if name not in fit.names:
         raise ValueError(f"{name} is not free; {hint(name, fit.names, 'free are')}")
+    if n < 3 or not (span is None or 0 < span < np.inf):
+        raise ValueError(f"A profile has three values at least over a positive span, got n = {n}, span = {span}.")
     error, best = fit.standard_errors[name], fit.estimates[name]
     if not np.isfinite(error):
         raise ValueError(f"These data do not tell {name}: {fit.message}.")
@@ -84,6 +92,8 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
                 there = least_squares(pinned, start=pinned.at({name: float(value)}, point), rtol=1e-5)
             except ValueError:  # outside its bounds, or nothing that can be simulated
                 break
+            if there.status != "converged":
+                break
             pin = (there.estimates[name] - value) / (1e-4 * error)
             cost = there.cost - pin**2 + ((there.estimates[name] - prior[0]) / prior[1]) ** 2
             found[float(value)], point = (cost, there.estimates), there.point
@@ -96,16 +106,18 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
 
 
 def _crossings(values: np.ndarray, costs: np.ndarray, limit: float) -> tuple[float, float]:
-    """Where the costs rise above the limit on both sides of their minimum, linear in between."""
+    """Where the costs rise above the limit on both sides of their minimum."""
     least, ends = int(np.argmin(costs)), []
+    # The root of what a cost exceeds its minimum by is linear where the cost is a parabola.
+    height, wanted = np.sqrt(costs - costs[least]), np.sqrt(limit - costs[least])
     for beyond, infinite in ((range(least, -1, -1), -np.inf), (range(least, len(values)), np.inf)):
         order = list(beyond)
-        above = next((k for k in order if costs[k] > limit), None)
+        above = next((k for k in order if height[k] > wanted), None)
         if above is None:
             ends.append(infinite)
             continue
         inside = order[order.index(above) - 1]
-        share = (limit - costs[inside]) / (costs[above] - costs[inside])
+        share = (wanted - height[inside]) / (height[above] - height[inside])
         ends.append(float(values[inside] + share * (values[above] - values[inside])))
     return ends[0], ends[1]
 
@@ -156,9 +168,7 @@ def cross_validate(fit: Fit, folds: int | Sequence[Sequence[int]] | None = None)
         raise ValueError("Leaving trials out needs two at least: cut a long one with `Trial.between`.")
     if folds is None:
         folds = T if T <= 10 else 5
-    groups = (
-        [list(g) for g in folds] if not isinstance(folds, int) else [list(range(k, T, folds)) for k in range(folds)]
-    )
+    groups = _folds(folds, T)
     held, estimates = np.full(T, np.nan), {name: [] for name in fit.names}
     for group in groups:
         others = fit.problem.only(set(range(T)) - set(group))
@@ -178,52 +188,31 @@ def cross_validate(fit: Fit, folds: int | Sequence[Sequence[int]] | None = None)
     )
 
 
+def _folds(folds: int | Sequence[Sequence[int]], T: int) -> list[list[int]]:
+    if isinstance(folds, int):
+        if not 2 <= folds <= T:
+            raise ValueError(f"`folds`: {T} trials can be left out in 2 to {T} parts, not in {folds}.")
+        return [list(range(k, T, folds)) for k in range(folds)]
+    groups = [[int(k) for k in group] for group in folds]
+    if sorted(k for group in groups for k in group) != list(range(T)) or not all(groups) or len(groups) < 2:
+        raise ValueError(f"`folds` must leave out each of the trials 0 to {T - 1} once, in two groups at least.")
+    return groups
+
+
 def costs_by_trial(problem: Problem, point: Point) -> np.ndarray:
-    """Sums of squares (T,) with these parameters, starts and biases found for them."""
+    """Sums of squares (T,) with these parameters, starts and biases found for them.
+
+    With the priors of a trial's starts and biases, and without those of the parameters, which belong to no trial.
+    """
+    windows = eqx.tree_at(lambda w: w.very_first, problem.windows, jnp.zeros_like(problem.windows.very_first))
+    problem = dataclasses.replace(problem, windows=windows)
     _, at = settle(problem, point, rtol=1e-5)
     costs = np.sum(np.asarray(at.blocks.R)[:, :, -1] ** 2, axis=1)
     return np.bincount(np.asarray(problem.windows.trial), costs, minlength=len(problem.trials))
 
 
-@dataclasses.dataclass(frozen=True)
-class Laplace:
-    """A Gaussian for the posterior of the free numbers x, at its mode.
-
-    `mean` (p,), `covariance` (p, p); `log_evidence` up to a constant that is the same for the same data: for comparing
-    models whose parameters have priors.
-    """
-
-    fit: Fit
-    mean: np.ndarray
-    covariance: np.ndarray
-    log_evidence: float
-
-    def sample(self, n: int, seed: int = 0) -> dict[str, np.ndarray]:
-        """Parameters (n,) by name, in their units: never outside their bounds."""
-        rng = np.random.default_rng(seed)
-        x = rng.multivariate_normal(self.mean, self.covariance, size=n)
-        values = np.stack([np.asarray(self.fit.parameters.values(jnp.asarray(row))) for row in x])
-        return dict(zip(self.fit.names, values.T, strict=True))
-
-
-def laplace(fit: Fit) -> Laplace:
-    """The Laplace approximation: `sigma` is taken as it was given, priors count, nuisance values are integrated out.
-
-        log evidence = -cost / 2 - 1/2 log det(information of all unknowns) + constant
-
-    **Raises:** `ValueError` that names the parameters that the data do not tell: nothing bounds their posterior.
-    """
-    untold = [name for name, error in fit.standard_errors.items() if not np.isfinite(error)]
-    if untold:
-        raise ValueError(f"These data do not tell {', '.join(untold)}: give a prior, or leave something out.")
-    eliminated = eliminate(fit.linearization.blocks, 0.0)
-    A = np.asarray(eliminated.rows[0])
-    information = A.T @ A
-    sign, log_det = np.linalg.slogdet(information)
-    evidence = -0.5 * fit.cost - 0.5 * (float(log_det) + float(eliminated.log_determinant))
-    return Laplace(fit, np.asarray(fit.point.x), np.linalg.inv(information), evidence if sign > 0 else float("nan"))
-
-
 def t_quantile(level: float, freedom: int) -> float:
-    """Two-sided, of Student's distribution."""
-    return float(stats.t.ppf(0.5 * (1 + level), max(freedom, 1)))
+    """Two-sided, of Student's distribution; NaN without a degree of freedom."""
+    if not 0 < level < 1:
+        raise ValueError(f"`level` is a probability between 0 and 1, such as 0.95; got {level}.")
+    return float(stats.t.ppf(0.5 * (1 + level), freedom)) if freedom > 0 else float("nan")

@@ -1,0 +1,222 @@
+"""What a fit reports, against linear least squares in closed form: every number is computed here a second time."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+from systems import Track
+
+from jaxkane.fit import Free, Problem, Trial, cross_validate, laplace, least_squares, profile
+
+TIGHT = 1e-6
+t = np.arange(0.0, 4.0, 0.1)
+SIGMA, N = 0.02, 6
+PRIOR = (1.1, 0.01)  # of the gain
+BIAS = 0.05  # [m], a deviation
+
+
+def responses(push):
+    """Columns (n_t, 5) of what is measured, by gain, drift, start and offset: x'' = gain push + drift, push linear
+    between samples."""
+    h, rows = np.diff(t), [(0.0, 0.0)]
+    for i, dt in enumerate(h):
+        x, v = rows[-1]
+        rows.append((x + v * dt + (2 * push[i] + push[i + 1]) * dt**2 / 6, v + (push[i] + push[i + 1]) * dt / 2))
+    return np.column_stack([np.array(rows)[:, 0], t**2 / 2, np.ones_like(t), t, np.ones_like(t)])
+
+
+PUSHES = [np.sin((1.5 + 0.3 * k) * t + k) for k in range(N)]
+COLUMNS = [responses(push) for push in PUSHES]
+
+
+def recorded(seed, wander=0.0, noise=0.03):
+    """Noise, and in every trial another drift: that is what errors by trial are for."""
+    rng = np.random.default_rng(seed)
+    return [
+        C @ [1.2, 0.3 + wander * rng.normal(), 0.1 * k, -0.2, 0.03 * rng.normal()] + noise * rng.normal(size=t.size)
+        for k, C in enumerate(COLUMNS)
+    ]
+
+
+def trials_of(records):
+    return [
+        Trial(t, {"x": y}, {"push": push}, sigma=SIGMA, name=f"run {k}")
+        for k, (y, push) in enumerate(zip(records, PUSHES, strict=True))
+    ]
+
+
+def dense(records, prior=PRIOR):
+    """Rows (n, 2 + 3 N) and right-hand sides of the whole problem, in standard deviations.
+
+    Unknowns: gain, drift; start, speed and sensor's offset of each trial.
+    """
+    own = np.kron(np.eye(N), np.zeros((t.size, 3)))
+    A, y = np.zeros((N * t.size, 2)), np.concatenate(records) / SIGMA
+    for k, C in enumerate(COLUMNS):
+        rows = slice(k * t.size, (k + 1) * t.size)
+        A[rows], own[rows, 3 * k : 3 * k + 3] = C[:, :2] / SIGMA, C[:, 2:] / SIGMA
+    A = np.hstack([A, own])
+    of_bias = np.eye(A.shape[1])[4::3] / BIAS
+    of_gain = np.eye(1, A.shape[1]) / prior[1]
+    return np.vstack([A, of_bias, of_gain]), np.concatenate([y, np.zeros(N), [prior[0] / prior[1]]])
+
+
+def by_trial(records):
+    """Of each trial, its rows by gain and drift and its right-hand side with its own unknowns projected out."""
+    for C, y in zip(COLUMNS, records, strict=True):
+        Q, _ = np.linalg.qr(np.vstack([C[:, 2:] / SIGMA, [[0.0, 0.0, 1 / BIAS]]]))
+        clear = lambda a, Q=Q: a - Q @ (Q.T @ a)  # noqa: E731
+        yield clear(np.vstack([C[:, :2] / SIGMA, [[0.0, 0.0]]])), clear(np.append(y / SIGMA, 0.0))
+
+
+FREE = (Free("gain", prior=PRIOR), "drift")
+OPTIONS = {"unknown": ("x", "x_dot"), "sensor_bias": {"x": BIAS}}
+
+
+def fitted(records, *free, start=None, **options):
+    problem = Problem.of(Track() if start is None else start, trials_of(records), free, **(OPTIONS | options))
+    return least_squares(problem, rtol=1e-14, damping=1e-7)
+
+
+@pytest.fixture(scope="module", params=[0.0, 0.2], ids=["noise", "wander"])
+def case(request):
+    records = recorded(1, wander=request.param)
+    found = fitted(records, *FREE)
+    assert found.ok, found.message
+    assert found.robust == (request.param > 0)
+    A, y = dense(records)
+    best = np.linalg.lstsq(A, y, rcond=None)[0]
+    return records, found, A, y, best
+
+
+def errors_by_trial(records, best):
+    """The sandwich: scores of the trials, beside the information of a prior that was measured apart from them."""
+    information, meat = np.diag([PRIOR[1] ** -2, 0.0]), np.zeros((2, 2))
+    for A, y in by_trial(records):
+        score = A.T @ (A @ best[:2] - y)
+        information, meat = information + A.T @ A, meat + np.outer(score, score)
+    bread = np.linalg.inv(information)
+    return bread @ (N / (N - 1) * meat + np.diag([PRIOR[1] ** -2, 0.0])) @ bread
+
+
+def test_estimates_and_formal_errors(case):
+    records, found, A, y, best = case
+    np.testing.assert_allclose(list(found.estimates.values()), best[:2], rtol=TIGHT)
+    own = [[x["start of x"][0], x["start of x_dot"][0], x["bias of x"]] for x in found.nuisance.values()]
+    np.testing.assert_allclose(np.ravel(own), best[2:], rtol=TIGHT, atol=TIGHT)
+    rss = np.sum((A @ best - y) ** 2)
+    assert found.cost == pytest.approx(rss, rel=TIGHT)
+    assert found.freedom == (N - 1 if found.robust else A.shape[0] - A.shape[1])
+    assert found.variance == pytest.approx(rss / (A.shape[0] - A.shape[1]), rel=TIGHT)
+    C = found.variance * np.linalg.inv(A.T @ A)[:2, :2]
+    np.testing.assert_allclose(found.covariance, C, rtol=TIGHT)
+    assert found.correlation[0, 1] == pytest.approx(C[0, 1] / np.sqrt(C[0, 0] * C[1, 1]), rel=TIGHT)
+    fitted = np.concatenate([f["x"] for f in found.fitted.values()])
+    np.testing.assert_allclose(fitted, (A @ best)[: N * t.size] * SIGMA, atol=TIGHT)
+    measured = np.concatenate(records)
+    left = 1 - np.sum((measured - fitted) ** 2) / sum(np.sum((y - y.mean()) ** 2) for y in records)
+    assert found.variance_accounted_for["x"] == pytest.approx(left, rel=TIGHT)
+
+
+def test_errors_by_trial(case):
+    records, found, *_, best = case
+    np.testing.assert_allclose(found.clustered_covariance, errors_by_trial(records, best), rtol=1e-4)
+
+
+def test_intervals_and_profiles_have_the_same_freedom(case):
+    records, found, A, _, best = case
+    C = errors_by_trial(records, best) if found.robust else found.covariance
+    freedom = N - 1 if found.robust else A.shape[0] - A.shape[1]
+    half = stats.t.ppf(0.95, freedom) * np.sqrt(C.diagonal())
+    for i, name in enumerate(("gain", "drift")):
+        low, high = best[i] - half[i], best[i] + half[i]
+        assert found.intervals(0.9)[name] == pytest.approx((low, high), abs=1e-4 * half[i])
+        # The cost is a parabola: so is its profile, whatever the grid.
+        assert profile(found, name, n=5, level=0.9).interval == pytest.approx((low, high), abs=1e-3 * half[i])
+
+
+def test_trials_left_out(case):
+    records, found, *_, best = case
+    left_out = cross_validate(found)
+    pieces = list(by_trial(records))
+    for k in range(N):
+        keep = [p for i, p in enumerate(pieces) if i != k]
+        B = np.vstack([*(a for a, _ in keep), [[1 / PRIOR[1], 0.0]]])
+        rhs = np.concatenate([*(r for _, r in keep), [PRIOR[0] / PRIOR[1]]])
+        others = np.linalg.lstsq(B, rhs, rcond=None)[0]
+        found_others = [values[k] for values in left_out.estimates.values()]
+        np.testing.assert_allclose(found_others, others, atol=0.02 * found.standard_errors["gain"])
+        # A trial is charged with its own residuals alone, not with the parameters' priors.
+        for values, costs in ((others, left_out.held_out), (best[:2], left_out.fitted), ((1, 0), left_out.at_start)):
+            assert costs[k] == pytest.approx(np.sum((pieces[k][0] @ values - pieces[k][1]) ** 2), rel=1e-3)
+    assert left_out.n.tolist() == [t.size] * N
+
+
+def test_the_evidence_is_the_density_of_the_data():
+    # All unknowns have Gaussian priors, so the data are Gaussian: their density needs no integral.
+    records = recorded(2)
+    at_rest = [
+        Trial(t, {"x": y}, {"push": p}, sigma=SIGMA, initial={"x": 0.0}) for y, p in zip(records, PUSHES, strict=True)
+    ]
+    free = (Free("gain", prior=(1.0, 0.5), scale=7.0), Free("drift", prior=(0.0, 2.0)))
+    starts = {"x": 0.4, "x_dot": 0.3}
+    gaussian = laplace(least_squares(Problem.of(Track(), at_rest, free, **(OPTIONS | {"unknown": starts})), rtol=1e-14))
+    A = dense(records)[0][: N * t.size] * SIGMA
+    P = np.diag([0.5, 2.0, *[0.4, 0.3, BIAS] * N]) ** 2
+    mean = A[:, 0]  # with a gain of one
+    exact = stats.multivariate_normal(mean, A @ P @ A.T + SIGMA**2 * np.eye(len(A))).logpdf(np.concatenate(records))
+    assert gaussian.log_evidence == pytest.approx(exact, abs=1e-4)
+    assert gaussian.message == ""
+    # C = (A^T A / sigma^2 + P^-1)^-1, of x in the unit of the scales
+    covariance = np.linalg.inv(A.T @ A / SIGMA**2 + np.linalg.inv(P))[:2, :2] / np.outer([7.0, 1.0], [7.0, 1.0])
+    np.testing.assert_allclose(gaussian.covariance, covariance, rtol=TIGHT)
+    draws = gaussian.sample(2000)
+    assert np.std(draws["gain"]) == pytest.approx(7.0 * covariance[0, 0] ** 0.5, rel=0.05)
+
+
+@pytest.fixture(scope="module")
+def evidence():
+    records = recorded(2)
+
+    def of(*free):
+        return laplace(fitted(records, *free, start=Track(gain=1.1, drift=0.2)))
+
+    return of
+
+
+def test_the_evidence_knows_priors_and_no_scales(evidence):
+    prior = (1.0, 0.5)
+    drift = Free("drift", prior=(0.0, 2.0))
+    first = evidence(Free("gain", prior=prior), drift).log_evidence
+    # Starts without a prior have a density of one: they are integrated in closed form.
+    records = recorded(2)
+    A, y = dense(records, (1.0, 0.5))
+    A, y = np.vstack([A, np.eye(1, A.shape[1], 1) / 2.0]), np.append(y, 0.0)
+    rss = np.linalg.lstsq(A, y, rcond=None)[1][0]
+    exact = -0.5 * rss - N * t.size * np.log(SIGMA) - N * np.log(BIAS) - np.log(0.5) - np.log(2.0)
+    exact += 0.5 * (A.shape[1] - len(A)) * np.log(2 * math.pi) - 0.5 * np.linalg.slogdet(A.T @ A)[1]
+    assert first == pytest.approx(exact, abs=1e-5)
+    # How far a step goes, where it begins, and bounds that leave the prior whole are no part of a model.
+    for other in (
+        Free("gain", prior=prior, scale=1e-3),
+        Free("gain", prior=prior, start=2.0),
+        Free("gain", prior=prior, bounds=(-20.0, 25.0)),
+    ):
+        assert evidence(other, drift).log_evidence == pytest.approx(first, abs=1e-4), other
+    # Half of a prior whose mean is at a bound is cut off: the other half counts twice.
+    cut = evidence(Free("gain", prior=(0.0, 5.0), bounds=(0.0, 1e3)), drift).log_evidence
+    whole = evidence(Free("gain", prior=(0.0, 5.0)), drift).log_evidence
+    assert cut - whole == pytest.approx(np.log(2.0), abs=1e-4)
+
+
+def test_a_wider_prior_pays_for_itself(evidence):
+    drift = Free("drift", prior=(0.0, 2.0))
+    wide = [evidence(Free("gain", prior=(1.2, width)), drift).log_evidence for width in (10.0, 1000.0)]
+    assert wide[1] - wide[0] == pytest.approx(-np.log(100.0), abs=1e-3)
+    flat = [evidence(Free("gain", bounds=(0.0, width)), drift).log_evidence for width in (10.0, 1000.0)]
+    assert flat[1] - flat[0] == pytest.approx(-np.log(100.0), abs=1e-3)
+    none = evidence("gain", drift)
+    assert np.isnan(none.log_evidence)
+    assert "any value of gain is as likely" in none.message
+    assert none.sample(3)["gain"].shape == (3,)

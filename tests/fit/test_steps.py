@@ -1,0 +1,112 @@
+"""Steps of integration that follow the motion, at the start of a fit and at its end; an evidence by quadrature."""
+
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.optimize
+import scipy.special
+from scipy import stats
+from systems import Cart
+
+from jaxkane.fit import Free, Problem, Trial, fit, laplace, least_squares
+
+H, SIGMA = 0.25, 0.001
+t = np.arange(0.0, 10.0, H)
+PUSH = 20.0 * np.sin(3.0 * t) + 8.0 * np.cos(7.7 * t)
+
+
+def exact(stiffness, damping):
+    """x (..., n_t) of a cart of 1 kg whose push is linear between samples: the solution by the matrix exponential."""
+    stiffness, damping = np.broadcast_arrays(np.asarray(stiffness, float), damping)
+    rates = np.zeros((*stiffness.shape, 4, 4))  # of x, x_dot, the push and its rate
+    rates[..., 0, 1] = rates[..., 1, 2] = rates[..., 2, 3] = 1.0
+    rates[..., 1, 0], rates[..., 1, 1] = -stiffness, -damping
+    step, state, rows = scipy.linalg.expm(H * rates), np.zeros((*stiffness.shape, 4)), []
+    state[..., 0] = 0.1
+    for i in range(t.size):
+        rows.append(state[..., 0])
+        state[..., 2], state[..., 3] = PUSH[i], (PUSH[min(i + 1, t.size - 1)] - PUSH[i]) / H
+        state = np.einsum("...ij,...j->...i", step, state)
+    return np.stack(rows, axis=-1)
+
+
+@pytest.fixture(scope="module")
+def trial():
+    """Four samples a second of a mass that swings three times a second."""
+    noisy = exact(400.0, 3.0) + SIGMA * np.random.default_rng(0).normal(size=t.size)
+    return Trial(t, {"x": noisy}, {"push": PUSH}, sigma=SIGMA, initial={"x": 0.1, "x_dot": 0.0})
+
+
+GUESS = Cart(mass=1.0, stiffness=350.0, damping=2.0)
+NAMES = ("stiffness", "damping")
+
+
+@pytest.fixture(scope="module")
+def by_exact_motion(trial):
+    """Estimates and their errors from the exact solution."""
+    residuals = lambda p: (exact(*p) - trial.measured["x"]) / SIGMA  # noqa: E731
+    found = scipy.optimize.least_squares(
+        residuals, (390.0, 2.5), x_scale=(1.0, 0.1), xtol=1e-12, ftol=1e-12, gtol=1e-12
+    )
+    return found.x, np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
+
+
+def test_few_samples_a_period_have_no_bias(trial, by_exact_motion):
+    best, errors = by_exact_motion
+    found = fit(GUESS, trial, NAMES, method="least_squares")
+    assert found.ok, found.message
+    assert found.step_error < found.problem.step_tolerance
+    # The tolerance bounds what the steps do to the estimates.
+    assert np.all(np.abs((np.array(list(found.estimates.values())) - best) / errors) < found.problem.step_tolerance)
+
+
+def test_steps_too_coarse_are_told_or_halved(trial):
+    # Slow where it starts: the steps that are chosen there are too coarse where it ends.
+    slow = Cart(mass=1.0, stiffness=350.0, damping=40.0)
+    problem = Problem.of(slow, trial, NAMES)
+    direct = least_squares(problem)
+    told = fit(GUESS, trial, NAMES, method="least_squares", step=H / 4)
+    assert float(told.problem.windows.step[0]) == H / 4
+    for one in (told, direct):
+        assert one.status == "converged"
+        assert one.too_coarse
+        assert not one.ok
+        assert "is too coarse where the fit ended" in one.message
+        assert one.message.split("; ")[-1] + "." in str(one)
+    finer = fit(slow, trial, NAMES, method="least_squares")
+    assert finer.ok
+    assert finer.problem.windows.step[0] < problem.windows.step[0]
+    assert len(finer.history) > len(direct.history)
+
+
+def test_what_says_how_to_integrate(trial):
+    assert Problem.of(GUESS, trial, NAMES, atol=1e-9).model.settings.step is None
+    assert Problem.of(GUESS, trial, NAMES, step=1e-3).model.settings.max_steps is None
+    for options, message in (
+        ({"step": 0.1, "rtol": 1e-6}, "`step` fixes the step of integration"),
+        ({"step": float("nan")}, "`step` must be positive and finite"),
+        ({"atol": -1.0}, "`atol` must be positive and finite"),
+        ({"max_steps": 0}, "`max_steps` must be positive"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Problem.of(GUESS, trial, NAMES, **options)
+
+
+def test_more_fixed_steps_than_any_default_allows(trial):
+    # 10 s by steps of 1 ms are more than 4096.
+    found = least_squares(Problem.of(GUESS, trial, NAMES, step=1e-3))
+    assert found.ok, found.message
+
+
+def test_the_evidence_by_quadrature(trial, by_exact_motion):
+    (k, c), errors = by_exact_motion
+    priors = {"stiffness": (395.0, 4.0), "damping": (2.0, 0.5)}
+    found = least_squares(
+        Problem.of(GUESS, trial, [Free(name, prior=prior) for name, prior in priors.items()], step=1e-3)
+    )
+    grid = np.linspace(-6.0, 6.0, 25)
+    K, C = np.meshgrid(k + errors[0] * grid, c + errors[1] * grid, indexing="ij")
+    log_p = stats.norm.logpdf(trial.measured["x"], exact(K, C), SIGMA).sum(axis=-1)
+    log_p += stats.norm.logpdf(K, *priors["stiffness"]) + stats.norm.logpdf(C, *priors["damping"])
+    cell = np.log(errors[0] * errors[1] * (grid[1] - grid[0]) ** 2)
+    assert laplace(found).log_evidence == pytest.approx(scipy.special.logsumexp(log_p) + cell, abs=0.01)
