@@ -16,7 +16,7 @@ SOURCE = Path(jk.__file__).parent
 
 # Each module may import from the lines above it, and within the same package.
 FLOORS = [
-    ["_lookup", "_types", "_components", "_linear", "_nan", "_native", "_fuse", "_kinks"],
+    ["_lookup", "_types", "_components", "_linear", "_nan", "_native", "_reads", "_fuse", "_kinks"],
     ["rotations", "_vectors"],
     ["_system", "_trajectory"],
     ["loads"],
@@ -39,7 +39,7 @@ WITHIN_A_FLOOR = {
     "_vectors": {"rotations"},
     "_components": {"_types"},
     "_linear": {"_types", "_components"},
-    "_fuse": {"_native"},
+    "_fuse": {"_native", "_reads"},
 }
 
 

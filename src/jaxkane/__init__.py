@@ -31,6 +31,7 @@ from ._equations import mass_matrix as mass_matrix
 from ._equations import partial_velocities as partial_velocities
 from ._reactions import constraint_forces as constraint_forces
 from ._reactions import constraint_multipliers as constraint_multipliers
+from ._reads import forget as forget
 from ._signals import Samples as Samples
 from ._simulate import simulate as simulate
 from ._system import Body as Body

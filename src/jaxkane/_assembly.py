@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +15,7 @@ from ._check import check_system, configuration_residual, is_concrete
 from ._kane import Instant, as_array
 from ._lookup import refuse_unknown
 from ._nan import nan_where
+from ._reads import compiled
 from ._system import State, System
 from ._types import Component
 
@@ -166,7 +166,7 @@ class _Found(NamedTuple):
     steps: Any
 
 
-@eqx.filter_jit
+@compiled
 def _newton(system: System, q0, t, where: tuple[int, ...], lenient: bool) -> _Found:
     places = np.array(where, int)
     # What is not finite must not enter the linear solver, which would raise for all members of a batch.

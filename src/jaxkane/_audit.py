@@ -14,6 +14,7 @@ from ._components import matvec
 from ._fuse import fused
 from ._linear import stack
 from ._reactions import Reactions
+from ._reads import compiled
 from ._system import Force, Motion, System, kinetic_energy_of
 from ._trajectory import Trajectory
 from ._vectors import Vector
@@ -179,7 +180,7 @@ def audit(system: System, trajectory: Trajectory) -> Audit:
     )
 
 
-@eqx.filter_jit
+@compiled
 def _measured_along(system, t, q, u, inputs):
     return jax.vmap(lambda t, q, u, inputs: _measured(system, t, q, u, inputs))(t, q, u, inputs)
 

@@ -26,6 +26,7 @@ from jax.interpreters.partial_eval import dce_jaxpr
 
 from . import _native as native
 from ._native import CALLS, NotScalarError, Scalars
+from ._reads import on_forget, settling, version_of
 
 # What one compiled function may hold: elementwise work and the moving of scalars. Calls into libraries (LAPACK) may not
 # be compiled so, and loops would gain nothing.
@@ -48,20 +49,24 @@ Where = tuple[tuple[bool, ...], ...]
 def fused(f: Callable[..., Any]) -> Callable[..., Any]:
     """`f`, a pure function at module level, as one operation; where it calls into libraries, `f` itself.
 
-    It is traced once for each structure of its arguments, however often it is called.
+    It is traced once for each structure of its arguments, however often it is called, and again where what the code of
+    its arguments reads has changed.
     """
 
     @functools.lru_cache(maxsize=256)
-    def program_for(treedef, avals):
-        program, out = jax.make_jaxpr(lambda *leaves: f(*jax.tree.unflatten(treedef, leaves)), return_shape=True)(
+    def program_for(treedef, avals, version):
+        traced = settling(f)
+        program, out = jax.make_jaxpr(lambda *leaves: traced(*jax.tree.unflatten(treedef, leaves)), return_shape=True)(
             *_specs(avals)
         )
         return (_Program(program), jax.tree.structure(out)) if _is_plain(program.jaxpr) else None
 
+    on_forget(program_for.cache_clear)
+
     @functools.wraps(f)
     def call(*args):
         leaves, treedef = jax.tree.flatten(args)
-        found = program_for(treedef, tuple(map(jax.typeof, leaves)))
+        found = program_for(treedef, tuple(map(jax.typeof, leaves)), version_of(args))
         if found is None:
             return f(*args)
         program, structure = found

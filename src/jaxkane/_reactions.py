@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -24,6 +23,7 @@ from ._equations import InputValues, _arrays
 from ._fuse import fused
 from ._kane import Instant, Row, unit
 from ._linear import as_vector, solve
+from ._reads import compiled
 from ._system import Motion, System
 from ._trajectory import Trajectory
 from ._types import Component, Triple
@@ -94,8 +94,8 @@ def _forces(system, t, q, u, inputs):
 
 
 # What calls into libraries (four dependent speeds, long chains) is not fused: compiled all the same.
-_compiled_forces = eqx.filter_jit(_forces)
-_compiled_multipliers = eqx.filter_jit(_multipliers)
+_compiled_forces = compiled(_forces)
+_compiled_multipliers = compiled(_multipliers)
 
 
 class _Forces(NamedTuple):

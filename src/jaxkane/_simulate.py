@@ -24,6 +24,7 @@ from ._kane import Instant, by_names, checked_inputs, refuse_incomplete
 from ._kinks import ToKinks
 from ._linear import as_vector, determinant
 from ._lookup import not_there
+from ._reads import compiled
 from ._signals import as_signals, evaluate, sample_times
 from ._system import State, System, parameter_info
 from ._trajectory import Status, Trajectory
@@ -177,7 +178,7 @@ def settings_for(
     )
 
 
-@eqx.filter_jit
+@compiled
 def solve(system: System, state: State, ts: Array, signals: Any, settings: Settings) -> Trajectory:
     """`simulate` without its checks: one compiled program."""
     valid = _is_valid(system, state, ts[0])

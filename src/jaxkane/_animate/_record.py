@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._linear import stack
+from .._reads import version_of
 from .._system import Force, System, flatten_loads
 from .._trajectory import Trajectory
 from ._sketch import Element, Figure, Sketch, rotation
@@ -69,14 +70,14 @@ def record(system: System, trajectory: Trajectory, figure: Figure | None) -> Rec
     numbers, rest = eqx.partition(system, eqx.is_array)
     t, q, u, u_dep = (np.asarray(x)[reached] for x in (trajectory.t, trajectory.q, trajectory.u, trajectory.u_dep))
     u = np.concatenate([u, u_dep], axis=1)
-    found = jax.tree.map(np.asarray, _along(numbers, rest, figure, t, q, u))
+    found = jax.tree.map(np.asarray, _along(numbers, rest, figure, version_of(system, figure), t, q, u))
     if not found.bodies:
         raise ValueError(f"animate({name}): no body has a position. Give points their places, see jaxkane.Point.at.")
     return eqx.tree_at(lambda r: (r.mass, r.inertia), found, (found.mass[0], found.inertia[0]))
 
 
-@functools.partial(jax.jit, static_argnums=(1, 2), compiler_options=_COMPILE_QUICKLY)
-def _along(numbers, rest, figure, t, q, u):
+@functools.partial(jax.jit, static_argnums=(1, 2, 3), compiler_options=_COMPILE_QUICKLY)
+def _along(numbers, rest, figure, version, t, q, u):
     system = eqx.combine(numbers, rest)
     return jax.vmap(lambda t, q, u: _instant(system, figure, t, q, u))(t, q, u)
 

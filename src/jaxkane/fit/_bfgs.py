@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any, cast
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
 
+from .._reads import compiled
 from ._density import half_cost
 from ._model import Point
 from ._problem import Problem, linearize
@@ -59,7 +59,7 @@ def bfgs(
     return Fit.of(problem, end, there, history, status, type(solver).__name__)
 
 
-@eqx.filter_jit
+@compiled
 def _minimise(f, solver, origin, unit, unravel, steps):
     return optx.minimise(
         lambda y, _: f(unravel(origin + unit * y)), solver, jnp.zeros_like(origin), max_steps=steps, throw=False

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._assembly import assemble
+from .._reads import compiled
 from .._signals import Samples
 from .._simulate import Settings, solve
 from .._system import State, System
@@ -139,7 +140,7 @@ class Model(eqx.Module):
         return jnp.concatenate(rows), (simulated, ride.status)
 
 
-@eqx.filter_jit
+@compiled
 def starts_of(model: Model, windows: Windows, point: Point) -> tuple[Array, Array]:
     """Starts (W, n) and their derivatives (W, n, n_z + n_b + p) by z, b and x."""
     # A program of its own: inside that of the simulation Newton's method would be differentiated a tangent at a time.
@@ -167,7 +168,7 @@ def jacobian_of(model: Model, window: Windows, start: Array, start_dot: Array, z
     return jax.vmap(along, out_axes=(None, -1, None))(*directions)
 
 
-@eqx.filter_jit
+@compiled
 def blocks_of(model: Model, windows: Windows, by_trial: Array, point: Point, starts: Array, starts_dot: Array):
     """Blocks, what was simulated (W, n_c, n_t) and the status of every window (W,)."""
     n_z, n_b = point.z.shape[1], point.b.shape[1]
@@ -187,7 +188,7 @@ def blocks_of(model: Model, windows: Windows, by_trial: Array, point: Point, sta
     return Blocks(R, by_trial, n_z, n_next, n_b), simulated, status
 
 
-@eqx.filter_jit
+@compiled
 def costs_of(model: Model, windows: Windows, point: Point, starts: Array) -> tuple[Array, Array]:
     """Sums of squares (W,), and what was simulated (W, n_c, n_t): `blocks_of` without derivatives."""
 
@@ -201,7 +202,7 @@ def costs_of(model: Model, windows: Windows, point: Point, starts: Array) -> tup
     return each(window_cost, _arguments(windows, point, starts))
 
 
-@eqx.filter_jit
+@compiled
 def rides_of(model: Model, windows: Windows, point: Point, starts: Array) -> Trajectory:
     """The motion of every window, stacked."""
     return each(lambda now: model.simulate(now[0], now[4], now[3], point.x), _arguments(windows, point, starts))

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from .._check import is_concrete
 from .._lookup import not_there
+from .._reads import compiled
 from .._system import System
 from ._eig import eig
 from ._eigenvalues import Eigenvalues, MotionAt, eigenvalues, family_of, matrix
@@ -118,7 +119,7 @@ def _sign_changes(found: Eigenvalues, most: int) -> tuple[Any, Any, Any]:
     return jnp.where(is_one, row, row[0]), jnp.where(is_one, column, column[0]), is_one
 
 
-@eqx.filter_jit
+@compiled
 def _refine(system, found: Eigenvalues, motion, states, rows, columns):
     eps = float(jnp.finfo(found.values.dtype).eps)
     fixed = jax.lax.stop_gradient(found)

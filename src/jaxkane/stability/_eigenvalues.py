@@ -14,6 +14,7 @@ from scipy.optimize import linear_sum_assignment
 
 from .._check import is_concrete
 from .._lookup import not_there
+from .._reads import compiled
 from .._system import State, System
 from ..catalog import WhippleBicycle
 from ._bicycle import LATERAL, MODES, mode_order, straight_ahead
@@ -138,7 +139,7 @@ def matrix(system: System, value: Any, motion: Any, states: tuple[str, ...] | No
     return model.A, model.states
 
 
-@eqx.filter_jit
+@compiled
 def _along(system, values, motion, states, named):
     names: list[tuple[str, ...]] = []
 

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._lookup import by_name, hint
+from .._reads import compiled
 from .._system import System
 from ._solve import jacobian
 from ._steady import Problem, SteadyMotion, as_motion
@@ -190,7 +191,7 @@ class _Curve:
         return y
 
 
-@eqx.filter_jit
+@compiled
 def _residual_and_slope(problem: Problem, z, args):
     return problem.residual(z, args), jacobian(lambda z: problem.residual(z, args), z)
 

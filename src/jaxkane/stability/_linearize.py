@@ -17,6 +17,7 @@ from .._fuse import fused
 from .._kane import as_array, checked_inputs, refuse_incomplete
 from .._linear import as_vector, solve, stack
 from .._lookup import hint, refuse_unknown
+from .._reads import compiled
 from .._system import State, System, Values
 from .._types import Component
 from ._cyclic import cyclic_coordinates
@@ -154,7 +155,7 @@ class _Choice(eqx.Module):
     outputs: tuple[str, ...] = eqx.field(static=True)
 
 
-@eqx.filter_jit
+@compiled
 def _derivatives(at, choice: _Choice, functions: _Functions):
     q, w = at[2], at[4]
     T = _tangents(*at[:3], choice)
@@ -204,7 +205,7 @@ def _tangents(system: System, t, q, choice: _Choice):
     return stack(T).astype(q.dtype)
 
 
-@eqx.filter_jit
+@compiled
 def _rates(system, t, q, u, w):
     q_dot, u_dot = state_rates(system, t, q, u, {k: w[i] for i, k in enumerate(system.inputs)})
     return q_dot, u_dot, configuration_residual(system, t, q)

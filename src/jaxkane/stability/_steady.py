@@ -14,6 +14,7 @@ from .._check import check_system, configuration_residual, is_concrete
 from .._equations import dependent_speeds, state_rates
 from .._kane import as_array, checked_inputs
 from .._lookup import by_name, hint
+from .._reads import compiled
 from .._system import State, System
 from .._types import Component
 from ._cyclic import cyclic_coordinates
@@ -173,7 +174,7 @@ class Problem(eqx.Module):
         return dependent_speeds(system, t, q, u)[system.dependent_speeds.index(name)]
 
 
-@eqx.filter_jit
+@compiled
 def _solve(problem: Problem, guess, args):
     system, t, q, known, _ = args
     z = root(problem.residual, guess, args)

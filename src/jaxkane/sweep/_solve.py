@@ -17,6 +17,7 @@ import numpy as np
 from jax.sharding import AxisType, Mesh
 from jax.sharding import PartitionSpec as P
 
+from .._reads import compiled
 from .._simulate import Settings, solve
 from .._system import State
 from .._trajectory import Trajectory
@@ -80,13 +81,13 @@ def mesh_of(devices: Sequence[Any] | None) -> Mesh | None:
     return jax.make_mesh((len(devices),), ("members",), axis_types=(AxisType.Auto,), devices=devices)
 
 
-@eqx.filter_jit
+@compiled
 def _starts(members: Any, job: Job) -> State:
     # A program of its own: lineax, which Newton's method calls, cannot be traced within shard_map.
     return jax.vmap(lambda own: start_of(own, job.shared, job.ts[0]))(members)
 
 
-@eqx.filter_jit
+@compiled
 def _solve(members: Any, starts: State, job: Job) -> Part:
     arrays, static = eqx.partition(job, eqx.is_array)
 

@@ -1,0 +1,396 @@
+"""Programs follow what their code reads: a global, an attribute, a closure, a function that changed between calls."""
+
+import array
+import dataclasses
+import functools
+import gc
+import sys
+import threading
+import types
+import weakref
+from collections.abc import Callable
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane._fuse import fused
+from jaxkane._reads import version_of
+from jaxkane.fit._problem import cost
+
+RTOL = 1e-12
+TS = np.linspace(0.0, 0.2, 3)
+GRAVITY = 9.81  # [m/s^2]
+HELD = {"gravity": 9.81}
+TABLE = np.array([9.81, 0.0])
+PUSH = 0.0  # [m/s^2]
+
+
+class Settings:
+    def __init__(self):
+        self.gravity = 9.81
+
+
+SETTINGS = Settings()
+
+
+@dataclasses.dataclass(slots=True)
+class Slots:
+    gravity: float = 9.81
+
+
+SLOTS = Slots()
+NAMES = types.SimpleNamespace(gravity=9.81)
+
+
+def helper():
+    return GRAVITY
+
+
+def in_a_nested_lambda():
+    return (lambda: (lambda: GRAVITY)())()
+
+
+DEFAULT = [9.81]
+
+
+def with_default(gravity=DEFAULT):
+    return gravity[0]
+
+
+def closure():
+    gravity = 9.81
+
+    def read():
+        return gravity
+
+    def change(value):
+        nonlocal gravity
+        gravity = value
+
+    return read, change
+
+
+READ, CHANGE = closure()
+
+
+class Drop(jk.System):
+    """A particle that falls: x_dot_dot = gravity + push, whatever its mass."""
+
+    mass: jk.Scalar = jk.parameter(2.0)
+    coordinates, speeds, inputs = ("x",), ("v",), ("push",)
+    attribute = 9.81
+    mutable = {"gravity": [9.81]}
+
+    def gravity(self):
+        return GRAVITY
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(self.mass, 0.0, O.moving(q[0] * N.x, u[0] * N.x))])
+
+    def loads(self, t, q, u, motion, inputs):
+        return [jk.Force(self.mass * (self.gravity() + inputs["push"]) * motion.N.x, motion.bodies[0])]
+
+
+def accelerate(system):
+    return float(jk.accelerations(system, 0.0, [0.0], [0.0])[0])
+
+
+def with_gravity(read):
+    """A system whose gravity is what `read` says."""
+    return type("Drop", (Drop,), {"gravity": lambda self: read(self), "__module__": __name__})()
+
+
+def put(monkeypatch, values):
+    """Change the first entry, in place."""
+    monkeypatch.setattr(sys.modules[__name__], "restore", lambda: values.__setitem__(0, 9.81))
+    values[0] = 1.62
+
+
+def restore():
+    pass
+
+
+def in_module(name, value):
+    return lambda monkeypatch: monkeypatch.setattr(sys.modules[__name__], name, value)
+
+
+CHANGES = {
+    "global": (lambda self: GRAVITY, in_module("GRAVITY", 1.62)),
+    "global of a helper": (lambda self: helper(), in_module("GRAVITY", 1.62)),
+    "global of a nested lambda": (lambda self: in_a_nested_lambda(), in_module("GRAVITY", 1.62)),
+    "another helper": (lambda self: helper(), in_module("helper", lambda: 1.62)),
+    "code of a helper": (  # as an autoreload puts it in
+        lambda self: helper(),
+        lambda monkeypatch: monkeypatch.setattr(helper, "__code__", (lambda: 1.62).__code__),
+    ),
+    "entry of a dict": (lambda self: HELD["gravity"], lambda m: m.setitem(HELD, "gravity", 1.62)),
+    "entry of an array": (lambda self: TABLE[0], lambda m: put(m, TABLE)),
+    "attribute of an object": (lambda self: SETTINGS.gravity, lambda m: m.setattr(SETTINGS, "gravity", 1.62)),
+    "attribute of a namespace": (lambda self: NAMES.gravity, lambda m: m.setattr(NAMES, "gravity", 1.62)),
+    "slot of an object": (lambda self: SLOTS.gravity, lambda m: m.setattr(SLOTS, "gravity", 1.62)),
+    "default": (lambda self: with_default(), lambda m: put(m, DEFAULT)),
+    "replaced default": (lambda self: with_default(), lambda m: m.setattr(with_default, "__defaults__", ([1.62],))),
+    "closure": (lambda self: READ(), lambda m: CHANGE(1.62)),
+    "class attribute": (lambda self: self.attribute, lambda m: m.setattr(Drop, "attribute", 1.62)),
+    "mutable class attribute": (
+        lambda self: self.mutable["gravity"][0],
+        lambda m: put(m, Drop.mutable["gravity"]),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_change_is_noticed(name, monkeypatch):
+    read, change = CHANGES[name]
+    system = with_gravity(read)
+    assert accelerate(system) == pytest.approx(9.81, rel=RTOL)
+    change(monkeypatch)
+    assert accelerate(system) == pytest.approx(1.62, rel=RTOL)
+    restore()
+    CHANGE(9.81)
+
+
+def test_a_method_that_is_replaced_is_noticed(monkeypatch):
+    system = Drop()
+    assert accelerate(system) == pytest.approx(9.81, rel=RTOL)
+    monkeypatch.setattr(Drop, "gravity", lambda self: 1.62)
+    assert accelerate(system) == pytest.approx(1.62, rel=RTOL)
+
+
+@pytest.mark.parametrize("where", ["import moon", "from moon import gravity", "import planets.moon"])
+def test_modules_that_are_imported_inside(where, monkeypatch):
+    moon, planets = types.ModuleType("moon"), types.ModuleType("planets")
+    vars(moon)["gravity"], vars(planets)["moon"] = 9.81, moon
+    for name, module in {"moon": moon, "planets": planets, "planets.moon": moon}.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    found = "gravity" if "from" in where else where.split()[1] + ".gravity"
+    inside, outside = {"Drop": Drop}, {"Drop": Drop, "__name__": "notebook"}
+    exec(f"class Inside(Drop):\n    def gravity(self):\n        {where}\n        return {found}", inside)
+    exec(f"{where}\nclass Outside(Drop):\n    def gravity(self):\n        return {found}", outside)
+    systems = [inside["Inside"](), *([] if "from" in where else [outside["Outside"]()])]
+    assert [accelerate(s) for s in systems] == pytest.approx([9.81] * len(systems), rel=RTOL)
+    vars(moon)["gravity"] = 1.62
+    assert [accelerate(s) for s in systems] == pytest.approx([1.62] * len(systems), rel=RTOL)
+
+
+class Controller:
+    def __init__(self):
+        self.push = 0.0
+
+    def __call__(self, t, state):
+        return {"push": self.push}
+
+    def method(self, t, state):
+        return self.push
+
+
+def fall(acceleration):
+    return 0.5 * acceleration * TS[-1] ** 2
+
+
+def push(t, state, scale=None):
+    return PUSH
+
+
+REST = jk.State(np.zeros(1), np.zeros(1))
+SHORT = {"step": 0.1, "solver": diffrax.Midpoint()}  # exact here, and compiled quickly
+
+
+def test_simulate_follows_descriptions_and_controllers(monkeypatch):
+    controller = Controller()
+    last = lambda: float(jk.simulate(Drop(), REST, TS, controller, **SHORT)["x"][-1])  # noqa: E731
+    assert last() == pytest.approx(fall(9.81), rel=1e-9)
+    controller.push = 1.0
+    assert last() == pytest.approx(fall(10.81), rel=1e-9)
+    monkeypatch.setattr(sys.modules[__name__], "GRAVITY", 1.62)
+    assert last() == pytest.approx(fall(2.62), rel=1e-9)
+
+
+def test_input_functions_of_every_kind_are_looked_into(monkeypatch):
+    controller = Controller()
+    ways = [controller, {"push": controller.method}, {"push": push}, {"push": functools.partial(push, scale=HELD)}]
+    ways += [jax.tree_util.Partial(push), jax.jit(push), eqx.filter_jit(push), Holder(push, 1.0)]
+    before = [version_of(way) for way in ways]
+    assert [version_of(way) for way in ways] == before
+    controller.push = 1.0
+    monkeypatch.setattr(sys.modules[__name__], "PUSH", 1.0)
+    assert not set(before) & {version_of(way) for way in ways}
+    assert version_of(Holder(push, 1.0)) == version_of(Holder(push, 2.0))  # a number that is an argument of the program
+
+
+class Holder(eqx.Module):
+    f: Callable
+    gain: jax.Array = eqx.field(converter=jnp.asarray)
+
+    def __call__(self, t, state):
+        return self.gain * self.f(t, state)
+
+
+def test_sweeps_fits_models_and_forces_follow(monkeypatch):
+    table = {"mass": np.array([1.0, 2.0])}
+    trial = jk.fit.Trial(TS, {"x": fall(1.62) * (TS / TS[-1]) ** 2}, sigma=1.0)
+    problem = jk.fit.Problem.of(Drop(), trial, ["mass"], **SHORT)
+
+    def now():
+        rides = jk.sweep.sweep(Drop(), REST, TS, table=table, reduce=lambda ride: ride["x"][-1], **SHORT)
+        model = jk.stability.linearize(Sprung(), REST)
+        force = jk.constraint_forces(Hung(), 0.0, [0.0], [0.0])["P"][2]
+        return *rides.values, cost(problem, problem.start), float(model.A[1, 0]), float(force)
+
+    distance = fall(9.81 - 1.62) * (TS / TS[-1]) ** 2
+    np.testing.assert_allclose(now(), [fall(9.81), fall(9.81), np.sum(distance**2), -9.81, 2 * 9.81], rtol=1e-6)
+    monkeypatch.setattr(sys.modules[__name__], "GRAVITY", 1.62)
+    np.testing.assert_allclose(now(), [fall(1.62), fall(1.62), 0.0, -1.62, 2 * 1.62], rtol=1e-6, atol=1e-12)
+
+
+class Sprung(Drop):
+    """x_dot_dot = -GRAVITY x."""
+
+    def loads(self, t, q, u, motion, inputs):
+        return [jk.Force(-self.mass * GRAVITY * q[0] * motion.N.x, motion.bodies[0])]
+
+
+class Hung(jk.System):
+    """A pendulum whose pivot P carries its weight, mass 2 kg, along z."""
+
+    mass: jk.Scalar = jk.parameter(2.0)
+    coordinates, speeds = ("angle",), ("rate",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.fixed(0.0 * N.x)
+        arm = N.rotate(1, q[0], u[0])
+        return jk.Motion([jk.Body(self.mass, 0.0, P.fixed(-1.0 * arm.z))], points={"P": P})
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -GRAVITY * motion.N.z)
+
+
+def test_what_came_back_is_not_traced_again(monkeypatch):
+    calls = []
+
+    class Counted(Drop):
+        def loads(self, t, q, u, motion, inputs):
+            calls.append(1)  # what tracing itself changes is no change
+            return super().loads(t, q, u, motion, inputs)
+
+    system = Counted()
+    accelerate(system)
+    n = len(calls)
+    assert n > 0
+    accelerate(system)
+    assert len(calls) == n
+    monkeypatch.setattr(sys.modules[__name__], "GRAVITY", 1.62)
+    assert accelerate(system) == pytest.approx(1.62, rel=RTOL)
+    assert len(calls) > n
+
+
+def test_values_that_come_back_find_their_program_again():
+    seen = []
+
+    @fused
+    def program(x, f):
+        seen.append(f())
+        return x * f()
+
+    space = {"g": 2.0}
+    exec("def f():\n    return g", space)
+    f, x = jax.tree_util.Partial(space["f"]), jnp.array(3.0)
+    for g, expected in [(2.0, 6.0), (5.0, 15.0), (2.0, 6.0), (2, 6.0)]:
+        space["g"] = g
+        assert float(program(x, f)) == expected
+    assert seen == [2.0, 5.0, 2]
+
+
+def test_nan_zeros_and_arrays_of_other_types_are_told_apart():
+    space: dict[str, Any] = {}
+    exec("def f():\n    return x", space)
+    versions = []
+    values = [
+        np.nan,
+        0.0,
+        -0.0,
+        0,
+        False,
+        None,
+        "0",
+        (0.0,),
+        [0.0],
+        np.zeros(1),
+        np.zeros(1, np.float32),
+        np.zeros((1, 1)),
+    ]
+    for space["x"] in [*values, np.zeros(1, np.int64), {0.0}, {"a": 0.0}, {"b": 0.0}, jnp, len]:
+        versions.append(version_of(space["f"]))
+        assert version_of(space["f"]) == versions[-1]
+    assert len(set(versions)) == len(versions)
+    space["x"] = np.zeros(1)
+    assert version_of(space["f"]) == versions[9]  # not the same array, but the same numbers
+
+
+def test_objects_that_name_each_other_and_long_chains_come_to_an_end():
+    chain = []
+    for _ in range(5000):
+        chain = [chain]
+    ring = {}
+    ring["ring"] = ring
+    space = {"chain": chain, "ring": ring}
+    exec("def f():\n    return chain, ring, g()\ndef g():\n    return f()", space)
+    assert version_of(space["f"]) == version_of(space["f"])
+    before = version_of(space["f"])
+    ring["x"] = 1.0
+    assert version_of(space["f"]) != before
+
+
+def test_forget_reads_what_cannot_be_seen():
+    hidden = array.array("d", [9.81])  # of a C extension
+    system = with_gravity(lambda self: hidden[0])
+    outer = jax.jit(lambda v: jk.accelerations(system, 0.0, jnp.zeros(1), v)[0])
+    assert accelerate(system) == float(outer(jnp.zeros(1))) == pytest.approx(9.81, rel=RTOL)
+    hidden[0] = 1.62
+    jk.forget()
+    assert accelerate(system) == float(outer(jnp.zeros(1))) == pytest.approx(1.62, rel=RTOL)
+
+
+def test_what_is_gone_is_not_kept():
+    """JAX's registry keeps every class of a pytree for ever; nothing else does, and no controller is kept."""
+
+    def once(n):
+        controller = Controller()
+        version_of(controller, lambda: n)
+        return weakref.ref(controller)
+
+    gone = [once(n) for n in range(300)]
+    gc.collect()
+    assert sum(ref() is not None for ref in gone) <= 256
+    jk.forget()
+    gc.collect()
+    assert not any(ref() for ref in gone)
+
+
+def test_threads_agree():
+    found, n = [], 8
+
+    def look():
+        for _ in range(200):
+            found.append(version_of(Drop()))
+
+    threads = [threading.Thread(target=look) for _ in range(n)]
+    [t.start() for t in threads]
+    [t.join() for t in threads]
+    assert len(found) == 200 * n
+    assert len(set(found)) == 1
+
+
+def test_a_look_walks_through_nothing(monkeypatch):
+    system = Drop()
+    version = version_of(system)
+    monkeypatch.setattr("jaxkane._reads._Walk", None)  # it would be called to look anew
+    assert version_of(system) == version
