@@ -24,6 +24,7 @@ FLOORS = [
     ["_kane"],
     ["_check"],
     ["_drift"],
+    ["_rates"],
     ["_diagnose"],
     ["_equations", "_assembly", "_signals"],
     ["_simulate"],

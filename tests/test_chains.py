@@ -7,7 +7,7 @@ import pytest
 from benchmarks.chain import Chain
 
 import jaxkane as jk
-from jaxkane import _equations, _linear
+from jaxkane import _linear, _rates
 from jaxkane._fuse import _Program
 
 
@@ -74,7 +74,7 @@ def test_a_chain_of_twenty_keeps_its_energy():
 def test_the_work_grows_with_the_number_of_links():
     def operations(n):
         leaves, treedef = jax.tree.flatten((*at(Chain(n=n), n), jnp.ones(n)))
-        column = lambda *x: _equations._mass_times.__wrapped__(*jax.tree.unflatten(treedef, x))  # noqa: E731
+        column = lambda *x: _rates._mass_times.__wrapped__(*jax.tree.unflatten(treedef, x))  # noqa: E731
         traced = jax.make_jaxpr(column)(*leaves)
         return len(traced.jaxpr.eqns), len(_Program(traced).program.jaxpr.eqns)
 

@@ -7,7 +7,7 @@ import pytest
 
 import jaxkane as jk
 from jaxkane import _native
-from jaxkane._equations import _state_rates, state_rates
+from jaxkane._rates import _state_rates, state_rates
 from jaxkane._fuse import _Program, fused
 
 pytestmark = pytest.mark.usefixtures("native")

@@ -10,14 +10,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._check import configuration_residual
-from ._components import matvec
+from ._components import ZERO3, add3, cross, dot, matvec
 from ._fuse import fused
-from ._linear import stack
+from ._linear import as_vector, stack
+from ._rates import accelerations_and_mass_matrix
 from ._reactions import Reactions
 from ._reads import compiled
 from ._system import Force, Motion, System, kinetic_energy_of
 from ._trajectory import Trajectory
-from ._vectors import Vector
+from ._types import Triple
+from ._vectors import Point, Vector
 
 ORDERS = (8, 6)  # points under the polynomials whose integrals are the work, and its estimated error
 LOOK, BAD = "look", "bad"
@@ -30,6 +32,8 @@ class Audit(eqx.Module):
 
     - `t` (n_t,) [s]. `kinetic_energy`, `work` (n_t,) [J]: the work of all loads and of what drives prescribed motions,
         since `t[0]`. `energy_error` (n_t,) [J]: kinetic energy gained, less work.
+    - `lost_work` (n_t,) [J]: of loads on points or frames that do not follow the speeds, since they were made anew
+        inside `loads`: they have a velocity and no partial velocities, so that the motion never felt them.
     - `work_error` [J]: what the quadrature of the work may have cost. Work of forces that are constant in N on mass
         centres (weights) is exact; the power of all else is integrated between the times of the trajectory, by
         polynomials through eight of them. More times, a smaller error; the solver's tolerances are not seen here.
@@ -46,6 +50,7 @@ class Audit(eqx.Module):
     kinetic_energy: np.ndarray
     work: np.ndarray
     work_error: float
+    lost_work: np.ndarray
     linear_momentum: np.ndarray
     angular_momentum: np.ndarray
     configuration_residuals: np.ndarray
@@ -72,7 +77,7 @@ class Audit(eqx.Module):
     @property
     def ok(self) -> bool:
         """Whether no line of the table has the verdict "bad"."""
-        return all(verdict != BAD for *_, verdict in self.lines())
+        return not any(verdict.startswith(BAD) for *_, verdict in self.lines())
 
     def lines(self) -> list[tuple[str, str, str]]:
         """The table: what, how much, verdict."""
@@ -85,6 +90,7 @@ class Audit(eqx.Module):
             ("kinetic energy", f"{self.kinetic_energy.min():.4g} to {self.kinetic_energy.max():.4g} J", ""),
             ("work of loads", f"{self.work.min():.4g} to {self.work.max():.4g} J", f"+- {self.work_error:.1e} J"),
             ("energy balance", f"{self.energy_balance:.1e}", energy),
+            *self._loads_without_effect(),
             ("linear momentum", *_conservation(self.linear_momentum)),
             ("angular momentum", *_conservation(self.angular_momentum)),
         ]
@@ -97,6 +103,13 @@ class Audit(eqx.Module):
         if self.velocity_residuals.size:
             lines.append(("condition of C_dep", *_condition(self.condition_C_dep)))
         return lines
+
+    def _loads_without_effect(self) -> list[tuple[str, str, str]]:
+        lost = _relative(self.lost_work, self.kinetic_energy, self.work, self.lost_work)
+        if lost <= 1e-9:
+            return []
+        words = f"{_verdict(lost, 1e-9, 1e-6)}: loads on points or frames that were made anew in `loads` move nothing"
+        return [("work that nothing felt", f"{_largest(self.lost_work):.1e} J", words)]
 
     def __str__(self) -> str:
         lines = self.lines()
@@ -169,6 +182,7 @@ def audit(system: System, trajectory: Trajectory) -> Audit:
         kinetic_energy=now["T"],
         work=work,
         work_error=work_error,
+        lost_work=_cumulative_integral(ts, now["lost"], ORDERS[0]),
         linear_momentum=now["p"],
         angular_momentum=now["H"],
         configuration_residuals=now["h"],
@@ -182,45 +196,71 @@ def audit(system: System, trajectory: Trajectory) -> Audit:
 
 @compiled
 def _measured_along(system, t, q, u, inputs):
-    return jax.vmap(lambda t, q, u, inputs: _measured(system, t, q, u, inputs))(t, q, u, inputs)
+    def measured(t, q, u, inputs):
+        u_dot, M = accelerations_and_mass_matrix(system, t, q, u, inputs)
+        return {**_measured(system, t, q, u, inputs, u_dot), "M": M}
+
+    return jax.vmap(measured)(t, q, u, inputs)
 
 
 @fused
-def _measured(system, t, q, u, inputs):
-    now = Reactions(system, t, q, u, inputs)
-    motion = now.description
-    as_array = lambda row: stack([tuple(row)])[0].astype(q.dtype)  # noqa: E731
-    in_N = lambda vector: as_array(vector.components_in(motion.N))  # noqa: E731
+def _measured(system, t, q, u, inputs, u_dot):
+    now = Reactions(system, t, q, u, inputs, u_dot)
+    motion, places = now.description, _Places()
     loads = now.loads(motion)
     centers = [body.center for body in motion.bodies if body.center.has_position]
     at_centers = [load if isinstance(load, Force) and load.point in centers else None for load in loads]
-    p, H = _momenta(motion)
+    p, H = _momenta(motion, places)
     return {
-        "T": as_array([kinetic_energy_of(motion)])[0],
-        "power": as_array([load.vector.dot(load.velocity) for load in loads]),
-        "force": [load and in_N(load.vector) for load in at_centers],
-        "place": [load and in_N(load.point.position) for load in at_centers],
-        "prescribed": as_array([now.power_of_prescribed_motions()])[0],
-        "p": in_N(p),
-        "H": in_N(H),
+        "T": as_vector([kinetic_energy_of(motion)], q)[0],
+        "power": as_vector([load.vector.dot(load.velocity) for load in loads], q),
+        "force": [load and as_vector(_in_N(load.vector), q) for load in at_centers],
+        "place": [load and as_vector(places.of(load.point), q) for load in at_centers],
+        "prescribed": as_vector([now.power_of_prescribed_motions()], q)[0],
+        "lost": as_vector([now.power_without_partial_velocities()], q)[0],
+        "p": as_vector(p, q),
+        "H": as_vector(H, q),
         "h": configuration_residual(system, t, q),
-        "c": as_array(now.residuals(now.t, now.q, now.u_all)),
-        "M": stack(now.mass_matrix(motion, now.partials())).astype(q.dtype),
+        "c": as_vector(now.residuals(now.t, now.q, now.u_all), q),
         "C_dep": stack(now.C_dep).astype(q.dtype),
     }
 
 
-def _momenta(motion: Motion) -> tuple[Vector, Vector]:
-    """Linear momentum, and angular momentum about the origin."""
-    p, H = [], []
+def _in_N(vector: Vector) -> Triple:
+    """Components in N, by those of N's unit vectors, which remember every frame that they were resolved in.
+
+    A vector that is resolved itself passes all frames of its chain, and with all of them the work is of order n^2.
+    """
+    N, frame = vector.frame.root, vector.frame
+    return tuple(dot(axis.components_in(frame), vector.components) for axis in (N.x, N.y, N.z))  # type: ignore[return-value]
+
+
+class _Places:
+    """Positions in N, each from that of the point it was made from."""
+
+    def __init__(self) -> None:
+        self._known: dict[Point, Triple] = {}
+
+    def of(self, point: Point) -> Triple:
+        chain = []
+        while point is not None and point not in self._known:
+            chain.append(point)
+            point = point._base  # type: ignore[assignment]
+        place = ZERO3 if point is None else self._known[point]
+        for point in reversed(chain):
+            place = self._known[point] = add3(place, _in_N(point._offset))  # type: ignore[arg-type]
+        return place
+
+
+def _momenta(motion: Motion, places: _Places) -> tuple[Triple, Triple]:
+    """Linear momentum, and angular momentum about the origin, in N."""
+    p, H = ZERO3, ZERO3
     for body in motion.bodies:
-        p.append(body.mass * body.center.velocity)
-        H.append(body.frame.vector(*matvec(body.inertia, body.angular_velocity.components_in(body.frame))))
-        if body.center.has_position:
-            H.append(body.center.position.cross(p[-1]))
-        else:
-            H.append(jnp.nan * motion.N.x)
-    return sum(p), sum(H)  # type: ignore[return-value]
+        mv = _in_N(body.mass * body.center.velocity)
+        spin = body.frame.vector(*matvec(body.inertia, body.angular_velocity.components_in(body.frame)))
+        orbital = cross(places.of(body.center), mv) if body.center.has_position else (jnp.nan,) * 3
+        p, H = add3(p, mv), add3(H, add3(_in_N(spin), orbital))
+    return p, H
 
 
 def _work(t: np.ndarray, now: dict[str, Any]) -> tuple[np.ndarray, float]:

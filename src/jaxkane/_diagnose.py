@@ -8,12 +8,13 @@ from typing import Any
 import numpy as np
 
 from ._drift import constraint_rows, dependent_speeds_from
-from ._fuse import fused
-from ._kane import Instant
-from ._linear import as_vector, stack
+from ._rates import rates_and_equations
+from ._reads import compiled
 from ._system import System
 
 ROUNDING = 1e-12
+
+_equations = compiled(rates_and_equations)
 
 
 def diagnosis(system: System, t: Any, q: Any, u: Any, inputs: Any = None) -> str:
@@ -37,7 +38,7 @@ def diagnosis(system: System, t: Any, q: Any, u: Any, inputs: Any = None) -> str
                 f"{name}: the constraints cannot be solved for {_listed(system.dependent_speeds)} at {place} "
                 f"(det C_dep = 0): {found.advice()}"
             )
-    M, f, q_dot = (np.asarray(x, dtype=float) for x in _parts(system, t, q, u, inputs or {}))
+    q_dot, M, f = (np.asarray(x, dtype=float) for x in _equations(system, t, q, u, inputs or {}))
     if np.all(np.isfinite(M)):
         massless = _massless(M, system.speeds)
         if massless:
@@ -57,13 +58,6 @@ def diagnosis(system: System, t: Any, q: Any, u: Any, inputs: Any = None) -> str
     if not np.all(np.isfinite(f)):
         return f"{name}: the loads are not finite at {place}."
     return ""
-
-
-@fused
-def _parts(system, t, q, u, inputs):
-    now = Instant(system, t, q, u, inputs)
-    M, f = now.equations()
-    return stack(M).astype(q.dtype), as_vector(f, q), as_vector(now.q_dot, q)
 
 
 def _massless(M: np.ndarray, speeds: tuple[str, ...]) -> str:

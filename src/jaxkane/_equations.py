@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -18,7 +17,8 @@ from ._components import matvec, sub
 from ._diagnose import diagnosis
 from ._fuse import fused
 from ._kane import Instant, as_array, as_row, checked_inputs, jvp, refuse_incomplete
-from ._linear import as_vector, is_written_out, solve_positive_array, stack
+from ._linear import as_vector, stack
+from ._rates import rates_and_equations, state_rates
 from ._system import System, kinetic_energy_of
 from ._types import Component
 
@@ -58,36 +58,7 @@ def equations_of_motion(
     **Raises:** `ValueError` for wrong shapes, an unknown input, as many velocity residuals as there are not dependent
     speeds, or a description that contradicts itself.
     """
-    return _equations(*_arrays(system, t, q, u, inputs))[1:]
-
-
-def _equations(system, t, q, u, inputs):
-    """q_dot, M and f."""
-    if is_written_out(len(system.speeds)):
-        return _equations_written_out(system, t, q, u, inputs)
-    # The columns of M are one program, whose lanes are the directions.
-    q_dot, f = _rates_and_forcing(system, t, q, u, inputs)
-    columns = jax.vmap(lambda direction: _mass_times(system, t, q, u, inputs, direction))
-    return q_dot, columns(jnp.eye(len(system.speeds), dtype=q.dtype)), f
-
-
-@fused
-def _equations_written_out(system, t, q, u, inputs):
-    now = Instant(system, t, q, u, inputs)
-    M, f = now.equations()
-    return as_vector(now.q_dot, q), stack(M).astype(q.dtype), as_vector(f, q)
-
-
-@fused
-def _rates_and_forcing(system, t, q, u, inputs):
-    now = Instant(system, t, q, u, inputs)
-    return as_vector(now.q_dot, q), as_vector(now.forcing(), q)
-
-
-@fused
-def _mass_times(system, t, q, u, inputs, direction):
-    now = Instant(system, t, q, u, inputs)
-    return as_vector(now.mass_times(as_row(direction, system.speeds, "direction")), q)
+    return rates_and_equations(*_arrays(system, t, q, u, inputs))[1:]
 
 
 def accelerations(system: System, t: Component, q: Any, u: Any, inputs: InputValues = None) -> Float[Array, " n"]:
@@ -103,22 +74,6 @@ def accelerations(system: System, t: Component, q: Any, u: Any, inputs: InputVal
         if wrong:
             raise ValueError(wrong)
     return u_dot
-
-
-def state_rates(
-    system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]
-) -> tuple[Float[Array, " n_q"], Float[Array, " n"]]:
-    """q_dot and u_dot: the right-hand side, from arrays that are known to fit."""
-    if is_written_out(len(system.speeds)):
-        return _state_rates(system, t, q, u, inputs)
-    q_dot, M, f = _equations(system, t, q, u, inputs)
-    return q_dot, solve_positive_array(M, f)
-
-
-@fused
-def _state_rates(system, t, q, u, inputs):
-    now = Instant(system, t, q, u, inputs)
-    return as_vector(now.q_dot, q), as_vector(now.accelerations(), q)
 
 
 def mass_matrix(system: System, t: Component, q: Any, u: Any, inputs: InputValues = None) -> Float[Array, "n n"]:
@@ -216,13 +171,14 @@ def dependent_accelerations(
     system: System, t: Component, q: Any, u: Any, inputs: InputValues = None
 ) -> Float[Array, " k"]:
     """u_dep_dot (k,) = J u_dot - C_dep^-1 (dc/dt at frozen speeds). Arguments as `equations_of_motion`."""
-    return _dependent_accelerations(*_arrays(system, t, q, u, inputs))
+    arrays = _arrays(system, t, q, u, inputs)
+    return _dependent_accelerations(*arrays, state_rates(*arrays)[1])
 
 
 @fused
-def _dependent_accelerations(system, t, q, u, inputs):
+def _dependent_accelerations(system, t, q, u, inputs, u_dot):
     now = Instant(system, t, q, u, inputs)
-    return as_vector(now.dependent_accelerations(now.accelerations()), q)
+    return as_vector(now.dependent_accelerations(as_row(u_dot, system.speeds, "u_dot")), q)
 
 
 def constraint_jacobian(system: System, t: Component, q: Any) -> Float[Array, "k n"]:

@@ -328,8 +328,8 @@ def _evaluate_once(program: Jaxpr, consts: Sequence[Any], args: Sequence[Any], k
     read = lambda v: v.val if isinstance(v, Literal) else values[v]  # noqa: E731
     for equation in program.eqns:
         inputs = [read(v) for v in equation.invars]
-        if equation.primitive.name in CALLS:
-            inner = equation.params["jaxpr"]
+        inner = _called(equation)
+        if inner is not None:
             outputs = _evaluate_once(inner.jaxpr, inner.consts, inputs, known)
         else:
             # Literals by value, all else by identity: `known` keeps what it names alive.
@@ -343,12 +343,23 @@ def _evaluate_once(program: Jaxpr, consts: Sequence[Any], args: Sequence[Any], k
     return [read(v) for v in program.outvars]
 
 
+def _called(equation: Any) -> ClosedJaxpr | None:
+    """What an equation stands for: a program within a program is opened, so that the whole is one."""
+    if equation.primitive is _program_p:
+        program, sizes, where = (equation.params[k] for k in ("program", "sizes", "where"))
+        return (program.batched(sizes, where) if sizes else program).program
+    return equation.params["jaxpr"] if equation.primitive.name in CALLS else None
+
+
 def _is_plain(program: Jaxpr) -> bool:
     for equation in program.eqns:
+        inner = _called(equation)
+        if inner is not None:
+            if not _is_plain(inner.jaxpr):
+                return False
+            continue
         if equation.primitive.name not in _PLAIN:
             return False
         if equation.primitive.name == "reduce_sum" and getattr(equation.invars[0].aval, "size", 0) > _LARGEST_SUM:
-            return False
-        if equation.primitive.name in CALLS and not _is_plain(equation.params["jaxpr"].jaxpr):
             return False
     return True

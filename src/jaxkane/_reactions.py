@@ -18,13 +18,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ._components import add, dot, mul
+from ._components import add, dot, mul, sub
 from ._equations import InputValues, _arrays
 from ._fuse import fused
-from ._kane import Instant, Row, unit
+from ._kane import Instant, Row, as_row, unit
 from ._linear import as_vector, solve
+from ._rates import state_rates
 from ._reads import compiled
-from ._system import Motion, System
+from ._system import Motion, System, flatten_loads
 from ._trajectory import Trajectory
 from ._types import Component, Triple
 from ._vectors import Frame, Point, virtual
@@ -80,22 +81,27 @@ def _along(forces: Any, system: System, t: Any, q: Any, u: Any, inputs: InputVal
     return jax.vmap(forces, in_axes=(None, 0, 0, 0, 0))(system, t.t, t.q, t.u, t.inputs)
 
 
+@compiled
+def _compiled_multipliers(system, t, q, u, inputs):
+    return _multipliers(system, t, q, u, inputs, state_rates(system, t, q, u, inputs)[1])
+
+
+@compiled
+def _compiled_forces(system, t, q, u, inputs):
+    return _forces(system, t, q, u, inputs, state_rates(system, t, q, u, inputs)[1])
+
+
 @fused
-def _multipliers(system, t, q, u, inputs):
-    multipliers = Reactions(system, t, q, u, inputs).multipliers
+def _multipliers(system, t, q, u, inputs, u_dot):
+    multipliers = Reactions(system, t, q, u, inputs, u_dot).multipliers
     return as_vector(multipliers, q)
 
 
 @fused
-def _forces(system, t, q, u, inputs):
-    now = Reactions(system, t, q, u, inputs)
+def _forces(system, t, q, u, inputs, u_dot):
+    now = Reactions(system, t, q, u, inputs, u_dot)
     vectors = {name: as_vector(row, q) for name, row in now.forces_of_parts()}
     return vectors | {name: jnp.asarray(x, dtype=q.dtype) for name, x in now.forces_of_auxiliary_speeds()}
-
-
-# What calls into libraries (four dependent speeds, long chains) is not fused: compiled all the same.
-_compiled_forces = compiled(_forces)
-_compiled_multipliers = compiled(_multipliers)
 
 
 class _Forces(NamedTuple):
@@ -106,12 +112,15 @@ class _Forces(NamedTuple):
 
 
 class Reactions(Instant):
-    """An instant of the motion, with its accelerations and the multipliers of its residuals."""
+    """An instant of the motion with its accelerations `u_dot` (n,), and the multipliers of its residuals.
 
-    def __init__(self, system: System, t: Any, q: Any, u: Any, inputs: InputValues = None):
+    The accelerations are given: they are a program of their own, which for many speeds calls into libraries.
+    """
+
+    def __init__(self, system: System, t: Any, q: Any, u: Any, inputs: InputValues, u_dot: Any):
         super().__init__(system, t, q, u, inputs)
         self.description: Motion = self.motion(self.t, self.q, self.u_all)
-        u_dot = self.accelerations()
+        u_dot = as_row(u_dot, system.speeds, f"{self.name}: u_dot")
         u_dep_dot = self.dependent_accelerations(u_dot)
         self.momentum = self.momentum_rates(self.description, (*u_dot, *u_dep_dot))
         self.load_vectors = self.force_components(self.description)
@@ -138,6 +147,18 @@ class Reactions(Instant):
         still = (0.0,) * (self.n + self.k)
         c0 = self.residuals(self.t, self.q, still)
         return mul(-1.0, add(self.unbalanced(self.velocities(still)), dot(c0, self.multipliers)))
+
+    def power_without_partial_velocities(self) -> Component:
+        """Power [W] of the loads on velocities that change with the speeds where `loads` reads them, and not where
+        `motion` does: of points and frames that were made anew inside `loads`. Kane's equations do not notice it."""
+        motion = self.motion(self.t, self.q, (0.0,) * (self.n + self.k))
+        at_rest = (self._zero(),) * (self.n + self.k)  # no exact zeros, by which `loads` might divide
+        read_there = flatten_loads(self.system.loads(self.t, self.q, at_rest, motion, self.inputs))
+        total: Component = 0.0
+        for F, here, there in zip(self.load_vectors, self.loads(motion), read_there, strict=True):
+            changes = [sub(a, b) for a, b in zip(here.velocity.components, there.velocity.components, strict=True)]
+            total = add(total, dot(F, changes))
+        return total
 
     def forces_of_parts(self) -> Iterator[tuple[str, Row]]:
         """Forces at the named points, moments at the named frames."""

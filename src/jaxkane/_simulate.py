@@ -18,12 +18,13 @@ from jaxtyping import Array
 from ._check import check_state, check_system, configuration_residual, configuration_tolerance, is_concrete
 from ._diagnose import diagnosis
 from ._drift import correction, has_configuration_constraints, projected
-from ._equations import dependent_speeds, state_rates
+from ._equations import dependent_speeds
 from ._fuse import fused
 from ._kane import Instant, by_names, checked_inputs, refuse_incomplete
 from ._kinks import ToKinks
 from ._linear import as_vector, determinant
 from ._lookup import not_there
+from ._rates import state_rates
 from ._reads import compiled
 from ._signals import as_signals, evaluate, sample_times
 from ._system import State, System, parameter_info

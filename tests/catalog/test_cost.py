@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from jaxkane._equations import _state_rates
+from jaxkane._rates import _state_rates
 from jaxkane._fuse import _Program
 from jaxkane.catalog import CATALOG
 

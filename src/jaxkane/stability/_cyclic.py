@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._check import configuration_residual
-from .._equations import state_rates
+from .._rates import state_rates
 from .._system import System
 
 _FOUND: dict[tuple, tuple[str, ...]] = {}

@@ -12,11 +12,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._check import check_system, configuration_residual, is_concrete
-from .._equations import dependent_speeds, state_rates
+from .._equations import dependent_speeds
 from .._fuse import fused
 from .._kane import as_array, checked_inputs, refuse_incomplete
 from .._linear import as_vector, solve, stack
 from .._lookup import hint, refuse_unknown
+from .._rates import state_rates
 from .._reads import compiled
 from .._system import State, System, Values
 from .._types import Component

@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._check import check_system, configuration_residual, is_concrete
-from .._equations import dependent_speeds, state_rates
+from .._equations import dependent_speeds
 from .._kane import as_array, checked_inputs
 from .._lookup import by_name, hint
+from .._rates import state_rates
 from .._reads import compiled
 from .._system import State, System
 from .._types import Component
