@@ -7,8 +7,8 @@ import pytest
 
 import jaxkane as jk
 from jaxkane import _native
-from jaxkane._rates import _state_rates, state_rates
 from jaxkane._fuse import _Program, fused
+from jaxkane._rates import _state_rates, state_rates
 
 pytestmark = pytest.mark.usefixtures("native")
 

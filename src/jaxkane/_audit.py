@@ -258,7 +258,7 @@ def _momenta(motion: Motion, places: _Places) -> tuple[Triple, Triple]:
     for body in motion.bodies:
         mv = _in_N(body.mass * body.center.velocity)
         spin = body.frame.vector(*matvec(body.inertia, body.angular_velocity.components_in(body.frame)))
-        orbital = cross(places.of(body.center), mv) if body.center.has_position else (jnp.nan,) * 3
+        orbital = cross(places.of(body.center), mv) if body.center.has_position else (jnp.nan, jnp.nan, jnp.nan)
         p, H = add3(p, mv), add3(H, add3(_in_N(spin), orbital))
     return p, H
 

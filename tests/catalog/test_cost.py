@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from jaxkane._rates import _state_rates
 from jaxkane._fuse import _Program
+from jaxkane._rates import _state_rates
 from jaxkane.catalog import CATALOG
 
 # Equations of the jaxpr of (q_dot, u_dot), each common one once: measured, with five per cent to spare.
