@@ -181,6 +181,7 @@ def _check_rates(now: Instant) -> None:
             velocity = body.center.velocity.to(motion.N)
             _compare(now, f"mass centre of {body.name!r}", "moves", "m/s", by_position, velocity)
         _check_axisymmetry(now, body)
+        _check_about(now, body)
 
 
 def _compare(now: Instant, what: str, verb: str, unit: str, by_position: Any, stated: Any) -> None:
@@ -191,6 +192,21 @@ def _compare(now: Instant, what: str, verb: str, unit: str, by_position: Any, st
             f"{now.name}: the {what} {verb} with {show(by_position)} {unit} by the rates of its coordinates, but with "
             f"{show(stated)} {unit} by its description (components in N, at a trial state). A rate that is given to a "
             "frame or a point contradicts q_dot; or a point is called fixed in a frame in which it moves."
+        )
+
+
+def _check_about(now: Instant, body) -> None:
+    """The point about which an inertia was given moves with the body's frame, or the inertia would change there."""
+    if body.about is None:
+        return
+    N = body.frame.root
+    r = body.about.position_from(body.center)
+    carried = (body.center.velocity + body.frame.angular_velocity.cross(r)).to(N)
+    if _differs(now, np.asarray(body.about.velocity.to(N)) - np.asarray(carried), carried):
+        raise ValueError(
+            f"{now.name}: the inertia of the body {body.name!r} is given about a point that moves in its frame "
+            f"{body.frame.name!r}, so that it is not constant there. Give it about a point of the body, or about the "
+            "mass centre."
         )
 
 

@@ -14,27 +14,33 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ._components import component, dot
+from ._components import add, component, dot, mul, sub
 from ._lookup import not_there
 from ._types import Component, Triple
 from ._vectors import Frame, Point, Vector
 
 
-def parameter(default: Any = dataclasses.MISSING, *, positive: bool = False, shape: tuple[int, ...] = ()) -> Any:
+def parameter(
+    default: Any = dataclasses.MISSING, *, positive: bool = False, shape: tuple[int, ...] | None = None
+) -> Any:
     """A physical parameter of a `System`: a float array from birth, in SI units and radians.
 
         mass: Scalar = jk.parameter(positive=True)  # [kg]
+        moments: Array = jk.parameter([0.1, 0.2, 0.2], positive=True)  # [kg m^2]
 
     **Arguments:**
 
-    - `default`: a number; without one the parameter must be given.
+    - `default`: a number, or an array or nested lists of numbers; without one the parameter must be given.
     - `positive`: refuse zero and negative values, and let a fit move it on a logarithmic scale.
-    - `shape`: of the array, `()` for a number. A value with leading axes more is a batch.
+    - `shape`: of the array, by default that of `default`, or `()` for a number. A value with leading axes more is a
+        batch.
     """
-    metadata = {"jaxkane": ParameterInfo(positive, shape)}
     if default is dataclasses.MISSING:
-        return eqx.field(converter=_to_float, metadata=metadata)
-    return eqx.field(converter=_to_float, metadata=metadata, default=default)
+        return eqx.field(converter=_to_float, metadata={"jaxkane": ParameterInfo(positive, shape or ())})
+    # A copy, as NumPy: a list that is changed later must not change the default, and JAX must not start yet.
+    default = default if isinstance(default, jax.Array) or np.ndim(default) == 0 else np.array(default)
+    metadata = {"jaxkane": ParameterInfo(positive, np.shape(default) if shape is None else shape)}
+    return eqx.field(converter=_to_float, metadata=metadata, default_factory=lambda: default)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -77,9 +83,11 @@ class Body:
     - `angular_velocity`: a Vector, by default the frame's. An axisymmetric body (a wheel, a rotor) may stand in a
         frame that does not spin with it, with its own angular velocity: the textbook's Examples 5 and 7.
     - `name`: for error messages, forces and pictures.
+    - `about`: a Point that is fixed in `frame`, about which `inertia` is given instead: it is taken to the mass centre
+        by the parallel axis theorem, I - m (r.r 1 - r r).
     """
 
-    __slots__ = ("angular_velocity", "center", "frame", "inertia", "mass", "name")
+    __slots__ = ("about", "angular_velocity", "center", "frame", "inertia", "mass", "name")
 
     def __init__(
         self,
@@ -89,6 +97,7 @@ class Body:
         frame: Frame | None = None,
         angular_velocity: Vector | None = None,
         name: str = "body",
+        about: Point | None = None,
     ):
         self.mass = component(mass)
         self.inertia = _inertia(inertia, name)
@@ -96,6 +105,9 @@ class Body:
         self.frame = center.velocity.frame.root if frame is None else frame
         self.angular_velocity = self.frame.angular_velocity if angular_velocity is None else angular_velocity
         self.name = name
+        self.about = about
+        if about is not None:
+            self.inertia = _central(self.inertia, self.mass, center.position_from(about).components_in(self.frame))
 
     def __repr__(self) -> str:
         return f"Body({self.name})"
@@ -112,6 +124,17 @@ def _inertia(given: Any, name: str) -> tuple[Triple, Triple, Triple]:
     raise ValueError(
         f"{name}: the inertia is three principal moments or a (3, 3) matrix about the mass centre, got shape {shape}."
     )
+
+
+def _central(I: tuple[Triple, Triple, Triple], m: Component, r: Triple) -> tuple[Triple, Triple, Triple]:
+    """The inertia about the mass centre, which is at `r` from the point about which it is I: I - m (r.r 1 - r r)."""
+    squares = [mul(x, x) for x in r]
+    rows = []
+    for i in range(3):
+        across = add(squares[(i + 1) % 3], squares[(i + 2) % 3])
+        moved = [across if i == j else mul(-1.0, mul(r[i], r[j])) for j in range(3)]
+        rows.append(tuple(sub(I[i][j], mul(m, moved[j])) for j in range(3)))
+    return tuple(rows)  # type: ignore[return-value]
 
 
 def _inner(rows: Sequence[Any]) -> tuple[int, ...]:
@@ -220,9 +243,12 @@ class Motion:
 
 
 class Values(Sequence[Component]):
-    """Numbers by place and by name: `q[0]`, `q["roll"]`, `a, b = q`. JAX takes it for an array of shape (n,).
+    """Numbers by place and by name. JAX takes it for an array of shape (n,).
 
-    Its items may be exact Python floats, which is how a structural zero reaches a description.
+        q[0], q["roll"]; q["e1":"e4"], of which both ends are meant; q["x", "y"]; q[3:7]; a, b = q; "roll" in q
+
+    Arithmetic gives arrays; `jnp.asarray(q)` is one, for all else. The items may be exact Python floats, which is how a
+    structural zero reaches a description.
     """
 
     __slots__ = ("_items", "names")
@@ -236,15 +262,35 @@ class Values(Sequence[Component]):
 
     def __getitem__(self, key: Any) -> Any:
         if isinstance(key, str):
-            if key not in self.names:
-                raise KeyError(f"There is no {key!r} here; there are {', '.join(self.names)}.")
-            return self._items[self.names.index(key)]
+            return self._items[self._place(key)]
         if isinstance(key, slice):
-            return Values(self._items[key], self.names[key])
+            start, stop = (self._place(end) if isinstance(end, str) else end for end in (key.start, key.stop))
+            places = slice(start, stop + 1 if isinstance(key.stop, str) else stop, key.step)  # type: ignore[operator]
+            return Values(self._items[places], self.names[places])
+        if isinstance(key, (tuple, list)):
+            places = [self._place(k) if isinstance(k, str) else range(len(self))[k] for k in key]
+            return Values([self._items[i] for i in places], [self.names[i] for i in places if self.names])
         return self._items[key]
+
+    def _place(self, name: str) -> int:
+        if name not in self.names:
+            raise not_there(name, self.names, "these values")
+        return self.names.index(name)
 
     def __iter__(self):
         return iter(self._items)
+
+    def __contains__(self, name: object) -> bool:
+        if not isinstance(name, str):
+            raise TypeError(f"`in` asks for a name, as 'roll' in q; got {name!r}.")
+        return name in self.names
+
+    def __getattr__(self, name: str) -> Any:
+        if hasattr(jax.Array, name) and not name.startswith("__"):
+            raise AttributeError(
+                f"Values are named numbers and have no `.{name}`: jnp.asarray(q) is an array, which has."
+            )
+        raise AttributeError(f"Values have no {name!r}; by name they are read as q[{name!r}].")
 
     def __jax_array__(self) -> Array:
         return jnp.stack([jnp.asarray(x) for x in self._items]) if self._items else jnp.zeros(0)
@@ -255,6 +301,12 @@ class Values(Sequence[Component]):
     def __neg__(self) -> Array:
         return -self.__jax_array__()
 
+    def __pos__(self) -> Array:
+        return self.__jax_array__()
+
+    def __abs__(self) -> Array:
+        return abs(self.__jax_array__())
+
 
 def _elementwise(name: str) -> Callable[..., Array]:
     def operator(self: Values, other: Any) -> Array:
@@ -263,15 +315,18 @@ def _elementwise(name: str) -> Callable[..., Array]:
     return operator
 
 
-for _name in ("add", "sub", "mul", "truediv", "matmul"):
+for _name in ("add", "sub", "mul", "truediv", "floordiv", "mod", "pow", "matmul"):
     setattr(Values, f"__{_name}__", _elementwise(f"__{_name}__"))
     setattr(Values, f"__r{_name}__", _elementwise(f"__r{_name}__"))
+for _name in ("lt", "le", "gt", "ge"):
+    setattr(Values, f"__{_name}__", _elementwise(f"__{_name}__"))
 
 
 class State(eqx.Module):
     """What is integrated: coordinates and independent speeds.
 
-    Attributes: `q` (n_q,) [rad, m], `u` (n_u,) [rad/s, m/s]; a batch has leading axes.
+    Attributes: `q` (n_q,) [rad, m], `u` (n_u,) [rad/s, m/s]; a batch has leading axes. Or dicts by name, which are read
+    where the state meets its system: `jk.State({"angle": 0.3}, {"rate": 1.0})`. Names left out are zero.
     """
 
     q: Float[Array, "*batch n_q"] = eqx.field(converter=_to_float)
@@ -306,6 +361,7 @@ class System(eqx.Module):
     """Names of the inputs that `loads` reads."""
 
     def __check_init__(self) -> None:
+        _check_fields(self)
         for name, info in parameter_info(self).items():
             check_parameter(f"{type(self).__name__}.{name}", getattr(self, name), info)
 
@@ -359,6 +415,20 @@ def _values(values: Any, names: Sequence[str], label: str, n_optional: int = 0) 
     if len(items) != len(names):
         raise ValueError(f"{label} must have {len(names)} entries ({', '.join(names)}), got {len(items)}.")
     return Values(items, names)
+
+
+def _check_fields(system: System) -> None:
+    """Refuse numbers that a description counts with, names and switches as fields that JAX would trace."""
+    for path, value in jax.tree_util.tree_leaves_with_path(system):
+        name = path[0].name
+        if isinstance(value, (bool, int, str)) and name not in parameter_info(system):
+            whole = getattr(system, name)
+            kind = type(whole).__name__
+            raise TypeError(
+                f"{type(system).__name__}.{name} = {whole!r} would be traced as an array, and a description could not "
+                f"count with it. What belongs to the description, as a number of links: `{name}: {kind} = "
+                f"equinox.field(static=True)`. A physical parameter: `{name}: jk.Scalar = jk.parameter()`."
+            )
 
 
 def check_parameter(label: str, value: Any, info: ParameterInfo) -> None:

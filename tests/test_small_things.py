@@ -1,0 +1,123 @@
+"""What makes a description pleasant to write: defaults, fields, named values, inertia about any point."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane._system import Values
+
+
+class Beads(jk.System):
+    """Beads on a line, in any number."""
+
+    masses: jax.Array = jk.parameter([1.0, 2.0, 3.0], positive=True)  # [kg]
+    matrix: jax.Array = jk.parameter(np.eye(2))
+    gains: jax.Array = jk.parameter(jnp.array([1, 2]))
+    links: int = eqx.field(static=True, default=3)
+
+    @property
+    def coordinates(self):
+        return tuple(f"x{i}" for i in range(self.links))
+
+    @property
+    def speeds(self):
+        return tuple(f"v{i}" for i in range(self.links))
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion(
+            [jk.Body(self.masses[i], 0.0, O.moving(q[i] * N.x, u[i] * N.x), name=f"{i}") for i in range(self.links)]
+        )
+
+
+def test_parameters_have_arrays_and_lists_as_defaults():
+    beads = Beads()
+    assert beads.masses.shape == (3,)
+    assert beads.gains.dtype == jnp.float64
+    np.testing.assert_array_equal(jk.mass_matrix(beads, 0.0, [0.0] * 3, [0.0] * 3), np.diag([1.0, 2.0, 3.0]))
+    with pytest.raises(ValueError, match=r"Beads\.masses must have the shape \(3,\)"):
+        Beads(masses=[1.0, 2.0])
+    with pytest.raises(ValueError, match=r"masses = .* must be positive"):
+        Beads(masses=[1.0, -2.0, 1.0])
+    default = [1.0, 2.0]
+    Changed = type("Changed", (jk.System,), {"__annotations__": {"x": jax.Array}, "x": jk.parameter(default)})
+    default[0] = 5.0
+    np.testing.assert_array_equal(Changed().x, [1.0, 2.0])
+
+
+@pytest.mark.parametrize("value", [4, True, "left", (1, 2)])
+def test_a_field_that_should_be_static_is_named_with_the_remedy(value):
+    annotations = {"links": type(value)}
+    Chain = type("Chain", (jk.System,), {"__annotations__": annotations})
+    with pytest.raises(TypeError, match=r"Chain\.links = .*equinox\.field\(static=True\).*jk\.parameter"):
+        Chain(value)
+    Chain = type("Chain", (jk.System,), {"__annotations__": annotations, "links": eqx.field(static=True)})
+    assert Chain(value).links == value
+
+
+def test_values_by_name_and_their_arithmetic():
+    q = Values([1.0, 2.0, 3.0, 4.0], ("x", "e1", "e2", "e3"))
+    assert list(q["e1":"e3"]) == [2.0, 3.0, 4.0]
+    assert q["e1":"e3"].names == ("e1", "e2", "e3")
+    assert list(q[:"e1"]) == [1.0, 2.0]
+    assert list(q["x", "e3"]) == list(q[[0, -1]]) == [1.0, 4.0]
+    assert q["x", "e3"]["e3"] == 4.0
+    assert "e1" in q
+    assert "roll" not in q
+    array = np.array([1.0, 2.0, 3.0, 4.0])
+    for f in (
+        lambda a: a**2,
+        lambda a: 2.0**a,
+        abs,
+        lambda a: +a,
+        lambda a: a % 3.0,
+        lambda a: a // 2.0,
+        lambda a: a > 2,
+    ):
+        np.testing.assert_array_equal(f(q), f(array))
+    with pytest.raises(KeyError, match="did you mean 'e1'"):
+        q["e11":]
+    with pytest.raises(AttributeError, match=r"no `\.sum`: jnp\.asarray\(q\) is an array"):
+        q.sum()
+    with pytest.raises(AttributeError, match=r"read as q\['roll'\]"):
+        _ = q.roll
+    with pytest.raises(TypeError, match="`in` asks for a name"):
+        _ = 1.0 in q
+
+
+class Rod(jk.System):
+    """A rod on a pin, with its inertia about the pin or about its mass centre."""
+
+    mass: jk.Scalar = jk.parameter(2.0)
+    about_pin: bool = eqx.field(static=True, default=True)
+    wrong: bool = eqx.field(static=True, default=False)
+    coordinates, speeds = ("angle", "tilt"), ("rate", "tilt_rate")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, q["angle"], u["rate"])
+        B = A.rotate(1, q["tilt"], u["tilt_rate"])
+        r = B.vector(0.3, 0.4, -0.5)
+        G = O.fixed(r)
+        if not self.about_pin:
+            return jk.Motion([jk.Body(self.mass, np.diag([1.0, 2.0, 2.5]), G, B)])
+        x = np.array([0.3, 0.4, -0.5])
+        inertia = jnp.diag(jnp.array([1.0, 2.0, 2.5])) + self.mass * jnp.asarray(x @ x * np.eye(3) - np.outer(x, x))
+        about = O.moving(0.0 * A.x, 1.0 * A.x) if self.wrong else O
+        return jk.Motion([jk.Body(self.mass, inertia, G, B, about=about)])
+
+
+class AboutWhatSlides(Rod):
+    """The same, about a point that slides along the rod."""
+
+
+def test_inertia_about_another_point():
+    at = ([0.3, 0.4], [0.5, 0.6])
+    for function in (jk.mass_matrix, jk.forcing):
+        about_pin, central = (function(Rod(about_pin=b), 0.0, *at) for b in (True, False))
+        np.testing.assert_allclose(about_pin, central, rtol=1e-13, atol=1e-14)
+    with pytest.raises(ValueError, match=r"'body'.*about a point that moves in its frame"):
+        jk.mass_matrix(AboutWhatSlides(wrong=True), 0.0, *at)
