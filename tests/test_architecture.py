@@ -2,6 +2,7 @@
 
 import ast
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -16,6 +17,7 @@ SOURCE = Path(jk.__file__).parent
 
 # Each module may import from the lines above it, and within the same package.
 FLOORS = [
+    ["_jax_internals"],
     ["_lookup", "_types", "_components", "_linear", "_nan", "_native", "_reads", "_fuse", "_kinks"],
     ["rotations", "_vectors"],
     ["_system", "_trajectory"],
@@ -72,6 +74,17 @@ def test_imports_point_down():
         for imported in imports_of(path):
             fine = imported == unit or floor[imported] < floor[unit] or imported in WITHIN_A_FLOOR.get(unit, ())
             assert fine, f"{path.relative_to(SOURCE)} imports {imported}, which does not stand below it"
+
+
+# What JAX and equinox do not promise: the one file that uses it says what happens where it is gone.
+NOT_PROMISED = r"jax\.(extend|interpreters|experimental|_src)|equinox\._|jaxlib\.(?!__version__)|compiler_options"
+
+
+def test_one_file_uses_what_is_not_promised():
+    users = {unit_of(path) for path in SOURCE.rglob("*.py") if re.search(NOT_PROMISED, path.read_text())}
+    assert users == {"_jax_internals"}
+    of_core = {line for path in SOURCE.rglob("*.py") for line in re.findall(r".*jax\.core.*", path.read_text())}
+    assert of_core <= {"from jax.core import Tracer"}  # the rest of jax.core comes and goes
 
 
 def test_few_files_see_the_integrator():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import os
 import warnings
 from pathlib import Path
@@ -11,8 +10,8 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
+from . import _jax_internals as internals
 from . import _native
 
 
@@ -85,14 +84,13 @@ def configure(
     elif jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
         jax.config.update("jax_compilation_cache_dir", None)
         os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
-        reset_cache()
+        internals.look_for_cache_again()
     if devices is not None:
         _split_cpu(devices)
     if native is not None:
         _native.use(native)
-    if native and _native.why_not():
-        without = f"jaxkane.configure: no native kernels, XLA does their work: {_native.why_not()}."
-        warnings.warn(without, UserWarning, stacklevel=2)
+    if native and (why := _native.why_not()):
+        _native.tell(why)
     done = Configuration(bool(float64), folder, devices, _native.is_on())
     if verbose and done != _last:
         print(_told(done))
@@ -110,7 +108,7 @@ def _has_started() -> bool:
     now = jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue]
     try:
         jax.config.update("jax_num_cpu_devices", now + 1)
-    except RuntimeError:
+    except RuntimeError:  # raised for nothing else: the setting is only written down
         return True
     jax.config.update("jax_num_cpu_devices", now)
     return False
@@ -119,17 +117,17 @@ def _has_started() -> bool:
 def _split_cpu(devices: int) -> None:
     if not devices >= 1:
         raise ValueError(f"`devices` is a number of CPU devices, 1 or more; got {devices}.")
-    try:
+    if not _has_started():
         jax.config.update("jax_num_cpu_devices", int(devices))
-    except RuntimeError:
-        there = len(jax.local_devices(backend="cpu"))
-        if there != devices:
-            warnings.warn(
-                f"jaxkane.configure came too late for devices={devices}: JAX has started with {there}. Call it before "
-                "anything is computed; in a notebook, restart the kernel.",
-                UserWarning,
-                stacklevel=3,
-            )
+        return
+    there = len(jax.local_devices(backend="cpu"))
+    if there != devices:
+        warnings.warn(
+            f"jaxkane.configure came too late for devices={devices}: JAX has started with {there}. Call it before "
+            "anything is computed; in a notebook, restart the kernel.",
+            UserWarning,
+            stacklevel=3,
+        )
 
 
 def _folder(cache: bool | str | os.PathLike[str]) -> Path:
@@ -155,26 +153,27 @@ def _store_programs(folder: Path) -> None:
     for name, value in settings.items():
         jax.config.update(name, value)
         os.environ[name.upper()] = str(value)
-    reset_cache()  # JAX looks for a folder once, when it first compiles
-    # JAX stores no program that may call back into Python, as equinox's checks do in order to raise. equinox reads this
-    # variable when it is imported, which has happened; its checks look at the name in this module when they are traced.
+    internals.look_for_cache_again()  # JAX looks for a folder once, when it first compiles
+    # JAX stores no program that may call back into Python, as equinox's checks do in order to raise.
     os.environ["EQX_ON_ERROR"] = "nan"
-    checks = importlib.import_module("equinox._errors")
-    if not hasattr(checks, "EQX_ON_ERROR"):
+    if not internals.checks_give_nan():
         warnings.warn(
             "jaxkane.configure: this equinox cannot be told at run time how to treat errors, so simulations will not "
             "be stored. Set EQX_ON_ERROR=nan in the environment before Python starts.",
             UserWarning,
             stacklevel=3,
         )
-    checks.EQX_ON_ERROR = "nan"  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def _why_off() -> str | None:
+    return _native.why_not() if _native.is_wanted() else "switched off"
 
 
 def _told(done: Configuration) -> str:
     lines = [f"jaxkane: {'float64' if done.float64 else 'float32'}"]
     if done.devices is not None:
         lines[0] += f", {done.devices} CPU device{'s' if done.devices > 1 else ''}"
-    lines[0] += ", native kernels" if done.native else f", no native kernels ({_native.why_not() or 'switched off'})"
+    lines[0] += ", native kernels" if done.native else f", no native kernels ({_why_off()})"
     if done.cache is None:
         return f"{lines[0]}; compiled programs are not kept."
     sizes = [entry.stat().st_size for entry in os.scandir(done.cache) if entry.name.endswith("-cache")]

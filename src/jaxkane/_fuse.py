@@ -15,26 +15,40 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
-from jax.experimental.xla_metadata import set_xla_metadata
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun
-from jax.interpreters import ad, batching, mlir
-from jax.interpreters.partial_eval import dce_jaxpr
+import numpy as np
+from jax.core import Tracer
 
 from . import _native as native
+from ._jax_internals import (
+    FUSES,
+    ClosedJaxpr,
+    Jaxpr,
+    Literal,
+    as_lowering,
+    dce_jaxpr,
+    instantiate_zeros,
+    is_no_tangent,
+    is_undefined_primal,
+    jaxpr_as_fun,
+    new_primitive,
+    one_function,
+    settings,
+)
 from ._native import CALLS, NotScalarError, Scalars
 from ._reads import on_forget, settling, version_of
 
 # What one compiled function may hold: elementwise work and the moving of scalars. Calls into libraries (LAPACK) may not
 # be compiled so, and loops would gain nothing.
 _PLAIN = frozenset(
-    "abs acos add add_any and asin atan atan2 broadcast_in_dim cbrt clamp concatenate convert_element_type copy copy_p "
-    "cos cosh div eq erf exp exp2 expm1 floor ge gt integer_pow is_finite jit le log log1p logistic lt max min mul ne "
-    "neg not or pad pjit pow reduce_sum rem reshape round rsqrt select_n sign sin sinh slice sqrt square squeeze stack "
-    "stop_gradient sub tan tanh transpose unstack".split()
+    "abs acos acosh add add_any and asin asinh atan atan2 atanh broadcast_in_dim cbrt clamp concatenate "
+    "convert_element_type copy copy_p cos cosh div eq erf exp exp2 expm1 floor ge gt integer_pow is_finite jit le log "
+    "log1p logistic lt max min mul ne neg not or pad pjit pow reduce_sum rem reshape rev round rsqrt select_n sign sin "
+    "sinh slice split sqrt square squeeze stack stop_gradient sub tan tanh transpose unstack xor".split()
 )
 _LARGEST_SUM = 64  # XLA may hand larger ones to a library
 _MOST_LANES = 128  # in XLA's hands: with more, intermediates no longer stay in the cache
@@ -43,6 +57,9 @@ _MOST_LANES = 128  # in XLA's hands: with more, intermediates no longer stay in 
 _WHOLE_UP_TO = 2500
 _PIECE = 250
 
+# In the name of each call of the method itself into LAPACK.
+BY_LAPACK = "by_lapack"
+
 Where = tuple[tuple[bool, ...], ...]
 
 
@@ -50,29 +67,68 @@ def fused(f: Callable[..., Any]) -> Callable[..., Any]:
     """`f`, a pure function at module level, as one operation; where it calls into libraries, `f` itself.
 
     It is traced once for each structure of its arguments, however often it is called, and again where what the code of
-    its arguments reads has changed.
+    its arguments reads has changed. What keeps it from being one operation is told, by the name of the first argument's
+    type.
     """
 
     @functools.lru_cache(maxsize=256)
-    def program_for(treedef, avals, version):
+    def program_for(treedef, avals, version, label, _):
         traced = settling(f)
         program, out = jax.make_jaxpr(lambda *leaves: traced(*jax.tree.unflatten(treedef, leaves)), return_shape=True)(
             *_specs(avals)
         )
-        return (_Program(program), jax.tree.structure(out)) if _is_plain(program.jaxpr) else None
+        if any(isinstance(c, Tracer) for c in program.consts):
+            raise _CapturedError
+        foreign = list(_foreign(program.jaxpr))
+        if any(where for _, where in foreign):
+            _tell_foreign(label, dict.fromkeys(name for name, where in foreign if where))
+        return None if foreign else (_Program(program, label), jax.tree.structure(out))
 
     on_forget(program_for.cache_clear)
 
     @functools.wraps(f)
     def call(*args):
+        if FUSES is not None:
+            return f(*args)
         leaves, treedef = jax.tree.flatten(args)
-        found = program_for(treedef, tuple(map(jax.typeof, leaves)), version_of(args))
+        try:
+            found = program_for(treedef, tuple(map(jax.typeof, leaves)), version_of(args), _label(args[0]), settings())
+        except _CapturedError:
+            found = None
         if found is None:
             return f(*args)
         program, structure = found
         return jax.tree.unflatten(structure, program(*leaves))
 
     return call
+
+
+class _CapturedError(Exception):
+    """The function reads a value of the trace that is under way, so that its program must not outlive that."""
+
+
+def _label(system: Any) -> str:
+    return "A function" if hasattr(system, "dtype") else type(system).__name__
+
+
+_told: set[tuple[str, str]] = set()
+
+
+def _tell_foreign(label: str, names: Iterable[str]) -> None:
+    _tell(
+        label,
+        " and ".join(f"`{name}`" for name in names),
+        "cannot be part of one compiled function: evaluated operation by operation, these equations take about ten "
+        "times as long, and their derivatives up to a thousand times. Functions of single numbers, jnp.where and "
+        "entries at places known beforehand can be part of it",
+    )
+
+
+def _tell(label: str, what: str, why: str) -> None:
+    """Warn of something in a description that costs time; once."""
+    if (label, what) not in _told:
+        _told.add((label, what))
+        warnings.warn(f"{label}: its description uses {what}, which {why}.", UserWarning, stacklevel=2)
 
 
 def _specs(avals: Sequence[Any]) -> list[jax.ShapeDtypeStruct]:
@@ -82,17 +138,18 @@ def _specs(avals: Sequence[Any]) -> list[jax.ShapeDtypeStruct]:
 class _Program:
     """A traced program, and the programs that follow from it, each made once."""
 
-    def __init__(self, program: ClosedJaxpr):
+    def __init__(self, program: ClosedJaxpr, label: str = "A function"):
+        self.label = label
         self.program = without_repetition(program)
         self.evaluate = jaxpr_as_fun(self.program)
         self.in_avals, self.out_avals = self.program.in_avals, self.program.out_avals
-        self.is_plain = _is_plain(self.program.jaxpr)
+        self.is_plain = not any(_foreign(self.program.jaxpr))
         # A memory for each instance, since a cached method would keep the instance itself alive.
         self.tangent = functools.cache(self._tangent)
         self.transposed = functools.cache(self._transposed)
         self.batched = functools.cache(self._batched)
         self.scalars = functools.cache(self._scalars)
-        self.compiled = jax.jit(self.__call__)
+        self.compiled = functools.cache(self._compiled)
 
     def __call__(self, *leaves: Any) -> list[Any]:
         return _program_p.bind(*leaves, program=self, sizes=(), where=((),) * len(leaves))
@@ -111,7 +168,7 @@ class _Program:
             return jax.jvp(of_moving, [xs[i] for i in places], dxs)[1]
 
         dx_avals = [a for a, m in zip(self.in_avals, moving, strict=True) if m]
-        return _Program(jax.make_jaxpr(tangents)(*_specs([*self.in_avals, *dx_avals])))
+        return _Program(jax.make_jaxpr(tangents)(*_specs([*self.in_avals, *dx_avals])), self.label)
 
     def _transposed(self, linear: tuple[bool, ...]) -> _Program:
         """(the other inputs, cotangents of the outputs) -> cotangents of the linear inputs."""
@@ -125,7 +182,7 @@ class _Program:
             of_linear = lambda *ys: self.evaluate(*_replaced(full, places, ys))  # noqa: E731
             return jax.linear_transpose(of_linear, *[specs[i] for i in places])(list(cts))
 
-        return _Program(jax.make_jaxpr(cotangents)(*[specs[i] for i in others], *_specs(self.out_avals)))
+        return _Program(jax.make_jaxpr(cotangents)(*[specs[i] for i in others], *_specs(self.out_avals)), self.label)
 
     def _batched(self, sizes: tuple[int, ...], where: Where) -> _Program:
         """The program over leading axes of these sizes, of which input i has those in `where[i]`."""
@@ -136,14 +193,33 @@ class _Program:
         f = lambda *xs: self.evaluate(*xs)  # noqa: E731
         for d in reversed(range(len(sizes))):
             f = jax.vmap(f, in_axes=tuple(0 if has[d] else None for has in where), axis_size=sizes[d])
-        return _Program(jax.make_jaxpr(f)(*avals))
+        return _Program(jax.make_jaxpr(f)(*avals), self.label)
+
+    def _compiled(self, sizes: tuple[int, ...], where: Where) -> Callable[..., list[Any]]:
+        """The program over a batch, as a function that is compiled once for each kind of batch."""
+        return jax.jit(functools.partial(_program_p.bind, program=self, sizes=sizes, where=where))
 
     def _scalars(self) -> Scalars | None:
         """The program as a graph of scalars for machine code, where it can be written so."""
         try:
             return Scalars(self.program)
-        except NotScalarError:
+        except NotScalarError as error:
+            self._tell_not_scalar(error)
             return None
+
+    def target(self, sizes: tuple[int, ...], where: Where) -> str | None:
+        """The name of the native kernel for a batch, where there can be one."""
+        scalars = self.scalars() if native.is_on() and 0 not in sizes else None
+        try:
+            return scalars.target(sizes, where) if scalars else None
+        except NotScalarError as error:
+            self._tell_not_scalar(error)
+        except (RuntimeError, OSError, MemoryError) as error:  # LLVM's own are RuntimeError
+            native.tell(f"LLVM fails at {self.label}: {type(error).__name__}: {str(error)[:300]}")
+        return None
+
+    def _tell_not_scalar(self, error: NotScalarError) -> None:
+        _tell(self.label, f"{error}", "native kernels do not know: XLA does its work, three to ten times slower")
 
 
 def _chosen(sizes: Sequence[int], has: Sequence[bool]) -> tuple[int, ...]:
@@ -157,27 +233,19 @@ def _replaced(values: Sequence[Any], places: Sequence[int], new: Sequence[Any]) 
     return values
 
 
-_program_p = Primitive("scalar_program")
-_program_p.multiple_results = True
-
-
 # A call stands for a batch over leading axes `sizes`; input i has those of them that `where[i]` says, outputs have all.
 
 
-@_program_p.def_impl
 def _run(*args, program, sizes, where):
-    if not sizes:
-        return program.compiled(*args)
-    return jax.jit(functools.partial(_program_p.bind, program=program, sizes=sizes, where=where))(*args)
+    return program.compiled(sizes, where)(*args)
 
 
-@_program_p.def_abstract_eval
 def _abstract(*_, program, sizes, where):
     return [a.update(shape=(*sizes, *a.shape)) for a in program.out_avals]
 
 
 def _jvp(primals, tangents, *, program, sizes, where):
-    moving = tuple(type(dx) is not ad.Zero for dx in tangents)
+    moving = tuple(not is_no_tangent(dx) for dx in tangents)
     moves = [(dx, w) for dx, m, w in zip(tangents, moving, where, strict=True) if m]
     outputs = _program_p.bind(*primals, program=program, sizes=sizes, where=where)
     return outputs, _program_p.bind(
@@ -190,13 +258,13 @@ def _jvp(primals, tangents, *, program, sizes, where):
 
 
 def _transpose(cotangents, *args, program, sizes, where):
-    linear = tuple(ad.is_undefined_primal(x) for x in args)
+    linear = tuple(is_undefined_primal(x) for x in args)
     known = [(x, w) for x, w, is_linear in zip(args, where, linear, strict=True) if not is_linear]
     everywhere = ((True,) * len(sizes),) * len(cotangents)
     found = iter(
         _program_p.bind(
             *(x for x, _ in known),
-            *map(ad.instantiate_zeros, cotangents),
+            *map(instantiate_zeros, cotangents),
             program=program.transposed(linear),
             sizes=sizes,
             where=(*(w for _, w in known), *everywhere),
@@ -260,7 +328,7 @@ def _one_function(f: Callable[..., Any], args: Sequence[Any]) -> Any:
     def values_and_sum(*args):
         return f(*args), sum(x[(0,) * x.ndim].astype(float) for x in args)
 
-    with set_xla_metadata(xla_cpu_small_call="true", inlineable="false"):
+    with one_function():
         values, _ = jax.jit(values_and_sum)(*jax.lax.optimization_barrier(args))
     return values
 
@@ -293,21 +361,24 @@ def _pieces(program: Jaxpr) -> list[_Piece]:
     return pieces[::-1]
 
 
-_lower_as_one_function = mlir.lower_fun(_as_one_function, multiple_results=True)
-
-
 def _lower_on_cpu(context, *args, program, sizes, where):
-    scalars = program.scalars() if native.is_on() and 0 not in sizes else None
-    if scalars is None:
-        return _lower_as_one_function(context, *args, program=program, sizes=sizes, where=where)
-    return jax.ffi.ffi_lowering(scalars.target(sizes, where))(context, *args)
+    target = program.target(sizes, where)
+    if target is None:
+        return as_lowering(_as_one_function)(context, *args, program=program, sizes=sizes, where=where)
+    return jax.ffi.ffi_lowering(target)(context, *args)
 
 
-ad.primitive_jvps[_program_p] = _jvp
-ad.primitive_transposes[_program_p] = _transpose
-batching.primitive_batchers[_program_p] = _batch
-mlir.register_lowering(_program_p, mlir.lower_fun(_inlined, multiple_results=True))
-mlir.register_lowering(_program_p, _lower_on_cpu, platform="cpu")
+if FUSES is None:
+    _program_p = new_primitive(
+        "scalar_program",
+        evaluate=_run,
+        shapes=_abstract,
+        jvp=_jvp,
+        transpose=_transpose,
+        batch=_batch,
+        traced=_inlined,
+        lower_on_cpu=_lower_on_cpu,
+    )
 
 
 def without_repetition(program: ClosedJaxpr) -> ClosedJaxpr:
@@ -332,15 +403,29 @@ def _evaluate_once(program: Jaxpr, consts: Sequence[Any], args: Sequence[Any], k
         if inner is not None:
             outputs = _evaluate_once(inner.jaxpr, inner.consts, inputs, known)
         else:
-            # Literals by value, all else by identity: `known` keeps what it names alive.
-            names = [(v.val, str(v.aval)) if isinstance(v, Literal) else id(read(v)) for v in equation.invars]
-            key = (equation.primitive, *map(str, names), str(equation.params))
+            # Numbers by their bits, all else by identity: `known` keeps what it names alive.
+            names = [_bits(v) if isinstance(v, Literal) else id(read(v)) for v in equation.invars]
+            key = (equation.primitive, *names, _name_of(equation))
             if key not in known:
                 outputs = equation.primitive.bind(*inputs, **equation.params)
                 known[key] = outputs if equation.primitive.multiple_results else [outputs], inputs
             outputs = known[key][0]
         values.update(zip(equation.outvars, outputs, strict=True))
     return [read(v) for v in program.outvars]
+
+
+def _bits(literal: Any) -> tuple[bytes, str]:
+    return np.asarray(literal.val).tobytes(), str(literal.aval)  # -0.0 == 0.0, and an array's text is rounded
+
+
+def _name_of(equation: Any) -> Any:
+    """What two equations that do the same have in common: their parameters; itself where these cannot be compared."""
+    key = tuple(sorted(equation.params.items()))
+    try:
+        hash(key)
+    except TypeError:
+        return id(equation)
+    return key
 
 
 def _called(equation: Any) -> ClosedJaxpr | None:
@@ -351,15 +436,14 @@ def _called(equation: Any) -> ClosedJaxpr | None:
     return equation.params["jaxpr"] if equation.primitive.name in CALLS else None
 
 
-def _is_plain(program: Jaxpr) -> bool:
+def _foreign(program: Jaxpr, is_ours: bool = False) -> Iterator[tuple[str, bool]]:
+    """The operations that cannot be part of one compiled function, and whether they are the description's own: the
+    method itself has LAPACK solve what is too large to be written out (`_linear`)."""
     for equation in program.eqns:
-        inner = _called(equation)
+        name, inner = equation.primitive.name, _called(equation)
         if inner is not None:
-            if not _is_plain(inner.jaxpr):
-                return False
-            continue
-        if equation.primitive.name not in _PLAIN:
-            return False
-        if equation.primitive.name == "reduce_sum" and getattr(equation.invars[0].aval, "size", 0) > _LARGEST_SUM:
-            return False
-    return True
+            yield from _foreign(inner.jaxpr, is_ours or BY_LAPACK in equation.params.get("name", ""))
+        elif name not in _PLAIN:
+            yield name, not is_ours
+        elif name == "reduce_sum" and getattr(equation.invars[0].aval, "size", 0) > _LARGEST_SUM:
+            yield f"a sum of more than {_LARGEST_SUM}", not is_ours

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
 
@@ -28,7 +29,7 @@ def solve(A: Rows, *rights: Sequence[Component]) -> list[tuple[Component, ...]]:
         return [() for _ in rights]
     if n > _CRAMER_UP_TO:
         matrix = stack(A)
-        solution = jnp.linalg.solve(matrix, jnp.stack([stack([b])[0] for b in rights], axis=-1))
+        solution = _solved_by_lapack(matrix, jnp.stack([stack([b])[0] for b in rights], axis=-1))
         return [tuple(solution[i, j] for i in range(n)) for j in range(len(rights))]
     adjugate, det = _adjugate(A)
     reciprocal = 1.0 / det
@@ -37,7 +38,20 @@ def solve(A: Rows, *rights: Sequence[Component]) -> list[tuple[Component, ...]]:
 
 def determinant(A: Rows) -> Component:
     """det A."""
-    return _adjugate(A)[1] if len(A) <= _CRAMER_UP_TO else jnp.linalg.det(stack(A))
+    return _adjugate(A)[1] if len(A) <= _CRAMER_UP_TO else _det_by_lapack(stack(A))
+
+
+# By these names `_fuse` knows that it is not the description that calls a library.
+
+
+@jax.jit
+def _solved_by_lapack(matrix, rights):
+    return jnp.linalg.solve(matrix, rights)
+
+
+@jax.jit
+def _det_by_lapack(matrix):
+    return jnp.linalg.det(matrix)
 
 
 def _adjugate(A: Rows) -> tuple[Rows, Component]:

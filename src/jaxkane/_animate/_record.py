@@ -10,14 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._fuse import fused
 from .._linear import stack
 from .._reads import version_of
 from .._system import Force, System, flatten_loads
 from .._trajectory import Trajectory
 from ._sketch import Element, Figure, Sketch, rotation
-
-# A picture's program runs once or twice: it should compile quickly, not run quickly. The bicycle's: 4.6 -> 0.5 s.
-_COMPILE_QUICKLY: dict[str, Any] = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
 
 
 class Record(eqx.Module):
@@ -76,10 +74,16 @@ def record(system: System, trajectory: Trajectory, figure: Figure | None) -> Rec
     return eqx.tree_at(lambda r: (r.mass, r.inertia), found, (found.mass[0], found.inertia[0]))
 
 
-@functools.partial(jax.jit, static_argnums=(1, 2, 3), compiler_options=_COMPILE_QUICKLY)
+@functools.partial(jax.jit, static_argnums=(1, 2, 3))
 def _along(numbers, rest, figure, version, t, q, u):
+    # A picture's program runs once or twice: it should compile quickly, which one function for one instant does.
     system = eqx.combine(numbers, rest)
-    return jax.vmap(lambda t, q, u: _instant(system, figure, t, q, u))(t, q, u)
+    return jax.lax.map(lambda now: _instants(figure, version)(system, *now), (t, q, u))
+
+
+@functools.lru_cache(maxsize=64)
+def _instants(figure: Figure | None, version: Any) -> Any:
+    return fused(lambda system, *now: _instant(system, figure, *now))
 
 
 def _instant(system: System, figure: Figure | None, t, q, u) -> Any:

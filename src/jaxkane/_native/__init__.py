@@ -12,14 +12,17 @@ import functools
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr
 
+from .._jax_internals import ClosedJaxpr
+from ._available import is_on, is_wanted, machine, tell, use, why_not
 from ._graph import CALLS, LIBRARY, Graph, NotScalarError, symbol, unrolled
 from ._handler import handler_text
 from ._llvm import Writer
-from ._machine import is_on, machine, use, why_not
+from ._objects import Objects, cache_folder
 
-__all__ = ["CALLS", "NotScalarError", "Scalars", "is_on", "use", "why_not"]
+__all__ = ["CALLS", "NotScalarError", "Scalars", "is_on", "is_wanted", "tell", "use", "why_not"]
+
+FMOD = "fmod"  # in the C library what is `rem` in JAX
 
 
 class Scalars:
@@ -35,26 +38,40 @@ class Scalars:
             inputs.append(np.array(elements, np.int64).reshape(aval.shape))
         self.outputs = unrolled(program.jaxpr, program.consts, inputs, self.graph)
         self.bytes_of = [a.size * a.dtype.itemsize for a in (*program.in_avals, *program.out_avals)]
-        for node in self.graph.nodes:
-            if node.operation in LIBRARY and not machine().has(symbol(node)):
-                raise NotScalarError(f"{symbol(node)} is not known to LLVM here")
+        self.functions = {
+            symbol(node._replace(operation=FMOD) if node.operation == "rem" else node)
+            for node in self.graph.nodes
+            if node.operation in LIBRARY or node.operation == "rem"
+        }
         self.kernel = functools.cache(self._kernel)
         self.target = functools.cache(self._target)
 
     def _kernel(self, varies: tuple[bool, ...], lanes: int) -> str:
         writer = Writer(self.graph, varies, lanes, functools.partial(machine().of_lanes, lanes=lanes))
-        return machine().compile(writer.text(len(varies), self.outputs))[1]
+        return _compiled(writer.text(len(varies), self.outputs))[1]
 
     def _target(self, sizes: tuple[int, ...], where: tuple[tuple[bool, ...], ...]) -> str:
         """The name under which XLA calls the program for a batch of `sizes`, of whose dimensions argument i has those
-        in `where[i]`."""
+        in `where[i]`.
+
+        **Raises:** `NotScalarError` where this machine lacks a function, `RuntimeError` where LLVM fails.
+        """
+        missing = sorted(f for f in self.functions if not machine().has(f))
+        if missing:
+            raise NotScalarError(f"{', '.join(missing)} (not in the mathematical library here)")
         if all(all(w) or not any(w) for w in where):  # one long batch
             sizes, where = (int(np.prod(sizes)),) if sizes else (), tuple((any(w),) if sizes else () for w in where)
         lanes = min(machine().lanes, 1 << (sizes[-1] - 1).bit_length()) if sizes else 1
-        kernel = self.kernel(tuple(bool(w and w[-1]) for w in where), lanes)
-        address, name = machine().compile(handler_text(kernel, sizes, where, len(self.outputs), self.bytes_of))
-        _register(address, name)
+        with machine().lock:
+            kernel = self.kernel(tuple(bool(w and w[-1]) for w in where), lanes)
+            address, name = _compiled(handler_text(kernel, sizes, where, len(self.outputs), self.bytes_of))
+            _register(address, name)
         return name
+
+
+def _compiled(text: str) -> tuple[int, str]:
+    folder = cache_folder()
+    return machine().compile(text, Objects(folder) if folder else None)
 
 
 @functools.cache

@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jax.extend.core import Jaxpr, Literal
+
+from .._jax_internals import Jaxpr, Literal
 
 CALLS = ("jit", "pjit")
 
@@ -41,8 +42,9 @@ def symbol(node: Node) -> str:
 
 
 class Graph:
-    """Scalars, each once. Constants are folded where that is exact: x + 0, x - 0, x * 1, x * 0 (an exact zero of the
-    description or of a tangent, not a number that happens to be zero), x / 1, 0 / x."""
+    """Scalars, each once. Folded is what XLA folds too: x + 0, x - 0, x * 1, x * -1, x / 1. Not x * 0 and 0 / x, which
+    are NaN where x is not finite or zero, nor 0 - x, which is no -x where x is zero: the zeros of descriptions and of
+    derivatives are gone before (`_components`, and JAX), so that nothing is to be gained."""
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
@@ -78,15 +80,13 @@ class Graph:
             case "add":
                 return b if x == 0 else a if y == 0 else None
             case "sub":
-                return a if y == 0 else self.add("neg", (b,), dtype) if x == 0 else None
+                return a if y == 0 else None
             case "mul":
-                if x == 0 or y == 0:
-                    return self.constant(0.0, dtype)
                 if x in (1, -1) or y in (1, -1):
                     other, unit = (b, x) if x in (1, -1) else (a, y)
                     return other if unit == 1 else self.add("neg", (other,), dtype)
             case "div":
-                return a if y == 1 else self.constant(0.0, dtype) if x == 0 and y != 0 else None
+                return a if y == 1 else None
         return None
 
 
@@ -204,10 +204,11 @@ def _moved(name: str, params: Any, xs: list[np.ndarray], shape: tuple[int, ...])
         case "slice":
             steps = params["strides"] or (1,) * x.ndim
             return [x[tuple(map(slice, params["start_indices"], params["limit_indices"], steps))]]
-        case "pad" if all(low >= 0 and high >= 0 for low, high, _ in params["padding_config"]):
+        case "pad":
             out = np.full(shape, xs[1], dtype=x.dtype)
-            inner = (slice(lo, s - hi, step + 1) for s, (lo, hi, step) in zip(shape, params["padding_config"]))
-            out[tuple(inner)] = x
+            places = [low + (1 + step) * np.arange(n) for n, (low, _, step) in zip(x.shape, params["padding_config"])]
+            kept = [(0 <= at) & (at < n) for at, n in zip(places, shape)]  # a negative padding takes away
+            out[np.ix_(*(at[k] for at, k in zip(places, kept)))] = x[np.ix_(*kept)]
             return [out]
     return None
 

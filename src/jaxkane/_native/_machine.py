@@ -1,49 +1,71 @@
-"""LLVM in this process: whether it is there, and what has been compiled by it. Knows no programs, only text."""
+"""LLVM in this process: the processor, and texts compiled for it. Knows neither programs nor JAX.
+
+The probe (`_probed.py`) loads this file by itself, so it imports nothing of this package.
+"""
 
 from __future__ import annotations
 
 import ctypes.util
 import functools
 import hashlib
-import os
 import platform
-import warnings
-from pathlib import Path
-from typing import Any
-
-import jax
+import threading
+from typing import Any, Protocol
 
 _OLDEST_LLVM = 20
+_MATHEMATICS = {"Linux": "libm.so.6", "Darwin": "/usr/lib/libSystem.B.dylib", "Windows": "ucrtbase.dll"}
+
+
+class Store(Protocol):
+    """Where compiled code is kept from one process to the next."""
+
+    def read(self, name: str) -> bytes | None: ...
+    def write(self, name: str, code: bytes) -> None: ...
 
 
 class Machine:
-    """This processor: its name and `features`, and how many float64 `lanes` its vectors have."""
+    """This processor: its name and `features`, and how many float64 `lanes` its vectors have.
+
+    LLVM is for one thread at a time, and a function must not be compiled twice: the code of the first would go while
+    XLA calls it. Whoever compiles and registers holds `lock`.
+    """
 
     def __init__(self) -> None:
+        import llvmlite
         import llvmlite.binding as llvm
 
-        self.llvm = llvm
+        self.llvm, self.lock = llvm, threading.RLock()
         llvm.initialize_native_target()
         llvm.initialize_native_asmprinter()
         features = llvm.get_host_cpu_features()
         self.cpu, self.features = llvm.get_host_cpu_name(), features.flatten()
+        self.version = f"llvmlite {llvmlite.__version__}, LLVM {'.'.join(map(str, llvm.llvm_version_info))}"
         self.lanes = 8 if features.get("avx512f") else 4 if features.get("avx2") else 2
-        self.has_libmvec = platform.machine() == "x86_64" and _load(llvm, "mvec")
-        _load(llvm, "m")
+        on_linux = platform.system() == "Linux"
+        self.has_libmvec = on_linux and platform.machine() == "x86_64" and _load(llvm, "libmvec.so.1", "mvec")
+        _load(llvm, _MATHEMATICS.get(platform.system()), "m")
         self._compiled: dict[str, tuple[int, Any]] = {}
 
-    def compile(self, text: str) -> tuple[int, str]:
-        """The address of the function that `text` defines as @it, and a name for it that other texts may call."""
-        digest = hashlib.sha256("\n".join((text, self.cpu, self.features)).encode())
-        name = "jaxkane_" + digest.hexdigest()[:24]
-        if name not in self._compiled:
-            engine, keepers = self._engine(name, text.replace("@it(", f"@{name}("))
-            address = engine.get_function_address(name)
-            self.llvm.add_symbol(name, address)
-            self._compiled[name] = address, keepers  # code lives as long as the process
-        return self._compiled[name][0], name
+    def name_of(self, text: str) -> str:
+        """The name under which `compile(text)` defines its function: of the text, the processor and the LLVM."""
+        return "jaxkane_" + hashlib.sha256("\n".join((text, *self.key)).encode()).hexdigest()[:32]
 
-    def _engine(self, name: str, text: str) -> tuple[Any, Any]:
+    @property
+    def key(self) -> tuple[str, str, str]:
+        return self.cpu, self.features, self.version
+
+    def compile(self, text: str, store: Store | None = None) -> tuple[int, str]:
+        """The address of the function that `text` defines as @it, and a name for it that other texts may call."""
+        name = self.name_of(text)
+        with self.lock:
+            if name not in self._compiled:
+                engine, keepers = self._engine(name, text.replace("@it(", f"@{name}("), store)
+                address = engine.get_function_address(name)
+                self.llvm.add_symbol(name, address)
+                self._compiled[name] = address, keepers  # code lives as long as the process
+            return self._compiled[name][0], name
+
+    def _engine(self, name: str, text: str, store: Store | None) -> tuple[Any, Any]:
         llvm = self.llvm
         module = llvm.parse_assembly(text)
         module.name = name
@@ -51,10 +73,11 @@ class Machine:
             cpu=self.cpu, features=self.features, opt=2, codemodel="jitdefault", jit=True
         )
         engine = llvm.create_mcjit_compiler(module, target)
-        folder = _cache_folder()
-        if folder:
-            engine.set_object_cache(functools.partial(_keep, folder), functools.partial(_kept, folder))
+        kept, made = store.read(name) if store else None, []
+        engine.set_object_cache(lambda _, code: made.append(code), lambda _: kept)
         engine.finalize_object()
+        if store and made:
+            store.write(name, made[0])
         return engine, (engine, target)
 
     def has(self, function: str) -> bool:
@@ -69,67 +92,24 @@ class Machine:
         return name if self.has_libmvec and kind and self.has(name) else None
 
 
-def _load(llvm: Any, library: str) -> bool:
-    path = ctypes.util.find_library(library)
-    if path:
-        llvm.load_library_permanently(path)
-    return path is not None
-
-
-@functools.cache
-def machine() -> Machine:
-    return Machine()
-
-
-_wanted = os.environ.get("JAXKANE_NATIVE", "1") != "0"
-
-
-def use(native: bool) -> None:
-    """Whether programs that are compiled from now on become machine code through LLVM, or XLA's."""
-    global _wanted
-    if native != _wanted:
-        _wanted = native
-        jax.clear_caches()
-    os.environ["JAXKANE_NATIVE"] = str(int(native))
-
-
-def is_on() -> bool:
-    return _wanted and why_not() is None
-
-
-@functools.cache
-def why_not() -> str | None:
-    """Why this process cannot have native kernels; None where it can."""
-    if platform.system() != "Linux":
-        return f"they are made for Linux, and this is {platform.system()}"
+def without_llvm() -> str | None:
+    """Why there is no LLVM in this process that could be used; None where there is one."""
     try:
-        version = machine().llvm.llvm_version_info
+        from llvmlite.binding import llvm_version_info
     except ImportError:
         return "llvmlite is not installed: pip install 'jaxkane[native]'"
-    except Exception as error:  # an LLVM or a processor that is not known here
+    except OSError as error:  # its shared library does not load
         return f"LLVM does not work here: {error}"
-    return None if version >= (_OLDEST_LLVM,) else "llvmlite is too old: pip install 'llvmlite>=0.45'"
+    return None if llvm_version_info >= (_OLDEST_LLVM,) else "llvmlite is too old: pip install 'llvmlite>=0.45'"
 
 
-def _cache_folder() -> Path | None:
-    """Beside JAX's persistent compilation cache, where that is on."""
-    config: Any = jax.config
-    folder = config.jax_compilation_cache_dir
-    return Path(folder) / "jaxkane" if folder and config.jax_enable_compilation_cache else None
-
-
-def _keep(folder: Path, module: Any, code: bytes) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        scratch = folder / f"{module.name}.{os.getpid()}"
-        scratch.write_bytes(code)
-        scratch.replace(folder / f"{module.name}.o")
-    except OSError as error:
-        warnings.warn(f"Compiled code could not be kept in {folder}: {error}", stacklevel=2)
-
-
-def _kept(folder: Path, module: Any) -> bytes | None:
-    try:
-        return (folder / f"{module.name}.o").read_bytes()
-    except OSError:
-        return None
+def _load(llvm: Any, file: str | None, name: str) -> bool:
+    """Have LLVM look for functions in a shared library, known by its file or else by its name."""
+    for place in (lambda: file, lambda: ctypes.util.find_library(name)):
+        try:
+            if path := place():
+                llvm.load_library_permanently(path)
+                return True
+        except RuntimeError:  # as llvmlite says that there is no such file
+            continue
+    return False

@@ -14,9 +14,9 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.multihost_utils import process_allgather
 from jaxtyping import Array
 
+from .._jax_internals import process_allgather
 from ._blocks import Blocks
 from ._model import Model, Point, blocks_of, costs_of
 from ._windows import Windows

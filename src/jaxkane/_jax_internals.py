@@ -1,0 +1,125 @@
+"""All that this library uses of JAX and equinox beyond what they promise. Knows no programs and no mechanics.
+
+Each has a way back, so that where a release takes it away, results stay right and only speed, or a convenience, goes:
+
+| what | without it |
+|---|---|
+| jaxprs and primitives (`jax.extend`, `jax.interpreters`) | `FUSES` says why; right-hand sides are plain JAX |
+| the frontend attribute that makes one function of a program | XLA cuts the program as it does any other |
+| `reset_cache`, equinox's switch of its checks | programs are kept only where the environment says so from the start |
+| `process_allgather` | none: a fit by several processes raises ImportError |
+
+`tests/test_jax_internals.py` names what has gone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+import jax
+
+FUSES: str | None = None  # why programs cannot be fused, or None
+try:
+    from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun
+    from jax.interpreters import ad, batching, mlir
+    from jax.interpreters.ad import instantiate_zeros, is_undefined_primal
+    from jax.interpreters.partial_eval import dce_jaxpr
+except ImportError as error:
+    FUSES = f"this JAX lacks what that needs ({error})"
+    missing: Any = None
+    ClosedJaxpr = Jaxpr = Literal = Primitive = missing
+    jaxpr_as_fun = dce_jaxpr = instantiate_zeros = is_undefined_primal = ad = batching = mlir = missing
+
+
+def new_primitive(
+    name: str,
+    *,
+    evaluate: Callable[..., Any],
+    shapes: Callable[..., Any],
+    jvp: Callable[..., Any],
+    transpose: Callable[..., Any],
+    batch: Callable[..., Any],
+    traced: Callable[..., Any],
+    lower_on_cpu: Callable[..., Any],
+) -> Any:
+    """An operation of JAX with several results and these rules; `traced` is what it stands for, `lower_on_cpu` makes
+    its text for XLA there."""
+    primitive = Primitive(name)
+    primitive.multiple_results = True
+    primitive.def_impl(evaluate)
+    primitive.def_abstract_eval(shapes)
+    ad.primitive_jvps[primitive] = jvp
+    ad.primitive_transposes[primitive] = transpose
+    batching.primitive_batchers[primitive] = batch
+    mlir.register_lowering(primitive, mlir.lower_fun(traced, multiple_results=True))
+    mlir.register_lowering(primitive, lower_on_cpu, platform="cpu")
+    return primitive
+
+
+def as_lowering(f: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of JAX, with several results, as a rule that makes text for XLA."""
+    return mlir.lower_fun(f, multiple_results=True)
+
+
+def is_no_tangent(tangent: Any) -> bool:
+    """Whether a tangent is JAX's sign for none at all, which is more than zero."""
+    return type(tangent) is ad.Zero
+
+
+def one_function() -> contextlib.AbstractContextManager[Any]:
+    """Under it, each call of a jitted function is compiled by XLA:CPU as one function of LLVM."""
+    try:
+        from jax.experimental.xla_metadata import set_xla_metadata
+
+        return set_xla_metadata(xla_cpu_small_call="true", inlineable="false")
+    except (ImportError, TypeError):
+        return contextlib.nullcontext()
+
+
+def settings() -> Any:
+    """JAX's settings on which a traced program depends beside its arguments."""
+    return tuple(getattr(jax.config, name, None) for name in _SETTINGS)
+
+
+_SETTINGS = (
+    "jax_enable_x64",
+    "jax_numpy_dtype_promotion",
+    "jax_numpy_rank_promotion",
+    "jax_default_matmul_precision",
+    "jax_default_dtype_bits",
+    "jax_debug_nans",
+)
+
+
+def look_for_cache_again() -> None:
+    """Have JAX look again where programs are kept: it does so once, when it first compiles."""
+    try:
+        from jax.experimental.compilation_cache.compilation_cache import reset_cache
+    except ImportError:
+        return
+    reset_cache()
+
+
+def checks_give_nan() -> bool:
+    """Have equinox's checks give NaN rather than raise; whether that could be done.
+
+    equinox reads the environment's EQX_ON_ERROR when it is imported; its checks look at the name in their own module
+    when they are traced.
+    """
+    try:
+        checks: Any = importlib.import_module("equinox._errors")
+    except ImportError:
+        return False
+    known = hasattr(checks, "EQX_ON_ERROR")
+    checks.EQX_ON_ERROR = "nan"
+    return known
+
+
+def process_allgather(x: Any, *, tiled: bool = False) -> Any:
+    """The arrays of all processes, stacked or, if `tiled`, one after the other."""
+    from jax.experimental.multihost_utils import process_allgather
+
+    return process_allgather(x, tiled=tiled)
