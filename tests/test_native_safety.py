@@ -206,6 +206,7 @@ def test_places_are_those_of_the_header_of_jaxlib():
 def unproven(tmp_path, monkeypatch):
     """A process that has tried nothing yet, and folders without verdicts."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(_probe, "cache_folder", lambda: None)
     monkeypatch.setattr(_available, "_told", set())
     _available._verdict.cache_clear()
     yield tmp_path
