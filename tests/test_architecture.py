@@ -21,7 +21,7 @@ FLOORS = [
     ["_lookup", "_types", "_components", "_linear", "_nan", "_native", "_reads", "_fuse", "_kinks"],
     ["rotations", "_vectors"],
     ["_system", "_trajectory"],
-    ["loads"],
+    ["loads", "_units"],
     ["catalog"],
     ["_kane"],
     ["_check"],

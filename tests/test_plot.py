@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
+from jaxkane._units import unit_of
 from jaxkane.plot._stability import stable_ranges
-from jaxkane.plot._trajectories import unit_of
 
 
 @pytest.fixture(autouse=True, params=["default", "dark_background"])
@@ -198,7 +198,7 @@ def fitted(n):
     names = tuple(f"ride {k}" for k in range(n))
     trials = [types.SimpleNamespace(t=t, measured=m, name=name) for m, name in zip(measured, names)]
     return types.SimpleNamespace(
-        problem=types.SimpleNamespace(trials=trials, channels=("roll", "yaw_rate")),
+        problem=types.SimpleNamespace(trials=trials, channels=("roll", "yaw_rate"), system=jk.catalog.DoublePendulum()),
         trial_names=names,
         fitted=dict(zip(names, simulated)),
         residuals=dict(zip(names, [{name: np.full(21, 0.5) for name in trial} for trial in measured])),

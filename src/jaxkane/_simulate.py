@@ -30,6 +30,7 @@ from ._signals import as_signals, evaluate, sample_times
 from ._system import State, System, parameter_info
 from ._trajectory import Status, Trajectory
 from ._types import Component, Inputs
+from ._units import units_of
 
 ADJOINTS = {
     "auto": diffrax.RecursiveCheckpointAdjoint,
@@ -254,6 +255,7 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
         names=(tuple(system.coordinates), tuple(system.speeds), tuple(system.dependent_speeds)),
         events=tuple(name for name in stops if name != _SINGULAR),
         adjoint=type(settings.adjoint).__name__,
+        units=tuple(units_of(system).items()),
     )
 
 

@@ -47,6 +47,7 @@ class Trajectory(eqx.Module):
     - `inputs`: values (n_t,) of every input by name.
     - `status`: a `Status` code; `reason` says it in words. `t_end` [s]: where the simulation ended.
     - `stats`: numbers of steps taken, accepted and rejected. `adjoint`: how it is differentiated.
+    - `units`: pairs of a name and its unit, as the system declares them.
     """
 
     t: Float[Array, "*batch n_t"]
@@ -60,6 +61,7 @@ class Trajectory(eqx.Module):
     names: tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]] = eqx.field(static=True)
     events: tuple[str, ...] = eqx.field(static=True)
     adjoint: str = eqx.field(static=True)
+    units: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
 
     def __getitem__(self, name: str) -> Float[Array, "*batch n_t"]:
         groups = zip(self.names, (self.q, self.u, self.u_dep), strict=True)

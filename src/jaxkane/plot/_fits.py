@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from .._lookup import hint, refuse_unknown
+from .._units import in_degrees, refuse_no_angle, unit_of, units_of
 from ._axes import SOFT, finish, panels
-from ._trajectories import unit_of
 
 _TRIALS = 3
 
@@ -48,6 +48,9 @@ def fits(
     refuse_unknown(channels, all_channels, "fits: there is no channel")
     if not channels:
         raise ValueError(f"fits: `channels` is empty; {hint([], all_channels)}")
+    known = {channel: unit_of(channel, units_of(fit.problem.system) | dict(units or {})) for channel in channels}
+    if degrees:
+        refuse_no_angle(channels, known.values())
     each = 1 + residuals
     heights = {"height_ratios": [3, 1.2][:each] * len(channels)}
     axes = panels(axes, each * len(channels), len(chosen), size=(4.2, 1.5), sharex="col", sharey="row", **heights)
@@ -60,7 +63,7 @@ def fits(
             if channel not in trial.measured:
                 ax.text(0.5, 0.5, "not measured", ha="center", va="center", color=SOFT, transform=ax.transAxes)
                 continue
-            scale, unit = _scale((units or {}).get(channel, unit_of(channel)), degrees)
+            scale, unit = _scale(known[channel], degrees)
             ax.plot(
                 trial.t, scale * trial.measured[channel], ".", color="C0", markersize=3, alpha=0.6, label="measured"
             )
@@ -91,5 +94,5 @@ def _spread(n: int) -> list[int]:
 
 
 def _scale(unit: str, degrees: bool) -> tuple[float, str]:
-    turns = degrees and unit in ("rad", "rad/s")
+    turns = degrees and in_degrees(unit)
     return (180.0 / np.pi, unit.replace("rad", "deg")) if turns else (1.0, unit)

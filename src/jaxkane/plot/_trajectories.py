@@ -1,36 +1,17 @@
-"""Motions over time, by name and with units. Knows trajectories and the usual names; knows no system."""
+"""Motions over time, by name and with units. Knows trajectories; knows no system."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from .._trajectory import Status, Trajectory
+from .._units import in_degrees, refuse_no_angle, unit_of
 from ._axes import SOFT, finish, panels
 
-# The unit that a name tells: of the coordinate, before "_rate" or "_dot".
-_UNITS = {
-    r"roll|pitch|yaw|steer|lean|heading|spin|.*angle\d*|theta\d*|phi\d*|psi\d*|alpha\d*|beta\d*": "rad",
-    r"[xyz]\d*|.*(position|distance|displacement|height)\d*": "m",
-    r"omega\d*": "rad/s",
-    r"v\d*|.*_speed": "m/s",
-    r".*_?torque\d*": "N m",
-    r".*_?force\d*": "N",
-    r"e\d": "",
-}
 _MARKED = 200  # more members of a batch than this are drawn without a mark where they ended
-
-
-def unit_of(name: str) -> str:
-    """The unit that a usual name tells, or "": "roll" rad, "yaw_rate" rad/s, "x" m, "steer_torque" N m."""
-    base, rate = re.fullmatch(r"(.*?)((?:_rate|_dot)?)", name).groups()  # type: ignore[union-attr]
-    unit = next((unit for pattern, unit in _UNITS.items() if re.fullmatch(pattern, base)), "")
-    if base.endswith("wheel") and rate:
-        unit = "rad"
-    return unit + ("/s" if rate and unit else "")
 
 
 def trajectories(
@@ -52,15 +33,22 @@ def trajectories(
     - `trajectory`: a `Trajectory`. Of a batch all members are drawn, faintly.
     - `names`: of what is drawn; names in a tuple share a panel. By default the coordinates.
     - `degrees`: angles in degrees instead of radians.
-    - `units`: by name, where the name does not tell it as "roll", "x", "yaw_rate" or "steer_torque" do.
+    - `units`: by name. By default those that the system declares (`System.units`); where it declares none, what a usual
+        name tells, as "roll", "x", "yaw_rate" and "steer_torque" do.
     - `label`: what this motion is called in the legend, when several are drawn into the same `axes`.
     - `axes`: as many as there are panels. `style`: passed on to matplotlib's `plot`.
 
     **Returns:** the axes (n_panels,).
 
-    **Raises:** `KeyError` for a name that the trajectory does not have.
+    **Raises:** `KeyError` for a name that the trajectory does not have; `ValueError` for `degrees` where nothing is
+    known to be an angle.
     """
     groups = [(group,) if isinstance(group, str) else tuple(group) for group in names or trajectory.names[0]]
+    drawn = [name for group in groups for name in group]
+    known = {name: unit_of(name, dict(trajectory.units) | dict(units or {})) for name in drawn}
+    values = {name: np.asarray(trajectory[name], dtype=float) for name in drawn}
+    if degrees:
+        refuse_no_angle(drawn, known.values())
     t = np.asarray(trajectory.t, dtype=float)
     found = panels(axes, len(groups), size=(7.0, 1.6 if len(groups) > 1 else 3.0), sharex=True)[:, 0]
     n = int(np.prod(t.shape[:-1]))
@@ -69,7 +57,7 @@ def trajectories(
     for ax, group in zip(found, groups, strict=True):
         shown = []
         for name in group:
-            y, unit = _values(trajectory, name, degrees, units or {})
+            y, unit = _in_unit(values[name], known[name], degrees)
             told = [part for part in (name if len(group) > 1 else "", label) if part]
             y = y.reshape(n, -1)
             line = ax.plot(t[0], y[0], label=", ".join(told) or None, **members | style)[0]
@@ -84,11 +72,8 @@ def trajectories(
     return found
 
 
-def _values(trajectory: Trajectory, name: str, degrees: bool, units: Mapping[str, str]) -> tuple[np.ndarray, str]:
-    y, unit = np.asarray(trajectory[name], dtype=float), units.get(name, unit_of(name))
-    if degrees and unit in ("rad", "rad/s"):
-        return np.degrees(y), unit.replace("rad", "deg")
-    return y, unit
+def _in_unit(y: np.ndarray, unit: str, degrees: bool) -> tuple[np.ndarray, str]:
+    return (np.degrees(y), unit.replace("rad", "deg")) if degrees and in_degrees(unit) else (y, unit)
 
 
 def _axis_label(shown: Sequence[tuple[str, str]]) -> str:

@@ -36,6 +36,7 @@ class Part(eqx.Module):
     names: tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]] = eqx.field(static=True)
     events: tuple[str, ...] = eqx.field(static=True)
     adjoint: str = eqx.field(static=True)
+    units: tuple[tuple[str, str], ...] = eqx.field(static=True)
 
 
 class Job(eqx.Module):
@@ -59,7 +60,7 @@ class Job(eqx.Module):
             values = (ride.q, ride.u, ride.u_dep, ride.inputs)
         else:
             values = jax.tree.map(jnp.asarray, self.reduce(ride))
-        return Part(values, ride.status, ride.t_end, ride.stats, ride.names, ride.events, ride.adjoint)
+        return Part(values, ride.status, ride.t_end, ride.stats, ride.names, ride.events, ride.adjoint, ride.units)
 
     def solve(self, members: Any, size: int) -> Part:
         """The motions of a chunk (n, ...), n at most `size`: one program serves every chunk of a size."""
