@@ -11,52 +11,69 @@ from jaxkane.fit import Free, Problem, Trial, cross_validate, laplace, least_squ
 
 TIGHT = 1e-6
 t = np.arange(0.0, 4.0, 0.1)
-SIGMA, N = 0.02, 6
+N = 6
+SIGMA = np.repeat([0.02, 0.05], t.size)  # of positions [m], then speeds [m/s], as all rows of a trial
 PRIOR = (1.1, 0.01)  # of the gain
 BIAS = 0.05  # [m], a deviation
 
 
 def responses(push):
-    """Columns (n_t, 5) of what is measured, by gain, drift, start and offset: x'' = gain push + drift, push linear
-    between samples."""
+    """Columns (2 n_t, 5) of position and speed by gain, drift, start, speed and the position sensor's offset:
+    x'' = gain push + drift, push linear between samples."""
     h, rows = np.diff(t), [(0.0, 0.0)]
     for i, dt in enumerate(h):
         x, v = rows[-1]
         rows.append((x + v * dt + (2 * push[i] + push[i + 1]) * dt**2 / 6, v + (push[i] + push[i + 1]) * dt / 2))
-    return np.column_stack([np.array(rows)[:, 0], t**2 / 2, np.ones_like(t), t, np.ones_like(t)])
+    one, zero = np.ones_like(t), np.zeros_like(t)
+    x, v = np.array(rows).T
+    return np.vstack([np.column_stack([x, t**2 / 2, one, t, one]), np.column_stack([v, t, zero, one, zero])])
 
 
 PUSHES = [np.sin((1.5 + 0.3 * k) * t + k) for k in range(N)]
 COLUMNS = [responses(push) for push in PUSHES]
 
 
-def recorded(seed, wander=0.0, noise=0.03):
-    """Noise, and in every trial another drift: that is what errors by trial are for."""
+def recorded(seed, wander=0.0):
+    """Noise half as large again as `sigma`, a gap, and in every trial another drift, for which errors by trial are."""
     rng = np.random.default_rng(seed)
-    return [
-        C @ [1.2, 0.3 + wander * rng.normal(), 0.1 * k, -0.2, 0.03 * rng.normal()] + noise * rng.normal(size=t.size)
-        for k, C in enumerate(COLUMNS)
-    ]
+    records = []
+    for k, C in enumerate(COLUMNS):
+        unknowns = [1.2, 0.3 + wander * rng.normal(), 0.1 * k, -0.2, 0.03 * rng.normal()]
+        records.append(C @ unknowns + 1.5 * SIGMA * rng.normal(size=SIGMA.size))
+    records[2][10:15] = np.nan
+    return records
 
 
-def trials_of(records):
-    return [
-        Trial(t, {"x": y}, {"push": push}, sigma=SIGMA, name=f"run {k}")
-        for k, (y, push) in enumerate(zip(records, PUSHES, strict=True))
-    ]
+def trials_of(records, **more):
+    found = []
+    for k, (y, push) in enumerate(zip(records, PUSHES, strict=True)):
+        channels = {"x": y[: t.size], "x_dot": y[t.size :]}
+        channels = dict(sorted(channels.items(), reverse=k % 2 == 0))  # in whatever order
+        sigma = {"x_dot": SIGMA[-1], "x": SIGMA[0]}
+        found.append(Trial(t, channels, {"push": push}, sigma=sigma, name=f"run {k}", **more))
+    return found
+
+
+def weighed(C, y):
+    """Rows and right-hand sides in standard deviations, zero where there is a gap."""
+    seen = np.isfinite(y)
+    return np.where(seen[:, None], C / SIGMA[:, None], 0.0), np.where(seen, y, 0.0) / SIGMA
 
 
 def dense(records, prior=PRIOR):
-    """Rows (n, 2 + 3 N) and right-hand sides of the whole problem, in standard deviations.
+    """All rows and right-hand sides, in standard deviations.
 
     Unknowns: gain, drift; start, speed and sensor's offset of each trial.
     """
-    own = np.kron(np.eye(N), np.zeros((t.size, 3)))
-    A, y = np.zeros((N * t.size, 2)), np.concatenate(records) / SIGMA
-    for k, C in enumerate(COLUMNS):
-        rows = slice(k * t.size, (k + 1) * t.size)
-        A[rows], own[rows, 3 * k : 3 * k + 3] = C[:, :2] / SIGMA, C[:, 2:] / SIGMA
-    A = np.hstack([A, own])
+    A, y = [], []
+    for k, (C, record) in enumerate(zip(COLUMNS, records, strict=True)):
+        rows, values = weighed(C, record)
+        seen = np.isfinite(record)
+        own = np.zeros((seen.sum(), 3 * N))
+        own[:, 3 * k : 3 * k + 3] = rows[seen, 2:]
+        A.append(np.hstack([rows[seen, :2], own]))
+        y.append(values[seen])
+    A, y = np.vstack(A), np.concatenate(y)
     of_bias = np.eye(A.shape[1])[4::3] / BIAS
     of_gain = np.eye(1, A.shape[1]) / prior[1]
     return np.vstack([A, of_bias, of_gain]), np.concatenate([y, np.zeros(N), [prior[0] / prior[1]]])
@@ -64,10 +81,11 @@ def dense(records, prior=PRIOR):
 
 def by_trial(records):
     """Of each trial, its rows by gain and drift and its right-hand side with its own unknowns projected out."""
-    for C, y in zip(COLUMNS, records, strict=True):
-        Q, _ = np.linalg.qr(np.vstack([C[:, 2:] / SIGMA, [[0.0, 0.0, 1 / BIAS]]]))
+    for C, record in zip(COLUMNS, records, strict=True):
+        rows, y = weighed(C, record)
+        Q, _ = np.linalg.qr(np.vstack([rows[:, 2:], [[0.0, 0.0, 1 / BIAS]]]))
         clear = lambda a, Q=Q: a - Q @ (Q.T @ a)  # noqa: E731
-        yield clear(np.vstack([C[:, :2] / SIGMA, [[0.0, 0.0]]])), clear(np.append(y / SIGMA, 0.0))
+        yield clear(np.vstack([rows[:, :2], [[0.0, 0.0]]])), clear(np.append(y, 0.0))
 
 
 FREE = (Free("gain", prior=PRIOR), "drift")
@@ -112,11 +130,15 @@ def test_estimates_and_formal_errors(case):
     C = found.variance * np.linalg.inv(A.T @ A)[:2, :2]
     np.testing.assert_allclose(found.covariance, C, rtol=TIGHT)
     assert found.correlation[0, 1] == pytest.approx(C[0, 1] / np.sqrt(C[0, 0] * C[1, 1]), rel=TIGHT)
-    fitted = np.concatenate([f["x"] for f in found.fitted.values()])
-    np.testing.assert_allclose(fitted, (A @ best)[: N * t.size] * SIGMA, atol=TIGHT)
-    measured = np.concatenate(records)
-    left = 1 - np.sum((measured - fitted) ** 2) / sum(np.sum((y - y.mean()) ** 2) for y in records)
-    assert found.variance_accounted_for["x"] == pytest.approx(left, rel=TIGHT)
+    # Of each channel, gaps left out.
+    for channel, rows in (("x", slice(0, t.size)), ("x_dot", slice(t.size, None))):
+        pairs = [(record[rows], f[channel]) for record, f in zip(records, found.fitted.values(), strict=True)]
+        left = 1 - sum(np.nansum((y - f) ** 2) for y, f in pairs) / sum(
+            np.nansum((y - np.nanmean(y)) ** 2) for y, _ in pairs
+        )
+        assert found.variance_accounted_for[channel] == pytest.approx(left, rel=TIGHT)
+    residuals = np.concatenate([np.concatenate([r["x"], r["x_dot"]]) for r in found.residuals.values()])
+    np.testing.assert_allclose(residuals[np.isfinite(residuals)], (A @ best - y)[: -N - 1], atol=1e-4)
 
 
 def test_errors_by_trial(case):
@@ -150,26 +172,27 @@ def test_trials_left_out(case):
         # A trial is charged with its own residuals alone, not with the parameters' priors.
         for values, costs in ((others, left_out.held_out), (best[:2], left_out.fitted), ((1, 0), left_out.at_start)):
             assert costs[k] == pytest.approx(np.sum((pieces[k][0] @ values - pieces[k][1]) ** 2), rel=1e-3)
-    assert left_out.n.tolist() == [t.size] * N
+    assert left_out.n.tolist() == [np.isfinite(y).sum() for y in records]
 
 
 def test_the_evidence_is_the_density_of_the_data():
     # All unknowns have Gaussian priors, so the data are Gaussian: their density needs no integral.
     records = recorded(2)
-    at_rest = [
-        Trial(t, {"x": y}, {"push": p}, sigma=SIGMA, initial={"x": 0.0}) for y, p in zip(records, PUSHES, strict=True)
-    ]
+    at_rest = trials_of(records, initial={"x": 0.0, "x_dot": 0.0})
     free = (Free("gain", prior=(1.0, 0.5), scale=7.0), Free("drift", prior=(0.0, 2.0)))
     starts = {"x": 0.4, "x_dot": 0.3}
     gaussian = laplace(least_squares(Problem.of(Track(), at_rest, free, **(OPTIONS | {"unknown": starts})), rtol=1e-14))
-    A = dense(records)[0][: N * t.size] * SIGMA
+    y, sigma = np.concatenate(records), np.tile(SIGMA, N)
+    y, sigma = y[np.isfinite(y)], sigma[np.isfinite(y)]
+    A = dense(records)[0][: -N - 1] * sigma[:, None]
     P = np.diag([0.5, 2.0, *[0.4, 0.3, BIAS] * N]) ** 2
     mean = A[:, 0]  # with a gain of one
-    exact = stats.multivariate_normal(mean, A @ P @ A.T + SIGMA**2 * np.eye(len(A))).logpdf(np.concatenate(records))
+    exact = stats.multivariate_normal(mean, A @ P @ A.T + np.diag(sigma**2)).logpdf(y)
     assert gaussian.log_evidence == pytest.approx(exact, abs=1e-4)
     assert gaussian.message == ""
     # C = (A^T A / sigma^2 + P^-1)^-1, of x in the unit of the scales
-    covariance = np.linalg.inv(A.T @ A / SIGMA**2 + np.linalg.inv(P))[:2, :2] / np.outer([7.0, 1.0], [7.0, 1.0])
+    scales = np.outer([7.0, 2.0], [7.0, 2.0])  # of a start at zero it is the prior's deviation
+    covariance = np.linalg.inv(A.T @ (A / sigma[:, None] ** 2) + np.linalg.inv(P))[:2, :2] / scales
     np.testing.assert_allclose(gaussian.covariance, covariance, rtol=TIGHT)
     draws = gaussian.sample(2000)
     assert np.std(draws["gain"]) == pytest.approx(7.0 * covariance[0, 0] ** 0.5, rel=0.05)
@@ -194,7 +217,13 @@ def test_the_evidence_knows_priors_and_no_scales(evidence):
     A, y = dense(records, (1.0, 0.5))
     A, y = np.vstack([A, np.eye(1, A.shape[1], 1) / 2.0]), np.append(y, 0.0)
     rss = np.linalg.lstsq(A, y, rcond=None)[1][0]
-    exact = -0.5 * rss - N * t.size * np.log(SIGMA) - N * np.log(BIAS) - np.log(0.5) - np.log(2.0)
+    exact = (
+        -0.5 * rss
+        - np.log(np.tile(SIGMA, N)[np.isfinite(np.concatenate(records))]).sum()
+        - N * np.log(BIAS)
+        - np.log(0.5)
+        - np.log(2.0)
+    )
     exact += 0.5 * (A.shape[1] - len(A)) * np.log(2 * math.pi) - 0.5 * np.linalg.slogdet(A.T @ A)[1]
     assert first == pytest.approx(exact, abs=1e-5)
     # How far a step goes, where it begins, and bounds that leave the prior whole are no part of a model.
@@ -220,3 +249,31 @@ def test_a_wider_prior_pays_for_itself(evidence):
     assert np.isnan(none.log_evidence)
     assert "any value of gain is as likely" in none.message
     assert none.sample(3)["gain"].shape == (3,)
+
+
+def test_the_verdict_does_not_know_units():
+    # A push in mN with a gain in 1/g is the same experiment: so is what the data tell.
+    def told(unit, noise):
+        records = [y + noise * SIGMA * np.random.default_rng(9).normal(size=y.size) for y in recorded(3)]
+        trials = trials_of(records)
+        for trial in trials:
+            trial.inputs["push"] = trial.inputs["push"] * unit
+        problem = Problem.of(Track(gain=1.1 / unit, drift=0.2), trials, ("gain", "drift"), **OPTIONS)
+        return least_squares(problem, rtol=1e-12)
+
+    for noise in (0.0, 300.0):
+        one, other = told(1.0, noise), told(1e-3, noise)
+        assert other.singular_values == pytest.approx(one.singular_values, rel=1e-6)
+        assert other.ok == one.ok == (noise == 0.0)
+        assert len(other.identifiability.messages) == len(one.identifiability.messages)
+        assert other.standard_errors["gain"] == pytest.approx(1e3 * one.standard_errors["gain"], rel=1e-6)
+
+
+def test_as_many_unknowns_as_residuals():
+    # Two of each trial, and its sensor's prior, for three unknowns of its own: nothing is left for the common ones.
+    records = [np.where(np.isin(np.arange(y.size), (5, 30)), y, np.nan) for y in recorded(4)]
+    found = fitted(records, *FREE)
+    assert found.problem.size[0] < found.problem.size[1]
+    assert np.isnan(found.variance)
+    assert all(not np.isfinite(error) for error in found.standard_errors.values())
+    assert any("residuals for" in note for note in found.short_notes)

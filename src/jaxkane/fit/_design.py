@@ -16,7 +16,7 @@ from jaxtyping import Array
 from tqdm import tqdm
 
 from .._system import System
-from ._model import Model, Point, each, jacobian_of, starts_of
+from ._model import Model, Point, by_next, each, jacobian_of, starts_of
 from ._parameters import parameters_of
 from ._problem import Problem
 from ._trial import Trial
@@ -29,7 +29,8 @@ class Design:
 
     - `coefficients`: of the input; `inputs`: its samples (n_t,) by name; `trial`: the plan, with what the system would
         do as its measurements.
-    - `standard_errors`, `correlation`: of the parameters, for noise as in `sigma`; `before`: the same at the start.
+    - `standard_errors`, `correlation`: of the parameters, for noise as in `sigma`, infinite where the plan tells
+        nothing; `before`: the same at the start. They are those of a fit of `trial` with the same options.
     - `history`: of the criterion, with what exceeds the limits.
     """
 
@@ -105,7 +106,8 @@ def design(
         arrays, where the search starts.
     - `free`: the parameters, as in `fit`; `about`: the names of those that matter, by default all.
     - `sigma`: the channels that will be measured, and the standard deviation of their noise.
-    - `initial`: of the trial. `options`: as in `fit`: `unknown`, `window`, `input_bias`, ...
+    - `initial`: of the trial. `options`: as in `fit`: `unknown`, `window`, `input_bias`, ... With `window` alone every
+        window begins as `initial` says; with `continuity` the plan is one motion, cut into windows.
     - `rms`: root mean squares that inputs are scaled to, by name. `limits`: magnitudes that channels should not exceed.
     - `steps`, `rate`: of Adam on the coefficients.
 
@@ -134,22 +136,7 @@ def design(
     problem = Problem.of(system, plan(coefficients), free, **options)
     if problem.model.settings.step is None:
         raise ValueError("`inputs` must vary in time where the search starts, or give a `step` of integration [s].")
-    point = problem.start
-    starts, starts_dot = starts_of(problem.model, problem.windows, point)
-    bounds = jnp.asarray([(limits or {}).get(c, np.inf) for c in problem.channels], t.dtype)
-    # Windows take their samples from the trial's; where a sample stands in it does not change.
-    where = jnp.searchsorted(t, problem.windows.t_input).clip(0, t.shape[0] - 1)
-
-    def goal(c: Any, model: Model, windows: Windows) -> tuple[Array, tuple[Array, Array]]:
-        now = signals(c, t)
-        zero = jnp.zeros_like(t)
-        samples = jnp.stack([now.get(name, zero)[where] for name in system.inputs], axis=1)
-        windows = eqx.tree_at(lambda w: w.inputs, windows, samples)
-        covariance, simulated = _covariance(model, windows, point, starts, starts_dot)
-        excess = jax.nn.relu(jnp.abs(simulated) / bounds[None, :, None] - 1.0)
-        part = covariance[places][:, places]
-        value = jnp.linalg.slogdet(part)[1] if criterion == "D" else jnp.trace(part)
-        return value + 100.0 * jnp.mean(excess**2), (covariance, simulated)
+    goal = goal_of(problem, t, signals, places, criterion, limits or {})
 
     @eqx.filter_jit
     def gradient(c, model, windows):
@@ -162,47 +149,121 @@ def design(
     memory, history, best, first = descent.init(coefficients), [], None, None
     c = coefficients
     for _ in tqdm(range(steps + 1), disable=not progress, desc="design"):
-        value, slope, (covariance, simulated) = gradient(c, problem.model, problem.windows)
+        value, slope, (information, windows, simulated) = gradient(c, problem.model, problem.windows)
         if not np.isfinite(float(value)):
             if best is None:
                 raise ValueError("The plan cannot be simulated where the search starts, or tells nothing at all.")
             break
         history.append(float(value))
-        first = covariance if first is None else first
+        first = information if first is None else first
         if best is None or float(value) < best[0]:
-            best = float(value), c, covariance, simulated
+            best = float(value), c, information, windows, simulated
         with jax.numpy_dtype_promotion("standard"):
             updates, memory = descent.update(slope, memory, c)
             c = optax.apply_updates(c, updates)
     assert best is not None
-    _, c, covariance, simulated = best
-    scales = np.linalg.norm(np.asarray(problem.parameters.slopes(point.x)), axis=1)
-    in_units = lambda C: np.asarray(C) * np.outer(scales, scales)  # noqa: E731
-    rows = np.concatenate([np.asarray(simulated)[i, :, :n] for i, (_, _, n) in enumerate(problem.places)], axis=1)
+    assert first is not None
+    _, c, information, windows, simulated = best
+    scales = np.linalg.norm(np.asarray(problem.parameters.slopes(problem.start.x)), axis=1)
+    in_units = lambda information: _covariance(np.asarray(information)) * np.outer(scales, scales)  # noqa: E731
+    rows = _joined(problem, [np.asarray(x) for x in simulated])
     trial = plan(c, dict(zip(problem.channels, rows, strict=True)))
-    return Design(c, trial.inputs, trial, names, in_units(covariance), in_units(first), tuple(history))
+    if problem.model.nuisance.chained:  # every window is known to begin where the motion is
+        rides = dataclasses.replace(problem, windows=windows).trajectories(problem.start)
+        moves = _joined(problem, [np.concatenate([ride.q, ride.u], axis=1).T for ride in rides])
+        known = dict(zip((*system.coordinates, *system.speeds), moves, strict=True))
+        trial = Trial(t, trial.measured, trial.inputs, sigma=sigma, initial=known, name="plan")
+    return Design(c, trial.inputs, trial, names, in_units(information), in_units(first), tuple(history))
 
 
-def _covariance(model: Model, windows: Windows, point: Point, starts: Array, starts_dot: Array) -> tuple[Array, Array]:
-    """Of the scaled parameters (p, p), and what would be measured (W, n_c, n_t).
+def _joined(problem: Problem, of_windows: Sequence[np.ndarray]) -> np.ndarray:
+    """Rows (m, n_t) of the whole trial from those of its windows."""
+    pairs = zip(of_windows, problem.places, strict=True)
+    return np.concatenate([rows[:, :n] for rows, (_, _, n) in pairs], axis=1)
+
+
+def goal_of(
+    problem: Problem,
+    t: Array,
+    signals: Callable[[Any, Array], Mapping[str, Array]],
+    places: np.ndarray,
+    criterion: str,
+    limits: Mapping[str, float],
+) -> Callable[[Any, Model, Windows], tuple[Array, tuple[Array, Windows, Array]]]:
+    """The criterion as a function of coefficients, model and windows that JAX can differentiate; and with it the
+    information about the scaled parameters (p, p), the windows, and what would be measured (W, n_c, n_t)."""
+    point, chained = problem.start, problem.model.nuisance.chained
+    fixed = None if chained else starts_of(problem.model, problem.windows, point)
+    bounds = jnp.asarray([limits.get(c, np.inf) for c in problem.channels], t.dtype)
+    # Windows take their samples from the trial's; where a sample stands in it does not change.
+    where = jnp.searchsorted(t, problem.windows.t_input).clip(0, t.shape[0] - 1)
+
+    def goal(c: Any, model: Model, windows: Windows):
+        now, zero = signals(c, t), jnp.zeros_like(t)
+        samples = jnp.stack([now.get(name, zero)[where] for name in problem.system.inputs], axis=1)
+        windows = eqx.tree_at(lambda w: w.inputs, windows, samples)
+        windows = _one_motion(model, windows, point) if chained else windows
+        starts, starts_dot = starts_of(model, windows, point) if fixed is None else fixed
+        information, simulated = _information(model, windows, point, starts, starts_dot)
+        floor = 1e-12 * jnp.trace(information) * jnp.eye(information.shape[0], dtype=information.dtype)
+        part = jnp.linalg.inv(information + floor)[places][:, places]
+        value = jnp.linalg.slogdet(part)[1] if criterion == "D" else jnp.trace(part)
+        excess = jax.nn.relu(jnp.abs(simulated) / bounds[None, :, None] - 1.0)
+        return value + 100.0 * jnp.mean(excess**2), (information, windows, simulated)
+
+    return goal
+
+
+def _one_motion(model: Model, windows: Windows, point: Point) -> Windows:
+    """Windows that each begin where the one before ends."""
+    first = jax.tree.map(lambda x: x[0], windows)
+
+    def go_on(start: Array, window: Windows) -> tuple[Array, Array]:
+        ride = model.simulate(window, start, point.b[0], point.x)
+        return jnp.concatenate([ride.q[-1], ride.u[-1]]), start
+
+    end, starts = jax.lax.scan(go_on, model.consistent(first, point.z[0], point.x), windows)
+    return eqx.tree_at(lambda w: (w.start, w.next_start), windows, (starts, jnp.append(starts[1:], end[None], axis=0)))
+
+
+def _information(model: Model, windows: Windows, point: Point, starts: Array, starts_dot: Array) -> tuple[Array, Array]:
+    """About the scaled parameters (p, p), the others eliminated, and what would be measured (W, n_c, n_t).
 
     By normal equations, whose derivatives, unlike a QR decomposition's, always exist.
     """
     n_z, n_b, p = point.z.shape[1], point.b.shape[1], point.x.shape[0]
+    n_next = n_z if model.nuisance.chained else 0
 
     def of_window(arguments):
         window, z, b, start, start_dot = arguments
-        _, J, (simulated, _) = jacobian_of(model, window, start, start_dot, z, b, point.x)
-        N = J.T @ J
-        return _without(N, n_z), simulated
+        r, J, (simulated, _) = jacobian_of(model, window, start, start_dot, z, b, point.x)
+        links = by_next(model, window, r.shape[0])[:, :n_next]
+        J = jnp.column_stack([J[:, :n_z], links, J[:, n_z:]])  # by [z, z_next, b, x]
+        return J.T @ J, simulated
 
     N, simulated = each(of_window, (windows, point.z, point.b[windows.trial], starts, starts_dot))
-    information = _without(jnp.sum(N, axis=0), n_b)
+    # What a window and those before it say about [z_next, b, x] is known of [z, b, x] in the next.
+    places = np.r_[:n_next, n_z + n_next : n_z + n_next + n_b + p]
+
+    def go_on(known: Array, N: Array) -> tuple[Array, None]:
+        return _without(N.at[places[:, None], places[None, :]].add(known), n_z), None
+
+    known, _ = jax.lax.scan(go_on, jnp.zeros((places.size, places.size), N.dtype), N)
+    information = _without(known[n_next:, n_next:], n_b)
     slopes = model.parameters.slopes(point.x)
     to_x = jnp.linalg.solve(slopes, jnp.diag(jnp.linalg.norm(slopes, axis=1)))
-    information = to_x.T @ information @ to_x
-    floor = 1e-12 * jnp.trace(information) * jnp.eye(p, dtype=information.dtype)
-    return jnp.linalg.inv(information + floor), simulated
+    return to_x.T @ information @ to_x, simulated
+
+
+def _covariance(information: np.ndarray) -> np.ndarray:
+    """Its inverse (p, p), infinite for parameters of which it says nothing."""
+    s, V = np.linalg.eigh(information)
+    told = s > 1e-11 * s.max()
+    covariance = (V[:, told] / s[told]) @ V[:, told].T
+    untold = np.any(np.abs(V[:, ~told]) > 1e-5, axis=1)
+    covariance[untold, :] = covariance[:, untold] = np.nan
+    covariance[untold, untold] = np.inf
+    return covariance
 
 
 def _without(N: Array, n: int) -> Array:

@@ -144,7 +144,7 @@ def _directions(eliminated: Eliminated, variance: float | None) -> Array:
 
 def _is_minimum(at: Linearization, eliminated: Eliminated, rtol: float) -> bool:
     """Whether the linearized problem promises to lower the cost by less than `rtol` of it."""
-    return at.cost - float(eliminated.step(1e-9)[1]) <= rtol * at.cost
+    return at.cost - float(eliminated.step(1e-9)[1]) <= max(rtol * at.cost, 1e-12)
 
 
 def _guarded(problem: Problem, point: Point, at: Linearization, step: Array, eliminated: Eliminated):

@@ -116,7 +116,8 @@ def _step(problem: Problem, state: _State, at: Linearization, rtol: float) -> Li
     eliminated = eliminate(at.blocks, damping)
     x, promised = eliminated.step(damping)
     gain = at.cost - float(promised)
-    if gain <= rtol * at.cost and damping <= 1e-2:
+    # What is left of a cost that vanishes is rounding: a millionth of a standard error.
+    if gain <= max(rtol * at.cost, 1e-12) and damping <= 1e-2:
         return "converged"
     tried = moved(state.point, x, eliminated)
     there = linearize(problem, tried)

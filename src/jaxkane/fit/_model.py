@@ -177,8 +177,8 @@ def blocks_of(model: Model, windows: Windows, by_trial: Array, point: Point, sta
     def window_block(arguments):
         window, z, z_next, b, start, start_dot = arguments
         r, J, more = jacobian_of(model, window, start, start_dot, z, b, point.x)
-        by_next = _by_next(model, window, r.shape[0])[:, :n_next]
-        A = jnp.column_stack([J[:, :n_z], by_next, J[:, n_z:], r + by_next @ z_next[:n_next]])
+        links = by_next(model, window, r.shape[0])[:, :n_next]
+        A = jnp.column_stack([J[:, :n_z], links, J[:, n_z:], r + links @ z_next[:n_next]])
         # The triangle says all that the (m, k) matrix says about least squares. QR of NaN is not everywhere NaN.
         bad = ~jnp.all(jnp.isfinite(A))
         A = jnp.concatenate([jnp.where(bad, 0.0, A), jnp.zeros((A.shape[1], A.shape[1]), A.dtype)])
@@ -196,7 +196,7 @@ def costs_of(model: Model, windows: Windows, point: Point, starts: Array) -> tup
         window, z, z_next, b, start = arguments
         r, (simulated, _) = model.residuals(window, start, z, b, point.x)
         if model.nuisance.chained:
-            r = r + _by_next(model, window, r.shape[0]) @ z_next
+            r = r + by_next(model, window, r.shape[0]) @ z_next
         return jnp.sum(r**2), simulated
 
     return each(window_cost, _arguments(windows, point, starts))
@@ -213,14 +213,14 @@ def _arguments(windows: Windows, point: Point, *more: Array) -> tuple[Any, ...]:
     return windows, point.z, z_next, point.b[windows.trial], *more
 
 
-def _by_next(model: Model, window: Windows, m: int) -> Array:
+def by_next(model: Model, window: Windows, m: int) -> Array:
     """Derivatives (m, n_z) of a window's residuals by the next window's start."""
     n_z, before = window_size(model), window.weight.size
-    by_next = jnp.zeros((m, n_z), window.t.dtype)
+    links = jnp.zeros((m, n_z), window.t.dtype)
     if not model.nuisance.chained:
-        return by_next
+        return links
     places = jnp.arange(n_z, dtype=jnp.int32)
-    return by_next.at[before + places, places].set(-window.linked / model.nuisance.jump)
+    return links.at[before + places, places].set(-window.linked / model.nuisance.jump)
 
 
 def window_size(model: Model) -> int:

@@ -33,9 +33,11 @@ class Free:
     - `start`: the first guess; by default the system's value.
     - `bounds`: (lower, upper) of which either may be None; it never leaves them. By default (0, None), a logarithmic
         scale, where the parameter is declared positive, and none elsewhere.
-    - `scale`: how much is a lot, in the parameter's unit; by default the start's magnitude, or 1 for zero.
+    - `scale`: how much is a lot, in the parameter's unit; by default the start's magnitude; for a start at
+        zero the prior's deviation, or 1: give it there, since what is called undetermined is counted in it.
     - `prior`: (mean, standard deviation) of what was measured elsewhere.
-    - `tied`: other parameters that follow it: their name and factor, `Free("rR", tied={"rF": 1.0})`.
+    - `tied`: other parameters that follow it: their name and factor, `Free("rR", tied={"rF": 1.0})`. All entries of
+        one with axes follow.
     - `name`, `unit`: for tables.
     """
 
@@ -202,7 +204,7 @@ class Parameters(eqx.Module):
 
 
 def _checked_prior(name: str, prior: Any) -> Prior:
-    if not (len(prior) == 2 and math.isfinite(prior[0]) and prior[1] > 0):
+    if np.shape(prior) != (2,) or not (math.isfinite(prior[0]) and prior[1] > 0):
         raise ValueError(f"{name}: a prior is (mean, standard deviation > 0), got {prior}.")
     return float(prior[0]), float(prior[1])
 
@@ -228,9 +230,9 @@ def parameters_of(system: System, free: Sequence[Any] | Any) -> Parameters:
     names = [e.name for e in entries]
     places = [place for e in entries for place in [*[t[:2] for t in e.targets], *([e.role] if e.role else [])]]
     twice = [e.name for e in entries if any(places.count(t[:2]) > 1 for t in e.targets) or places.count(e.role) > 1]
-    if twice or len(set(names)) < len(names):
-        repeated = ", ".join(sorted(set(twice))) or "a parameter"
-        raise ValueError(f"`free` names {repeated} twice: {', '.join(names)}.")
+    twice += [name for name in names if names.count(name) > 1]
+    if twice:
+        raise ValueError(f"`free` names {', '.join(sorted(set(twice)))} twice, or ties it too: {', '.join(names)}.")
     priors = [prior if prior else (0.0, math.inf) for part in parts for prior in part[4]]
     array = lambda numbers: jnp.asarray(np.array(numbers, float), jnp.result_type(float))  # noqa: E731
     return Parameters(
@@ -256,7 +258,7 @@ def _of_input(system: System, item: Gain | Delay):
 
 def _of_leaves(system: System, item: Free):
     chosen, leaves = _find(system, item.where)
-    followers = [(name, factor, *_find(system, name)[0]) for name, factor in item.tied.items()]
+    followers = [follower for name, factor in item.tied.items() for follower in _followers(system, name, factor)]
     parts = []
     for i in chosen:
         path, leaf = leaves[i]
@@ -267,28 +269,49 @@ def _of_leaves(system: System, item: Free):
             label = item.name if item.name and not many else _path_name(path)
             label += str(list(index)) if leaf.ndim else ""
             start = float(leaf[index]) if item.start is None else float(item.start)
-            targets = [(i, place, 1.0), *((j, 0, float(factor)) for _, factor, j in followers)]
-            entry = _Entry(label, item.unit, tuple(targets))
+            entry = _Entry(label, item.unit, ((i, place, 1.0), *followers))
             parts.append(_scalar(entry, item, start, _declared_positive(system, path)))
     return parts
 
 
+def _followers(system: System, name: str, factor: float) -> list[tuple[int, int, float]]:
+    """(leaf, place, factor) of every entry of what is tied."""
+    chosen, leaves = _find(system, name)
+    for path in (leaves[i][0] for i in chosen):
+        if not math.isfinite(factor) or (factor <= 0 and _declared_positive(system, path)):
+            must = "positive, as the parameter is declared" if math.isfinite(factor) else "a finite number"
+            raise ValueError(f"`tied`: the factor of {_path_name(path)} must be {must}; got {factor}.")
+    return [(i, place, float(factor)) for i in chosen for place in range(leaves[i][1].size)]
+
+
 def _scalar(entry: _Entry, item: Free | Gain | Delay, start: float, positive: bool):
     name = entry.name
-    lower, upper = item.bounds if item.bounds is not None else ((0.0, None) if positive else (None, None))
+    lower, upper = _checked_bounds(name, item.bounds, positive)
     if not math.isfinite(start):
         raise ValueError(f"{name} starts at {start}.")
     if (lower is not None and not start > lower) or (upper is not None and not start < upper):
         raise ValueError(f"{name} starts at {start:.6g}, which is not inside its bounds ({lower}, {upper}).")
-    scale = abs(start) or 1.0
+    prior = _checked_prior(name, item.prior) if item.prior is not None else None
+    scale = abs(start) or (prior[1] if prior is not None and math.isfinite(prior[1]) else 1.0)
     if item.scale is not None:
-        if not item.scale > 0:
-            raise ValueError(f"{name}: the scale must be positive, got {item.scale}.")
+        if not 0 < item.scale < math.inf:
+            raise ValueError(f"{name}: the scale must be positive and finite, got {item.scale}.")
         scale = float(item.scale)
     ends = (-math.inf if lower is None else lower, math.inf if upper is None else upper)
     numbers = [jnp.asarray(float(x), jnp.result_type(float)) for x in (start, *ends, scale)]
-    prior = _checked_prior(name, item.prior) if item.prior is not None else None
     return [entry], Interval(*numbers, bounded=(lower is not None, upper is not None)), [start], [scale], [prior]
+
+
+def _checked_bounds(name: str, bounds: Any, positive: bool) -> tuple[float | None, float | None]:
+    """(lower, upper), None where there is none; infinite ones are none."""
+    if bounds is None:
+        return (0.0, None) if positive else (None, None)
+    lower, upper = (end if b is None else float(b) for b, end in zip(bounds, (-math.inf, math.inf), strict=True))
+    if not lower < upper:
+        raise ValueError(
+            f"{name}: nothing lies between the bounds {bounds}; they are (lower, upper), or None for none."
+        )
+    return (None if lower == -math.inf else lower), (None if upper == math.inf else upper)
 
 
 _PRODUCTS = ((0, 1), (0, 2), (1, 2))

@@ -111,7 +111,7 @@ class Fit:
         words = STATUS[self.status]
         if self.status == "converged" and not self.identifiability.ok:
             words = "the cost has converged, but not every parameter is determined"
-        notes = (*self.identifiability.messages, *suspicions.coarse_steps(self))
+        notes = (*self.identifiability.messages, *suspicions.no_freedom(self), *suspicions.coarse_steps(self))
         return "; ".join([words, *(note.rstrip(".") for note in notes)])
 
     @property

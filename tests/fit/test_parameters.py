@@ -1,0 +1,100 @@
+"""Free parameters: entries of vectors, what is tied, bounds, scales, priors; each contradiction is one clear error."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane.fit import Free, Gain
+from jaxkane.fit._bijections import Interval, log_gaussian_mass
+from jaxkane.fit._parameters import parameters_of
+
+
+class Springs(eqx.Module):
+    """Parameters alone."""
+
+    others: jk.Scalar = jk.parameter(positive=True)  # [N/m], three of them
+    matrix: jk.Scalar = jk.parameter()  # [N/m]
+    stiffness: jk.Scalar = jk.parameter(4.0, positive=True)  # [N/m]
+    offset: jk.Scalar = jk.parameter(0.0)  # [m]
+    inputs = ("push",)
+
+
+SYSTEM = Springs(others=jnp.array([1.0, 2.0, 3.0]), matrix=jnp.zeros((2, 2)))
+
+
+def test_all_entries_of_a_vector_follow():
+    free = Free("stiffness", tied={"others": 0.5, "matrix": -2.0})
+    parameters = parameters_of(SYSTEM, free)
+    system, _ = parameters.apply(SYSTEM, parameters.inverse(jnp.array([8.0])))
+    np.testing.assert_allclose(system.others, [4.0, 4.0, 4.0], rtol=1e-12)
+    np.testing.assert_allclose(system.matrix, np.full((2, 2), -16.0), rtol=1e-12)
+
+
+def test_entries_of_a_vector_are_parameters_of_their_own():
+    parameters = parameters_of(SYSTEM, (Free("others", prior=(2.0, 0.5)), "stiffness"))
+    assert parameters.names == ("others[0]", "others[1]", "others[2]", "stiffness")
+    system, _ = parameters.apply(SYSTEM, parameters.inverse(jnp.array([3.0, 2.0, 1.0, 7.0])))
+    np.testing.assert_allclose(system.others, [3.0, 2.0, 1.0], rtol=1e-12)
+    np.testing.assert_allclose(parameters.prior_residuals(jnp.zeros(4)), [-2.0, 0.0, 2.0, 0.0], atol=1e-12)
+    one = parameters.with_priors({"others[1]": (1.0, 0.1)})
+    assert float(one.prior_residuals(jnp.zeros(4))[1]) == pytest.approx(10.0)
+
+
+@pytest.mark.parametrize(
+    ("free", "message"),
+    [
+        (("stiffness", Free("offset", tied={"stiffness": 1.0})), "names offset, stiffness twice, or ties it too"),
+        (Free("stiffness", tied={"stiffness": 2.0}), "names stiffness twice, or ties it too"),
+        ((Free("offset", tied={"others": 1.0}), "others"), "twice, or ties it too"),
+        ((Free("stiffness", name="k"), Free("offset", name="k")), "names k twice"),
+        ((Gain("push"), Gain("push", name="another")), "names another, gain of push twice"),
+        (Free("others", tied={"stiffness": 1.0}), "has several entries; only a number can have others tied"),
+        (Free("offset", tied={"others": -1.0}), "factor of others must be positive, as the parameter is declared"),
+        (Free("offset", tied={"matrix": float("nan")}), "factor of matrix must be a finite number"),
+        (Free("offset", tied={"missing": 1.0}), "has no parameter 'missing'"),
+        (Free("stiffness", bounds=(5.0, 3.0)), r"stiffness: nothing lies between the bounds \(5.0, 3.0\)"),
+        (Free("stiffness", bounds=(float("nan"), 3.0)), "stiffness: nothing lies between the bounds"),
+        (Free("stiffness", bounds=(4.0, 6.0)), r"stiffness starts at 4, which is not inside its bounds"),
+        (Free("stiffness", start=-1.0), "stiffness starts at -1, which is not inside its bounds"),
+        (Free("stiffness", scale=float("inf")), "the scale must be positive and finite"),
+        (Free("stiffness", scale=0.0), "the scale must be positive and finite"),
+        (Free("stiffness", prior=(4.0, -1.0)), "a prior is"),
+        (Free("stiffness", prior=(float("nan"), 1.0)), "a prior is"),
+        (Free("stiffness", prior=4.0), "a prior is"),
+    ],
+)
+def test_what_contradicts_itself_is_refused(free, message):
+    with pytest.raises(ValueError, match=message):
+        parameters_of(SYSTEM, free)
+
+
+def test_infinite_bounds_are_none():
+    for bounds, bounded in (((0.0, np.inf), (True, False)), ((-np.inf, np.inf), (False, False))):
+        parameters = parameters_of(SYSTEM, Free("stiffness", bounds=bounds))
+        assert parameters.bijections[0].bounded == bounded
+        assert float(parameters.values(jnp.array([0.5]))[0]) > 4.0
+
+
+def test_what_a_lot_is():
+    scale = lambda *free: parameters_of(SYSTEM, free).scale.tolist()  # noqa: E731
+    assert scale("stiffness", "offset") == [4.0, 1.0]
+    assert scale(Free("offset", prior=(0.0, 0.01))) == [0.01]
+    assert scale(Free("offset", prior=(0.0, 0.01), scale=0.5)) == [0.5]
+
+
+def test_priors_integrate_to_one():
+    # exp(constant - residual^2 / 2) over what lies between the bounds, by the trapezoidal rule.
+    for bounds, mean, deviation in (((None, None), 1.0, 0.3), ((0.0, None), -0.4, 0.5), ((-1.0, 2.0), 8.0, 2.0)):
+        lower, upper = (x if x is not None else end for x, end in zip(bounds, (-6.0, 6.0), strict=True))
+        start = jnp.asarray(0.5 * (lower + min(upper, 1.0)))
+        ends = [jnp.asarray(end if x is None else x) for x, end in zip(bounds, (-np.inf, np.inf), strict=True)]
+        interval = Interval(start, *ends, jnp.ones(()), bounded=tuple(x is not None for x in bounds))
+        constant = interval.log_prior_constants(np.array([mean]), np.array([deviation]))[0]
+        values = np.linspace(lower, upper, 20001)
+        density = np.exp(constant - 0.5 * ((values - mean) / deviation) ** 2)
+        assert np.trapezoid(density, values) == pytest.approx(1.0, abs=1e-6)
+    # Far from the mean neither side cancels.
+    assert log_gaussian_mass(30.0, 31.0) == pytest.approx(log_gaussian_mass(-31.0, -30.0), rel=1e-12)
+    assert np.isfinite(log_gaussian_mass(30.0, np.inf))
