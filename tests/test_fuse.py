@@ -3,6 +3,7 @@
 import subprocess
 import sys
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 
 from jaxkane import _fuse
 from jaxkane._fuse import fused, without_repetition
+from jaxkane._linear import determinant, solve
 
 
 def plain(a, b, x):
@@ -126,3 +128,117 @@ print("alive")
 def test_the_process_stays_alive():
     run = subprocess.run([sys.executable, "-c", CRASHES], capture_output=True, text=True, timeout=300, check=False)
     assert run.stdout.strip() == "alive", run.stderr[-2000:]
+
+
+def test_a_batch_without_jit_is_compiled_once(monkeypatch):
+    f = fused(lambda x, a: jnp.sin(a * x))
+    lowered, lower = [], _fuse._Program.target
+    monkeypatch.setattr(_fuse._Program, "target", lambda self, *batch: lowered.append(batch) or lower(self, *batch))
+    x = jnp.linspace(0.0, 1.0, 5)
+    for a in (1.0, 2.0, 3.0):
+        np.testing.assert_allclose(jax.vmap(f, (0, None))(x, a), np.sin(a * x), rtol=1e-14)
+    assert len(lowered) == 1
+    jax.vmap(f, (0, None))(x[:4], 1.0)
+    jax.vmap(f)(x, x)
+    assert len(lowered) == 3  # another size, and another argument that varies
+
+
+def test_a_value_of_the_trace_under_way_is_not_kept():
+    box = {}
+    f = fused(lambda x: box["k"] * jnp.sin(x))
+
+    def g(k, x):
+        box["k"] = k
+        return f(x)
+
+    x = jnp.array(0.4)
+    for k in (2.0, 3.0):
+        np.testing.assert_allclose(jax.jit(g)(jnp.array(k), x), k * np.sin(0.4), rtol=1e-14)
+        np.testing.assert_allclose(jax.grad(g)(jnp.array(k), x), np.sin(0.4), rtol=1e-14)
+        np.testing.assert_allclose(jax.jvp(g, (k, x), (0.0, 1.0))[1], k * np.cos(0.4), rtol=1e-14)
+        np.testing.assert_allclose(jax.vmap(g)(jnp.full(2, k), jnp.full(2, 0.4)), k * np.sin(0.4), rtol=1e-14)
+
+
+FIRST_CALLS = {
+    "jit": lambda f: jax.jit(f),
+    "grad": lambda f: lambda x: jax.value_and_grad(f)(x)[0],
+    "jvp": lambda f: lambda x: jax.jvp(f, (x,), (1.0,))[0],
+    "vmap": lambda f: lambda x: jax.vmap(f)(jnp.stack([x, x]))[1],
+    "jit of grad of vmap": lambda f: jax.jit(lambda x: jax.grad(lambda y: jax.vmap(f)(y).sum())(jnp.stack([x, x]))[0]),
+}
+
+
+@pytest.mark.parametrize("name", FIRST_CALLS)
+def test_a_first_call_inside_a_trace_leaves_nothing_behind(name):
+    f = fused(lambda x: jnp.sin(x) * jnp.cos(0.5 * x))
+    x = jnp.array(0.4)
+    with jax.checking_leaks():
+        FIRST_CALLS[name](f)(x)
+    np.testing.assert_allclose(f(x), np.sin(0.4) * np.cos(0.2), rtol=1e-14)
+    np.testing.assert_allclose(f(0.4), np.sin(0.4) * np.cos(0.2), rtol=1e-14)  # and of a weak type
+
+
+def test_the_precision_may_be_switched_between_calls():
+    f = fused(lambda x: (2.0 * x, jnp.full(2, 0.5)))
+    x = jnp.float32(0.4)
+    assert [y.dtype for y in f(x)] == [jnp.float32, jnp.float64]
+    with jax.enable_x64(False):
+        assert [y.dtype for y in f(x)] == [jnp.float32, jnp.float32]
+    assert [y.dtype for y in f(x)] == [jnp.float32, jnp.float64]
+
+
+def test_numbers_that_print_alike_are_not_the_same():
+    """Common ones are found by their bits: arrays print eight digits, -0.0 equals 0.0, and no NaN is itself."""
+    near = [np.array(0.1234567891234), np.array(0.1234567895678)]
+    f = lambda x: [x * near[0], x * near[1], jnp.arctan2(x * 0.0, -1.0), jnp.arctan2(x * -0.0, -1.0), x + jnp.nan]  # noqa: E731
+    once = without_repetition(jax.make_jaxpr(lambda x: [*f(x), *f(x)])(1.0))
+    assert [e.primitive.name for e in once.jaxpr.eqns].count("mul") == 4
+    assert [e.primitive.name for e in once.jaxpr.eqns].count("add") == 1
+    np.testing.assert_array_equal(jnp.stack(fused(f)(3.0)), [3 * near[0], 3 * near[1], np.pi, -np.pi, np.nan])
+
+
+class Ball(eqx.Module):
+    """A description's stand-in: its name is told."""
+
+    a: jax.Array
+
+
+SLOW = {
+    "cond": lambda b, x: jax.lax.cond(x > 0.0, lambda: b.a * x, lambda: x),
+    "while": lambda b, x: jax.lax.while_loop(lambda c: c < b.a, lambda c: c + x * x + 1.0, x),
+    "dot_general": lambda b, x: jnp.stack([x, b.a]) @ jnp.stack([b.a, x]),
+    "gather": lambda b, x: jnp.take(jnp.array([1.0, 2.0, 3.0]) * b.a, (x > 0.0).astype(int)),
+    "lu": lambda b, x: jnp.linalg.solve(jnp.full((2, 2), x).at[0, 0].add(b.a), jnp.ones(2))[0],
+}
+
+
+@pytest.mark.parametrize("name", SLOW)
+def test_what_cannot_be_one_function_is_told_once_by_name(name, monkeypatch):
+    monkeypatch.setattr(_fuse, "_told", set())
+    f = fused(SLOW[name])
+    ball, x = Ball(jnp.array(1.5)), jnp.array(0.4)
+    with pytest.warns(UserWarning, match=rf"Ball: its description uses .*`{name}`.* cannot be part of one") as told:
+        found = f(ball, x), jax.jit(f)(ball, x), jax.grad(lambda x: f(ball, x) if name != "while" else x)(x)
+    assert len(told) == 1
+    np.testing.assert_allclose(found[:2], np.full(2, SLOW[name](ball, x)), rtol=1e-14)
+
+
+@pytest.mark.filterwarnings("error")
+def test_lapack_of_the_method_itself_is_not_told():
+    def solved(x):
+        rows = [[1.0 + x if i == j else 0.1 * x for j in range(4)] for i in range(4)]
+        return solve(rows, [x, 1.0, 2.0, 3.0])[0][0] + determinant(rows)
+
+    f = lambda x: jax.jvp(solved, (x,), (jnp.ones(()),))[1]  # noqa: E731
+    np.testing.assert_allclose(fused(f)(jnp.array(0.4)), f(jnp.array(0.4)), rtol=1e-14)
+    np.testing.assert_allclose(jax.grad(fused(f))(jnp.array(0.4)), jax.grad(f)(jnp.array(0.4)), rtol=1e-14)
+
+
+@pytest.mark.usefixtures("native")
+def test_what_kernels_cannot_do_is_told_once_by_name(monkeypatch):
+    monkeypatch.setattr(_fuse, "_told", set())
+    f = fused(lambda ball, x: ball.a * jnp.round(x))
+    with pytest.warns(UserWarning, match="Ball: its description uses round of float64, which native") as told:
+        found = [f(Ball(jnp.array(1.5)), x) for x in (0.4, 1.7, jnp.array(2.5))]
+    np.testing.assert_allclose(found, [0.0, 3.0, 3.0])
+    assert len(told) == 1

@@ -121,10 +121,13 @@ def simulate(
     )
     try:
         ride = solve(system, state, ts, signals, settings)
-    except TypeError as error:
-        if adjoint != "auto" or "forward-mode autodiff" not in str(error):
+    except TypeError as error:  # as JAX says, too, that a derivative forward through the reverse adjoint is asked for
+        if adjoint != "auto":
             raise
-        ride = solve(system, state, ts, signals, dataclasses.replace(settings, adjoint=ADJOINTS["forward"]()))
+        try:
+            ride = solve(system, state, ts, signals, dataclasses.replace(settings, adjoint=ADJOINTS["forward"]()))
+        except TypeError:
+            raise error from None
     if is_concrete(ride.status) and ride.status == Status.NO_SOLUTION:
         inputs_now = _inputs(system, signals, ts[0], state.q, state.u)
         raise ValueError(

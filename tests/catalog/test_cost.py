@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import pytest
 
 from jaxkane._fuse import _Program
+from jaxkane._native import Scalars
 from jaxkane._rates import _state_rates
 from jaxkane.catalog import CATALOG
 
@@ -48,5 +49,11 @@ def test_the_programs_do_not_grow(name):
     plain = _state_rates.__wrapped__
     program = _Program(jax.make_jaxpr(lambda *x: plain(*jax.tree.unflatten(treedef, x)))(*leaves))
     size = lambda program: len(program.program.jaxpr.eqns)  # noqa: E731
+    tangent = program.tangent((True,) * len(leaves))
     assert size(program) <= MOST[name]
-    assert size(program.tangent((True,) * len(leaves))) <= 4 * MOST[name]  # in all directions that there are
+    assert size(tangent) <= 4 * MOST[name]  # in all directions that there are
+    # One operation that cannot be written as scalars would cost a factor of ten to three thousand.
+    cotangent = tangent.transposed((False,) * len(leaves) + (True,) * len(leaves))
+    for one in (program, tangent, cotangent):
+        assert one.is_plain
+        assert Scalars(one.program).graph.nodes  # raises, with the operation, where one is unknown
