@@ -19,6 +19,7 @@ def run(name, end=10.0, times=1001, inputs=None, **options):
     return system, jk.simulate(system, state, jnp.linspace(0.0, end, times), inputs, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [name for name in CATALOG if name != "BarWithPiston"])
 def test_energy_balance_of_ten_seconds(name):
     # Conservative or not: the audit counts the work of dampers, and of the motors of Example 5's engines.
@@ -59,6 +60,7 @@ def test_a_coarse_run_is_found_out():
     assert "bad" in str(audit)
 
 
+@pytest.mark.slow
 def test_conditioning_of_the_bicycle():
     system, ride = run("WhippleBicycle", 1.0, 11)
     audit = jk.audit(system, ride)

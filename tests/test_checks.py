@@ -254,6 +254,7 @@ def test_assemble_says_when_it_cannot():
     np.testing.assert_array_equal(given.u, [0.0, -10.0, 0.0])
 
 
+@pytest.mark.slow
 def test_assemble_is_differentiable_twice_and_maps():
     bike = WhippleBicycle.benchmark()
     pitch = lambda x: jk.assemble(bike, jnp.zeros(8).at[jnp.array([0, 2])].set(x)).q[4]  # noqa: E731

@@ -19,6 +19,7 @@ def crank_rocker():
     return system, jk.assemble(system, {"q1": 0.5, "q2": 1.0, "q3": 2.0}, {"u1": 4.0})
 
 
+@pytest.mark.slow
 def test_a_minute_of_a_four_bar_linkage():
     system, state = crank_rocker()
     ts = jnp.linspace(0.0, 60.0, 601)
@@ -41,6 +42,7 @@ def test_stabilized_and_projected_coordinates_do_not_drift():
     assert projected.drift < 1e-14
 
 
+@pytest.mark.slow
 def test_a_projected_motion_has_gradients_also_where_it_ends_early():
     top = jk.catalog.SpinningTop()
     entry = jk.catalog.CATALOG["SpinningTop"]

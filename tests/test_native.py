@@ -176,6 +176,7 @@ def close(a, b):
     np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("native")
 def test_the_bicycle_and_its_derivatives_as_by_xla(bicycle):
     def many(system, t, q, u, inputs):

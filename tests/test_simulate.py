@@ -118,6 +118,7 @@ def loss(system, state, torque, adjoint):
     return jnp.sum(ride["theta1"] ** 2 + ride["theta2_dot"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("torque", "forward", "reverse"),
     [(jnp.array(0.7), "auto", "both"), (jnp.sin(jnp.linspace(0.0, 3.0, 11)), "forward", "auto")],
@@ -155,6 +156,7 @@ def test_the_trajectory_says_how_it_is_differentiated():
     assert said == ["ForwardMode", "RecursiveCheckpointAdjoint"]
 
 
+@pytest.mark.slow
 def test_second_derivatives_forward_over_forward():
     f = lambda m: loss(DoublePendulum(mass=m, length=1.0), START, 0.7, "forward")  # noqa: E731
     slope = jax.jit(jax.jacfwd(f))
@@ -162,6 +164,7 @@ def test_second_derivatives_forward_over_forward():
     np.testing.assert_allclose(second, (slope(1.0 + 1e-4) - slope(1.0 - 1e-4)) / 2e-4, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_gradients_of_the_bicycle():
     """Reverse and forward through a ride, a parameter and the initial roll rate, against differences."""
     import dataclasses

@@ -119,6 +119,7 @@ def test_a_batch_is_what_its_members_are(n):
     np.testing.assert_allclose(eigvals(A[0, 0]), single[0])
 
 
+@pytest.mark.slow
 def test_a_batch_of_bicycles_against_the_literature(kernels):
     """Meijaard et al. (2007), Table 2, among three hundred others; and beside the double root, as LAPACK's."""
     atol = 1e-11
@@ -168,6 +169,7 @@ print("done")
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("way", ["native", "LAPACK"])
 def test_programs_in_several_threads_do_not_wait_for_each_other(way):
     """jaxlib's batched LAPACK waits in XLA's threads for XLA's threads: each of these programs once hung for ever."""

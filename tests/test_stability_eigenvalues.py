@@ -91,6 +91,7 @@ def test_crossing_modes_keep_their_columns():
     np.testing.assert_array_equal(tracked, lam[:, columns])
 
 
+@pytest.mark.slow
 def test_derivatives_of_eigenvalues_with_respect_to_all_parameters():
     rtol = 1e-7
 
@@ -139,6 +140,7 @@ def test_weave_and_capsize_speeds():
     assert repr(found).startswith("CriticalSpeeds(weave stable from 4.292382536 (3.435 rad/s), capsize unstable")
 
 
+@pytest.mark.slow
 def test_derivatives_of_critical_speeds_with_respect_to_all_parameters():
     rtol = 1e-7
 

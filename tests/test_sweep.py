@@ -29,6 +29,7 @@ def test_members_move_as_if_alone():
         assert int(rides.stats["steps"][i]) == int(alone.stats["steps"])
 
 
+@pytest.mark.slow
 def test_parameters_states_and_inputs_together_and_in_chunks():
     n = 70
     pendulums = DoublePendulum(mass=np.linspace(1.0, 2.0, n), length=1.0)

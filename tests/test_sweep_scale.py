@@ -90,6 +90,7 @@ def test_a_folder_holds_every_chunk_and_changes_nothing(rides, folder):
     same(rides, run())
 
 
+@pytest.mark.slow
 def test_a_sweep_that_was_killed_goes_on(rides, folder, script, tmp_path):
     process = subprocess.Popen([sys.executable, script, tmp_path / "sweep", tmp_path / "q.npy"])
     wait_for_chunks(tmp_path / "sweep", 3, process)
@@ -197,12 +198,15 @@ def test_functions_and_descriptions_are_told_apart_by_what_they_compute():
     assert len(seen.pop()) > 16
 
 
+@pytest.mark.slow
 def test_two_devices_give_the_same(rides, script, tmp_path):
-    two = {**os.environ, "XLA_FLAGS": "--xla_force_host_platform_device_count=2"}
+    flags = os.environ.get("XLA_FLAGS", "")  # the same code, to the last bit
+    two = {**os.environ, "XLA_FLAGS": f"{flags} --xla_force_host_platform_device_count=2"}
     subprocess.run([sys.executable, script, tmp_path / "sweep", tmp_path / "q.npy"], env=two, check=True, timeout=120)
     np.testing.assert_array_equal(np.load(tmp_path / "q.npy"), rides.q)
 
 
+@pytest.mark.slow
 def test_two_devices_find_dependent_coordinates():
     code = """
 import jaxkane as jk, numpy as np, jax

@@ -84,6 +84,7 @@ def test_a_table_with_labels_and_a_function_of_its_own():
     np.testing.assert_array_equal(jk.sweep.sweep(PENDULUM, start, TS, table=pandas.DataFrame(table)).q, swept.q)
 
 
+@pytest.mark.slow
 def test_coordinates_that_follow_are_found_anew():
     bicycle = WhippleBicycle.benchmark()
     upright = jk.State(np.zeros(8), np.array([0.0, -15.0, 0.0]))
@@ -95,6 +96,7 @@ def test_coordinates_that_follow_are_found_anew():
         jk.sweep.sweep(bicycle, upright, [0.0, 0.01], table={"pitch": [0.0, 0.1]})
 
 
+@pytest.mark.slow
 def test_sweeps_have_derivatives():
     rtol = 1e-6
 

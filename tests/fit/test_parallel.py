@@ -95,6 +95,7 @@ def script(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_two_processes_fit_as_one(script):
     rtol = 1e-10
     (alone,) = run(script, 0, 1)

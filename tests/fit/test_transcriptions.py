@@ -62,6 +62,7 @@ def test_a_chain_is_the_dense_solution():
     np.testing.assert_allclose(eliminated.log_determinant, determinant, rtol=tolerance)
 
 
+@pytest.mark.slow
 def test_short_chained_windows_are_a_kalman_filter():
     tolerance = 1e-6
     t = np.arange(0.0, 2.0, 0.05)
@@ -119,6 +120,7 @@ def result(problem):
     return least_squares(problem)
 
 
+@pytest.mark.slow
 def test_delays_gains_rates_and_gaps(result):
     assert result.ok, result.message
     near(result)
@@ -168,6 +170,7 @@ def test_an_interrupted_fit_goes_on_from_its_file(problem, method, tmp_path):
         method(problem.only([0]), checkpoint=path)
 
 
+@pytest.mark.slow
 def test_a_start_from_which_the_end_is_out_of_reach():
     # With a stiffness sixteen times too large a single shoot ends in another minimum; growing horizons do not.
     t = np.arange(0.0, 8.0, 0.05)
@@ -179,6 +182,7 @@ def test_a_start_from_which_the_end_is_out_of_reach():
     assert least_squares(problem).cost > 10 * grown.cost
 
 
+@pytest.mark.slow
 def test_process_noise_is_taken_for_what_it_is():
     # A hidden force shakes the cart: what it does in a window is what the motion may jump by at its end.
     t = np.arange(0.0, 8.0, 0.05)
