@@ -30,6 +30,7 @@ FLOORS = [
     ["_diagnose"],
     ["_equations", "_assembly", "_signals"],
     ["_simulate"],
+    ["_along"],
     ["_reactions"],
     ["sweep", "_audit", "_configure"],
     ["plot"],

@@ -7,6 +7,10 @@ from . import plot as plot
 from . import rotations as rotations
 from . import stability as stability
 from . import sweep as sweep
+from ._along import orientations as orientations
+from ._along import positions as positions
+from ._along import speed_rates as speed_rates
+from ._along import velocities as velocities
 from ._animate import Animation as Animation
 from ._animate import Sketch as Sketch
 from ._animate import animate as animate

@@ -11,6 +11,7 @@ import numpy as np
 
 from ._check import configuration_residual
 from ._components import ZERO3, add3, cross, dot, matvec
+from ._drift import relative_condition
 from ._fuse import fused
 from ._linear import as_vector, stack
 from ._rates import accelerations_and_mass_matrix
@@ -42,7 +43,7 @@ class Audit(eqx.Module):
     - `configuration_residuals` (n_t, h), `velocity_residuals` (n_t, k): of all constraints, in their own units. Norms
         of Euler parameters are among the first.
     - `condition_M`, `condition_C_dep` (n_t,): condition numbers of the mass matrix, and of what the dependent speeds
-        are solved from (1 without dependent speeds).
+        are solved from, as `best_dependent_speeds` has them (1 without dependent speeds).
     - `reason`: how the simulation ended.
     """
 
@@ -188,7 +189,9 @@ def audit(system: System, trajectory: Trajectory) -> Audit:
         configuration_residuals=now["h"],
         velocity_residuals=now["c"],
         condition_M=np.linalg.cond(now["M"]),
-        condition_C_dep=np.linalg.cond(now["C_dep"]) if now["c"].size else np.ones_like(ts),
+        condition_C_dep=relative_condition(now["C"], range(len(system.speeds), now["C"].shape[-1]))
+        if now["c"].size
+        else np.ones_like(ts),
         name=name,
         reason=trajectory.reason,
     )
@@ -222,7 +225,7 @@ def _measured(system, t, q, u, inputs, u_dot):
         "H": as_vector(H, q),
         "h": configuration_residual(system, t, q),
         "c": as_vector(now.residuals(now.t, now.q, now.u_all), q),
-        "C_dep": stack(now.C_dep).astype(q.dtype),
+        "C": stack([(*a, *b) for a, b in zip(now.C_ind, now.C_dep, strict=True)]).astype(q.dtype),
     }
 
 

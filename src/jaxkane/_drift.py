@@ -159,14 +159,18 @@ def relative_condition(C: np.ndarray, dependent: Sequence[int]) -> Any:
 
     At least the condition number of C_dep. C_dep alone would not tell that all of its entries are small beside those of
     the other speeds, so that these are multiplied by a large number: one residual has always the condition number 1.
-    Infinite where the residuals cannot be solved.
+    Infinite where the residuals cannot be solved, NaN where C is not finite.
     """
+    finite: Any = np.isfinite(C).all(axis=(-2, -1))
+    C = np.where(finite[..., None, None], C, 1.0)
     size = np.abs(C).max(axis=-1, keepdims=True)
     C = C / np.where(size > 0, size, 1.0)
     largest = np.linalg.svd(C, compute_uv=False)[..., 0]
     smallest = np.linalg.svd(C[..., list(dependent)], compute_uv=False)[..., -1]
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(smallest > 1e-14 * largest, largest / smallest, np.inf)[()]
+        condition = np.where(smallest > 1e-14 * largest, largest / smallest, np.inf)
+    condition = np.where(finite, condition, np.nan)
+    return condition if condition.ndim else float(condition)
 
 
 def _size(x: np.ndarray) -> float:

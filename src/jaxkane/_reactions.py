@@ -14,19 +14,18 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from ._along import along
 from ._components import add, dot, mul, sub
-from ._equations import InputValues, _arrays
+from ._equations import InputValues
 from ._fuse import fused
 from ._kane import Instant, Row, as_row, unit
 from ._linear import as_vector, solve
 from ._rates import state_rates
 from ._reads import compiled
 from ._system import Motion, System, flatten_loads
-from ._trajectory import Trajectory
 from ._types import Component, Triple
 from ._vectors import Frame, Point, virtual
 
@@ -54,7 +53,7 @@ def constraint_forces(
 
     **Raises:** `ValueError` as `accelerations`; `TypeError` for a trajectory together with `q`, `u` or `inputs`.
     """
-    return _along(_compiled_forces, system, t, q, u, inputs)
+    return along(_compiled_forces, system, t, q, u, inputs)
 
 
 def constraint_multipliers(
@@ -68,17 +67,7 @@ def constraint_multipliers(
     these were added. A residual that was given as a Vector counts as three, along the axes of the frame it is kept in.
     Arguments as `constraint_forces`.
     """
-    return _along(_compiled_multipliers, system, t, q, u, inputs)
-
-
-def _along(forces: Any, system: System, t: Any, q: Any, u: Any, inputs: InputValues) -> Any:
-    if not isinstance(t, Trajectory):
-        return forces(*_arrays(system, t, q, u, inputs))
-    if not (q is None and u is None and inputs is None):
-        raise TypeError("A Trajectory holds coordinates, speeds and inputs already: constraint_forces(system, ride).")
-    for _ in range(t.t.ndim - 1):
-        forces = jax.vmap(forces, in_axes=(None, 0, 0, 0, 0))
-    return jax.vmap(forces, in_axes=(None, 0, 0, 0, 0))(system, t.t, t.q, t.u, t.inputs)
+    return along(_compiled_multipliers, system, t, q, u, inputs)
 
 
 @compiled

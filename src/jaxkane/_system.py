@@ -360,8 +360,8 @@ class System(eqx.Module):
     inputs: ClassVar[tuple[str, ...]] = ()
     """Names of the inputs that `loads` reads."""
     units: ClassVar[Mapping[str, str]] = {}
-    """Units of coordinates, speeds and inputs by name, for pictures: `{"q0": "rad", "push": "N"}`. Those of usual names,
-    as "roll", "x" or "steer_torque", are known without."""
+    """Units of coordinates, speeds and inputs by name, for pictures: `{"q0": "rad", "push": "N"}`. Those of usual
+    names, as "roll", "x" or "steer_torque", are known without."""
 
     def __check_init__(self) -> None:
         _check_fields(self)

@@ -1,0 +1,112 @@
+"""Places, velocities, orientations and rates of speeds by name, along trajectories, batches and early ends."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane.catalog import DoublePendulum
+
+TS = jnp.linspace(0.0, 2.0, 5)
+
+
+class Disc(jk.System):
+    """A disc that rolls along N.x; it ends where it has rolled 0.6 m."""
+
+    radius: jk.Scalar = jk.parameter(0.5)
+    push: jk.Scalar = jk.parameter(0.3)  # [N m]
+    coordinates, speeds, dependent_speeds = ("x", "spin"), ("spin_rate",), ("x_dot",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        B = N.rotate(2, q["spin"], u["spin_rate"], "B")
+        G = O.moving(q["x"] * N.x, u["x_dot"] * N.x)
+        rim = G.fixed(self.radius * B.x)
+        return jk.Motion(
+            [jk.Body(1.0, (0.1, 0.2, 0.1), G, B, name="disc")],
+            [u["x_dot"] - self.radius * u["spin_rate"]],
+            points={"rim": rim, "contact": jk.Point.at(0.0 * N.x)},
+            frames={"B": B},
+        )
+
+    def q_dot(self, t, q, u):
+        return u["x_dot"], u["spin_rate"]
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Torque(self.push * motion.N.y, motion["disc"])
+
+    def events(self, t, q, u):
+        return {"far": 0.6 - q["x"]}
+
+
+START = jk.State({"spin": 0.2}, {"spin_rate": 1.5})
+
+
+@pytest.fixture(scope="module")
+def ride():
+    return jk.simulate(Disc(), START, TS, step=0.1)
+
+
+def test_by_name_along_a_trajectory(ride):
+    n, r = int(np.isfinite(ride["x"]).sum()), 0.5
+    assert 1 < n < 5  # it ended early
+    x, spin, rate = (np.asarray(ride[name]) for name in ("x", "spin", "spin_rate"))
+    zero = np.where(np.isfinite(x), 0.0, np.nan)
+    where, how_fast, turned = (f(Disc(), ride) for f in (jk.positions, jk.velocities, jk.orientations))
+    assert set(where) == {"disc", "rim"}  # a contact has no place
+    np.testing.assert_allclose(where["disc"], np.stack([x, zero, zero], 1), atol=1e-14)
+    np.testing.assert_allclose(where["rim"], np.stack([x + r * np.cos(spin), zero, -r * np.sin(spin)], 1), atol=1e-14)
+    rim = np.stack([rate * (r - r * np.sin(spin)), zero, -r * rate * np.cos(spin)], 1)
+    np.testing.assert_allclose(how_fast["rim"], rim, atol=1e-14)
+    np.testing.assert_allclose(how_fast["contact"][:n], 0.0, atol=0)
+    rows = [[np.cos(spin), zero, -np.sin(spin)], [zero, 1 + zero, zero], [np.sin(spin), zero, np.cos(spin)]]
+    np.testing.assert_allclose(turned["B"], np.moveaxis(np.array(rows), 2, 0), atol=1e-14)
+    np.testing.assert_array_equal(turned["disc"], turned["B"])
+    rates = jk.speed_rates(Disc(), ride)  # (I + m r^2) w_dot = T
+    np.testing.assert_allclose(rates["spin_rate"], 0.3 / 0.45 + zero, rtol=1e-14)
+    np.testing.assert_allclose(rates["x_dot"], 0.15 / 0.45 + zero, rtol=1e-14)
+
+
+def test_at_one_time_and_in_a_batch(ride):
+    where = jk.positions(Disc(), 0.0, {"x": 1.0}, {})["rim"]
+    np.testing.assert_allclose(where, [1.5, 0.0, 0.0], atol=1e-15)
+    two = jax.tree.map(lambda x: jnp.stack([x, x]), ride)
+    for f in (jk.positions, jk.speed_rates):
+        one, both = f(Disc(), ride), f(Disc(), two)
+        for name, x in one.items():
+            np.testing.assert_array_equal(both[name], np.stack([x, x]))
+    with pytest.raises(TypeError, match="holds coordinates, speeds and inputs already"):
+        jk.positions(Disc(), ride, [0.0, 0.0], [1.0])
+
+
+def test_derivatives_along_a_trajectory_that_ended():
+    def last(push):  # the rim where it was last
+        system = dataclasses.replace(Disc(), push=push)
+        ride = jk.simulate(system, START, TS, adjoint="both", step=0.1)
+        return jk.positions(system, ride)["rim"][1, 0]
+
+    def exact(push):
+        spin = 0.2 + 1.5 * 0.5 + 0.5 * push / 0.45 * 0.5**2
+        return 0.5 * (spin - 0.2) + 0.5 * np.cos(spin)
+
+    numeric = (exact(0.3 + 1e-6) - exact(0.3 - 1e-6)) / 2e-6
+    for derivative in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(jax.jit(derivative(last))(0.3), numeric, rtol=1e-7)
+
+
+def test_forces_of_constraint_along_a_trajectory_that_ended():
+    """The reverse derivative of what was reached sees nothing of what was not."""
+    system = DoublePendulum()
+    ride = jk.simulate(system, jk.State([0.3, 0.2], [0.0, 0.0]), TS)
+    cut = dataclasses.replace(ride, q=ride.q.at[3:].set(jnp.nan), u=ride.u.at[3:].set(jnp.nan))
+
+    def first(mass, ride):
+        forces = jk.constraint_forces(dataclasses.replace(system, mass=mass), ride)
+        return sum(jnp.sum(x[0]) for x in forces.values())
+
+    slope = jax.jit(jax.grad(first))
+    np.testing.assert_allclose(slope(1.0, cut), slope(1.0, ride), rtol=1e-13)
+    assert np.isfinite(slope(1.0, cut))
