@@ -110,3 +110,29 @@ def test_forces_of_constraint_along_a_trajectory_that_ended():
     slope = jax.jit(jax.grad(first))
     np.testing.assert_allclose(slope(1.0, cut), slope(1.0, ride), rtol=1e-13)
     assert np.isfinite(slope(1.0, cut))
+
+
+class Coupled(jk.System):
+    """Two carts on one line, coupled where their ends meet; `twice` is another point at that place."""
+
+    coordinates, speeds, dependent_speeds = ("x", "y"), ("x_dot",), ("y_dot",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        one = O.moving(q["x"] * N.x, u["x_dot"] * N.x)
+        two = O.moving(q["y"] * N.x, u["y_dot"] * N.x)
+        A, B, twice = one.fixed(0.5 * N.x), two.fixed(-0.5 * N.x), two.fixed(-0.5 * N.x)
+        bodies = [jk.Body(1.0, 0.0, one, name="one"), jk.Body(2.0, 0.0, two, name="two")]
+        return jk.Motion(bodies, [(A.velocity - B.velocity).dot(N.x)], points={"A": A, "B": B, "twice": twice})
+
+    def q_dot(self, t, q, u):
+        return u["x_dot"], u["y_dot"]
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force(6.0 * motion.N.x, motion["one"])
+
+
+def test_where_the_force_of_a_residual_is_read():
+    forces = jk.constraint_forces(Coupled(), 0.0, {"y": 1.0}, {})  # 6 N move 3 kg: 2 kg of them by 4 N
+    for name, force in {"A": -4.0, "B": 4.0, "twice": 0.0}.items():
+        np.testing.assert_allclose(forces[name], [force, 0.0, 0.0], atol=1e-14)

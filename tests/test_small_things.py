@@ -1,5 +1,8 @@
 """What makes a description pleasant to write: defaults, fields, named values, inertia about any point."""
 
+import re
+from pathlib import Path
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -149,3 +152,21 @@ def test_degrees_go_by_the_units_that_were_declared():
     with pytest.raises(ValueError, match=r"Wrong\.units names what is no coordinate, speed or input: q9"):
         jk.simulate(type("Wrong", (Cart,), {"units": {"q9": "m"}})(), jk.State([0.0, 0.0], [0.0, 0.0]), [0.0, 1.0])
     plt.close("all")
+
+
+def test_a_sensor_sits_on_its_body_by_a_quaternion():
+    N, _ = jk.inertial()
+    B = N.rotate(1, 0.5, 2.0)
+    S = B.rotate_euler((0.0, 0.0, 0.6, 0.8))  # about z, by 2 atan(0.6 / 0.8): cosine 0.28, sine 0.96
+    np.testing.assert_allclose(S.matrix(B), [[0.28, 0.96, 0], [-0.96, 0.28, 0], [0, 0, 1]], atol=1e-15)
+    np.testing.assert_allclose(S.angular_velocity.to(N), [2.0, 0.0, 0.0], atol=1e-15)
+
+
+def test_the_pendulum_of_the_page_for_sympys_users_moves_as_sympys():
+    """Figures: SymPy 1.14, `kane.mass_matrix.LUsolve(kane.forcing)` of the page at x = 0.6, vx = 0.5, m = 2, l = 1."""
+    page = (Path(__file__).parents[1] / "docs" / "coming_from_sympy.md").read_text(encoding="utf-8")
+    block = next(b for b in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "class Bob" in b)
+    names = {}
+    exec(block, names)
+    np.testing.assert_allclose([names["rates"]["vx"], names["rates"]["vy"]], [-4.943175, -3.2191], rtol=1e-12)
+    np.testing.assert_allclose(names["f"] / names["M"][0], -4.943175, rtol=1e-12)

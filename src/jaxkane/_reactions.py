@@ -42,6 +42,9 @@ def constraint_forces(
         point belongs to what is built from it.
     - A point whose velocity is a residual, or from which no body is built (a contact, the end of a closed loop): the
         force [N] of the constraints on the mechanism there.
+        It is read at the Point from which the residual was formed, and at those this was built from: a second Point
+        made at the same place is another point, at which no residual pulls: zero. Where the ends A and B of two bars
+        meet, by the residual `A.velocity - B.velocity`, A tells the force on its bar, B the opposite on its own.
     - A frame: the moment [N m] on all that turns with it, about the points from which that is built; torques from
         `loads` are not in it. In the directions of the frame's speeds it is zero.
     - An auxiliary speed: the force [N] or moment [N m] along it on the mechanism, a number.

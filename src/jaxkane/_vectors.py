@@ -158,19 +158,23 @@ class Frame:
         return frame
 
     def rotate_euler(
-        self, parameters: Sequence[Component], angular_velocity: Sequence[Component] | Vector, name: str | None = None
+        self,
+        parameters: Sequence[Component],
+        angular_velocity: Sequence[Component] | Vector | None = None,
+        name: str | None = None,
     ) -> Frame:
         """A frame oriented in this one by Euler parameters.
 
         **Arguments:**
 
         - `parameters`: (e1, e2, e3, e4) of unit norm, e4 the scalar: scalar last, as in the textbook.
-        - `angular_velocity`: relative to this frame [rad/s]: three components in the new frame, or a Vector.
+        - `angular_velocity`: relative to this frame [rad/s]: three components in the new frame, or a Vector. None for a
+            fixed rotation, as of a sensor on its body.
         """
         if len(parameters) != 4:
             raise ValueError(f"Euler parameters are four numbers, the scalar last; got {len(parameters)}.")
         rotation = rotations.euler_parameters_matrix([component(e) for e in parameters])
-        return self._oriented(rotation, angular_velocity, name)
+        return self._oriented(rotation, ZERO3 if angular_velocity is None else angular_velocity, name)
 
     def rotate_by(
         self, orientation: Callable[..., Any], t: Component, q: Any, q_dot: Any, name: str | None = None
