@@ -18,7 +18,8 @@ SOURCE = Path(jk.__file__).parent
 # Each module may import from the lines above it, and within the same package.
 FLOORS = [
     ["_jax_internals"],
-    ["_lookup", "_types", "_components", "_linear", "_nan", "_native", "_reads", "_fuse", "_kinks"],
+    ["_lookup", "_digest", "_whole_file"],
+    ["_types", "_components", "_linear", "_nan", "_native", "_reads", "_fuse", "_kinks"],
     ["rotations", "_vectors"],
     ["_system", "_trajectory"],
     ["loads", "_units"],

@@ -418,7 +418,10 @@ def settling(f: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def compiled(f: Callable[..., Any]) -> Callable[..., Any]:
-    """`equinox.filter_jit(f)`, traced again where what the code of its arguments reads has changed."""
+    """`equinox.filter_jit(f)`, traced again where what the code of its arguments reads has changed.
+
+    How often it was traced, tests ask of its attribute `compiled`.
+    """
 
     def run(version: bytes, args: Any, kwargs: Any) -> Any:
         return settling(f)(*args, **kwargs)
@@ -430,6 +433,7 @@ def compiled(f: Callable[..., Any]) -> Callable[..., Any]:
     def call(*args: Any, **kwargs: Any) -> Any:
         return jitted(version_of(args, kwargs), args, kwargs)
 
+    vars(call)["compiled"] = jitted
     return call
 
 

@@ -1,17 +1,23 @@
-"""Finished chunks as files, under a manifest. Knows arrays and files; knows nothing of what they mean."""
+"""Finished chunks as files, under a manifest. Knows arrays and files; knows nothing of what they mean.
+
+Several processes may work on one folder: of two that begin at once only one writes the manifest, the other finds it and
+compares; and a chunk has the same bytes whoever writes it.
+"""
 
 from __future__ import annotations
 
 import json
 import os
-import warnings
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+
+from .._digest import differences
+from .._whole_file import SCRATCH, write_whole
 
 MANIFEST = "sweep.json"
 
@@ -19,58 +25,63 @@ MANIFEST = "sweep.json"
 class Folder:
     """The chunks of one sweep: `chunk-00000000.npz`, named by the first member of each.
 
-    A file appears whole or not at all: it is written under another name, brought to the disk, and renamed.
-
-    **Raises:** `ValueError` where the folder holds another sweep, or something else.
+    **Raises:** `ValueError` where the folder holds another sweep, a manifest that cannot be read, or something else.
     """
 
     def __init__(self, path: str | os.PathLike[str], manifest: Mapping[str, Any]):
         self.path = Path(path).expanduser()
+        self.damaged: list[str] = []
+        if self.path.exists() and not self.path.is_dir():
+            raise ValueError(f"{self.path} is a file: `folder` is the name of a folder.")
         self.path.mkdir(parents=True, exist_ok=True)
         described = self.path / MANIFEST
-        if described.exists():
-            _compare(self.path, json.loads(described.read_text()), manifest)
-        elif any(self.path.iterdir()):
-            raise ValueError(f"{self.path} is not empty, and holds no {MANIFEST}: a sweep wants a folder of its own.")
-        else:
-            self._write(described, lambda file: file.write(json.dumps(manifest, indent=1).encode()))
+        if not described.exists():
+            # What a writer that was killed left behind holds nothing.
+            if any(not file.name.endswith(SCRATCH) for file in self.path.iterdir() if file.name != MANIFEST):
+                raise ValueError(
+                    f"{self.path} is not empty, and holds no {MANIFEST}: a sweep wants a folder of its own."
+                )
+            text = json.dumps(manifest, indent=1).encode()
+            if write_whole(described, lambda file: file.write(text), replace=False):
+                return
+        _compare(self.path, _read(described), manifest)
 
     def file(self, start: int) -> Path:
         return self.path / f"chunk-{start:08d}.npz"
 
     def write(self, start: int, part: Any) -> None:
         """Keep the chunk that begins with a member."""
-        self._write(self.file(start), lambda file: np.savez(file, **_named(part)))
+        try:
+            write_whole(self.file(start), lambda file: np.savez(file, **_named(part)))
+        except FileNotFoundError:
+            # Another process was done with the whole sweep, this chunk too, and has tidied up.
+            if not self.file(start).exists():
+                raise
 
-    def read(self, start: int, like: Any) -> Any:
-        """The chunk that begins with a member, in the structure of `like`; None where there is none that is whole."""
-        if not self.file(start).exists():
+    def read(self, start: int, like: Any, size: int) -> Any:
+        """The chunk of `size` members that begins with a member, each in the structure of `like`; None where there is
+        none that is whole, of which `damaged` keeps account."""
+        path = self.file(start)
+        if not path.exists():
             return None
         try:
-            with np.load(self.file(start)) as found:
-                return jax.tree.unflatten(jax.tree.structure(like), [found[name] for name in _named(like)])
-        except (zipfile.BadZipFile, KeyError, ValueError, EOFError, OSError) as error:
-            warnings.warn(f"{self.file(start)} cannot be read ({error}); it is computed again.", stacklevel=4)
+            with zipfile.ZipFile(path) as archive:
+                bad = archive.testzip()
+            if bad is not None:
+                raise ValueError(f"{bad} is damaged")
+            with np.load(path, allow_pickle=False) as found:
+                leaves = [_checked(name, found[name], leaf, size) for name, leaf in _named(like).items()]
+        except (MemoryError, PermissionError):
+            raise
+        except Exception as error:  # whatever a decoder says of bytes that are not its own
+            self.damaged.append(f"{path.name} ({type(error).__name__}: {error})")
             return None
+        return jax.tree.unflatten(jax.tree.structure(like), leaves)
 
     def tidy(self) -> None:
-        """Take away what writers that were killed left behind."""
-        for left in self.path.glob("*.tmp"):
+        """Take away what writers that were killed left behind, once every chunk is there."""
+        for left in self.path.glob(f"*{SCRATCH}"):
             left.unlink(missing_ok=True)
-
-    def _write(self, path: Path, put: Callable[[Any], Any]) -> None:
-        scratch = path.with_name(f"{path.name}.{os.getpid()}.tmp")
-        with open(scratch, "wb") as file:
-            put(file)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(scratch, path)
-        if os.name == "posix":  # the name, too, must be on the disk
-            handle = os.open(path.parent, os.O_RDONLY)
-            try:
-                os.fsync(handle)
-            finally:
-                os.close(handle)
 
 
 def _named(part: Any) -> dict[str, Any]:
@@ -78,19 +89,35 @@ def _named(part: Any) -> dict[str, Any]:
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
-def _compare(path: Path, there: Mapping[str, Any], here: Mapping[str, Any]) -> None:
-    differences = []
-    for group in dict.fromkeys((*there, *here)):
-        old, new = there.get(group, {}), here.get(group, {})
-        if not isinstance(old, dict) or not isinstance(new, dict):
-            old, new = {"": old}, {"": new}
-        for key in dict.fromkeys((*old, *new)):
-            a, b = (x.get(key) for x in (old, new))
-            if a != b:
-                a, b = ("nothing" if x in (None, {}) else x for x in (a, b))
-                differences.append(f"{group} {key}".strip() + f" ({a} there, {b} here)")
-    if differences:
+def _checked(name: str, array: np.ndarray, like: Any, size: int) -> np.ndarray:
+    if array.shape != (size, *like.shape) or array.dtype != like.dtype:
+        raise ValueError(f"{name} is {array.dtype}{list(array.shape)}, not {like.dtype}{[size, *like.shape]}")
+    return array
+
+
+def _read(path: Path) -> Mapping[str, Any]:
+    """The manifest in a file."""
+    try:
+        found = json.loads(path.read_bytes())
+    except ValueError as error:  # of JSON, or of its encoding
         raise ValueError(
-            f"{path} holds another sweep. It differs in {'; '.join(differences)}. Choose another folder, or delete "
-            "this one."
+            f"{path} cannot be read ({error}): it is damaged, or no manifest of a sweep, so nobody knows whose chunks "
+            "stand beside it. Choose another folder, or delete this one."
+        ) from None
+    if not isinstance(found, dict) or not {"system", "times", "layout"} <= found.keys():
+        raise ValueError(f"{path} is no manifest of a sweep. Choose another folder: a sweep wants one of its own.")
+    return found
+
+
+def _compare(path: Path, there: Mapping[str, Any], here: Mapping[str, Any]) -> None:
+    if "program" not in there:
+        raise ValueError(
+            f"{path} holds a sweep of an earlier version of jaxkane, which kept no account of all that was computed: "
+            "it cannot be told whether it is this one. Choose another folder, or delete this one."
+        )
+    found = differences(there, here)
+    if found:
+        raise ValueError(
+            f"{path} holds another sweep. It differs in {found}. Choose another folder, or delete this one. (The "
+            "program is what the description, the inputs and the functions compute, with the numbers that they read.)"
         )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import inspect
 from importlib.metadata import version
 from platform import python_version_tuple
 from typing import Any
@@ -10,24 +11,32 @@ from typing import Any
 import jax
 import numpy as np
 
+from .._digest import digest
 from .._native import is_on
 from .._simulate import Settings
 from .._system import State, System
-from ._fingerprint import digest
 from ._table import Table
 
 
 def manifest_of(
-    system: Any, state: Any, inputs: Any, table: Table | None, ts: Any, settings: Settings, reduce: Any, layout: Any
+    program: str,
+    system: Any,
+    state: Any,
+    inputs: Any,
+    table: Table | None,
+    ts: Any,
+    settings: Settings,
+    reduce: Any,
+    layout: Any,
 ) -> dict[str, Any]:
-    """All that the results follow from, by name."""
+    """All that the results follow from, by name; `program` is the digest of what is computed from it."""
     kind: dict[str, Any]
     if isinstance(system, System):
-        kind = {"class": type(system).__qualname__, "description": digest(type(system))}
+        kind = {"class": type(system).__qualname__}
         parameters = {field.name: _shown(getattr(system, field.name)) for field in dataclasses.fields(system)}
     else:
-        kind, parameters = {"function": digest(system)}, {}
-    places = {"q": _shown(state.q), "u": _shown(state.u)} if isinstance(state, State) else {"function": digest(state)}
+        kind, parameters = {"function": _shown(system)}, {}
+    places = {"q": _shown(state.q), "u": _shown(state.u)} if isinstance(state, State) else {"function": _shown(state)}
     signals = {name: _shown(x) for name, x in (inputs or {}).items()} if not callable(inputs) else _shown(inputs)
     return {
         "system": kind,
@@ -39,6 +48,7 @@ def manifest_of(
         "times": _shown(ts),
         "option": {f.name: _shown(getattr(settings, f.name)) for f in dataclasses.fields(settings)},
         "reduce": _shown(reduce),
+        "program": program,
         "layout": dict(layout),
         "device": jax.default_backend(),
         "kernels": "native" if is_on() and jax.default_backend() == "cpu" else "XLA",  # they round differently
@@ -48,7 +58,7 @@ def manifest_of(
 
 
 def _shown(value: Any) -> Any:
-    """Numbers as they are, everything else by a digest."""
+    """Numbers as they are, functions by name (what they compute is in the program), all else by a digest."""
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     if isinstance(value, (jax.Array, np.ndarray, np.generic)):
@@ -56,4 +66,6 @@ def _shown(value: Any) -> Any:
         if array.ndim == 0:
             return array.item()
         return f"{array.dtype}{list(array.shape)} {digest(array)}"
+    if inspect.isroutine(value):
+        return value.__qualname__
     return f"{getattr(value, '__qualname__', type(value).__qualname__)} {digest(value)}"

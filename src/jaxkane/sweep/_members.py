@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -40,7 +41,8 @@ def members_of(system: Any, state: Any, inputs: Inputs, table: Table | None, ts:
 
     **Raises:** `ValueError` when nothing is a batch, when batches differ in length, or for a column that nothing reads.
     """
-    columns = {name: np.asarray(x, dtype=ts.dtype) for name, x in table.numbers.items()} if table else {}
+    columns = {name: np.asarray(x, dtype=ts.dtype) for name, x in table.numbers.items()} if table is not None else {}
+    _refuse_twice(columns, system, inputs)
     signals = inputs if callable(inputs) else _signals(inputs, system, columns, ts)
     tree = (system, state, signals, columns)
     is_member = _batches(tree)
@@ -152,6 +154,18 @@ def _signals(inputs: Inputs, system: Any, columns: dict[str, Any], ts: Any) -> A
     for name, array in batches.items():
         known[name] = array[:, 0] if array.shape[1] == 1 else Samples(ts, array)
     return known
+
+
+def _refuse_twice(columns: dict[str, Any], system: Any, inputs: Inputs) -> None:
+    """A column takes the place of the one value that all members have, but not of values of their own."""
+    twice = {name: "`inputs`" for name in columns if isinstance(inputs, Mapping) and name in inputs}
+    if isinstance(system, System):
+        for name, info in parameter_info(system).items():
+            if name in columns and np.ndim(getattr(system, name)) > len(info.shape):
+                twice[name] = f"a batch of {type(system).__name__}"
+    if twice:
+        listed = ", ".join(f"{name} (a column of the table, and in {where})" for name, where in twice.items())
+        raise ValueError(f"sweep: given twice: {listed}. Leave one of them out.")
 
 
 def _batches(tree: Tree) -> dict[int, str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -19,6 +20,7 @@ from .._trajectory import Status, Trajectory
 from .._types import Inputs
 from ._cluster import on_cluster
 from ._files import Folder
+from ._fingerprint import traced
 from ._manifest import manifest_of
 from ._members import Row, members_of
 from ._result import Sweep
@@ -63,7 +65,8 @@ def sweep(
         kept to look at a million numbers.
     - `chunk`: members in one call of a compiled program, rounded up to whole groups of 32.
     - `folder`: keep every finished chunk there, as a file. A sweep that was stopped, or killed, goes on from there when
-        it is called again, and gives the same bytes as one that was not. One process at a time.
+        it is called again, and gives the same bytes as one that was not. It is known again by what it computes and the
+        numbers that it computes from; a folder of another sweep is refused.
     - `client`: a `dask.distributed.Client`: its workers, here or elsewhere, compute the chunks; workers of one thread
         are best. A worker that dies costs its chunk's time. Where workers have other processors or libraries than this
         machine, the last bits differ. Needs Dask: pip install 'jaxkane[cluster]'.
@@ -78,6 +81,8 @@ def sweep(
     **Raises:** `ValueError` when nothing is a batch, two batches differ in length, a column changes nothing, or the
     folder holds another sweep: the message says in what it differs.
     """
+    if chunk < 1:
+        raise ValueError(f"sweep: `chunk` is a number of members, at least one; got {chunk}.")
     table = as_table(table)
     if isinstance(state, State) and isinstance(system, System):
         state = as_state(system, state)
@@ -86,6 +91,10 @@ def sweep(
     members, shared, n = members_of(system, state, inputs, table, ts)
     found = table if table is not None else Table({}, ("member",), (n,))
     job = Job(shared, ts, settings, reduce, None if client is not None else mesh_of(devices))
+    own = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), members)
+    if n == 0:
+        like = jax.eval_shape(job.whole, own)
+        return Sweep.of(jax.tree.map(lambda x: np.zeros((0, *x.shape), x.dtype), like), found, ts, reduce is not None)
     if not is_concrete(members, shared, ts):  # inside jit, grad or vmap
         if folder is not None or client is not None:
             raise ValueError("sweep: `folder` and `client` cannot be used inside jit, grad or vmap.")
@@ -94,15 +103,16 @@ def sweep(
     size = n if n <= GROUP else GROUP * -(-min(chunk, n) // GROUP)
     members = jax.tree.map(np.asarray, members)
     members_at = lambda start: jax.tree.map(lambda x: x[start : start + size], members)  # noqa: E731
-    kept = None
+    kept = like = None
     if folder is not None:
         layout = {"members": n, "chunk": size}
-        kept = Folder(folder, manifest_of(system, state, inputs, table, ts, settings, reduce, layout))
+        program, like = traced(job, own)
+        kept = Folder(folder, manifest_of(program, system, state, inputs, table, ts, settings, reduce, layout))
     result = _Result(n)
     with tqdm(total=n, disable=not progress, unit="member", file=sys.stderr) as bar:
         try:
             left = list(range(0, n, size))
-            for start, part in _finished(kept, left, job, members_at):
+            for start, part in _finished(kept, left, like, n, size):
                 left.remove(start)
                 bar.update(result.put(start, part))
             bar.initial = bar.n  # what was there tells nothing about how fast it goes
@@ -124,18 +134,21 @@ def sweep(
 
 
 def _finished(
-    kept: Folder | None, starts: list[int], job: Job, members_at: Callable[[int], Any]
+    kept: Folder | None, starts: list[int], like: Part | None, n: int, size: int
 ) -> Iterator[tuple[int, Part]]:
-    """(start, part) of the chunks that stand in the folder."""
-    there = [start for start in starts if kept is not None and kept.file(start).exists()]
-    if kept is None or not there:
+    """(start, part) of the chunks that stand in the folder, each member of the shapes of `like`."""
+    if kept is None:
         return
-    own = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), members_at(0))
-    like = jax.eval_shape(job.whole, own)
-    for start in there:
-        part = kept.read(start, like)
+    for start in tuple(starts):
+        part = kept.read(start, like, min(size, n - start))
         if part is not None:
             yield start, part
+    if kept.damaged:
+        warnings.warn(
+            f"{kept.path}: {len(kept.damaged)} chunks cannot be read and are computed again: {kept.damaged[0]}"
+            + (", ..." if len(kept.damaged) > 1 else "."),
+            stacklevel=3,
+        )
 
 
 class _Result:

@@ -79,6 +79,10 @@ def as_table(table: Any) -> Table | None:
         raise TypeError(
             f"`table` is jaxkane.sweep.grid(...), a dict of columns or a DataFrame, got {type(table).__name__}."
         )
+    names = [str(name) for name, _ in table.items()]  # a DataFrame may have two columns of one name
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"`table` has more than one column of the name {', '.join(twice)}: which is meant?")
     columns = {str(name): _column(str(name), values) for name, values in table.items()}
     lengths = {name: len(column) for name, column in columns.items()}
     if not lengths:
@@ -90,15 +94,19 @@ def as_table(table: Any) -> Table | None:
 
 
 def _column(name: str, values: Any) -> np.ndarray:
+    if np.ma.is_masked(values):
+        raise ValueError(f"{name!r} has masked entries: leave these members out, or fill them.")
     try:
         column = np.asarray(values)
+        if column.ndim and not len(column):
+            return column.astype(float)  # no members
         if column.dtype.kind in "OUST":
             is_text = column.ndim == 1 and all(isinstance(x, str) for x in column)
             return column.astype(str) if is_text else _refuse(name, values)
         column = column.astype(float)
     except (TypeError, ValueError):
         return _refuse(name, values)
-    return column if column.ndim and len(column) else _refuse(name, column)
+    return column if column.ndim else _refuse(name, column)
 
 
 def _refuse(name: str, values: Any) -> Any:
