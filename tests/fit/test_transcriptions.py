@@ -135,11 +135,11 @@ def test_delays_gains_rates_and_gaps(result):
 def test_other_data_and_guesses_compile_nothing(result, runs, problem):
     import jaxkane.fit._model as model
 
-    before = model.blocks_of._cached._cache_size()
+    before = model.blocks_of.compiled._cached._cache_size()
     again = [Trial(r.t, r.measured, r.inputs, sigma=0.02, name="again") for r in runs]
     other = Problem.of(TRUTH, again, FREE, sensor_gain={"x": 0.2}, **UNKNOWN)
     near(least_squares(other))
-    assert model.blocks_of._cached._cache_size() == before
+    assert model.blocks_of.compiled._cached._cache_size() == before
 
 
 @pytest.mark.parametrize("method", [gauss_newton, bfgs])

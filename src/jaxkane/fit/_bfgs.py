@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -35,7 +33,8 @@ def bfgs(
     **Arguments:** `steps`: at most. `rtol`: stop where a step changes the cost and the unknowns by less than this part.
     `solver`: by default `optimistix.BFGS`. `start`: a `Point`.
 
-    **Returns:** a `Fit`, whose history is the cost at its two ends.
+    **Returns:** a `Fit`, whose history is the cost at its two ends; after an interruption (Ctrl-C) the best so far, and
+    `status` says so.
 
     **Raises:** `ValueError` where a window cannot be simulated with the first guess.
     """
@@ -49,18 +48,43 @@ def bfgs(
     origin, unravel = ravel_pytree(point)
     unit, _ = ravel_pytree(units)
     solver = optx.BFGS(rtol=rtol, atol=rtol) if solver is None else solver
-    solution = _minimise(half_cost(problem), solver, origin, unit, unravel, steps)
-    end = unravel(origin + unit * cast(Any, solution.value))
+    cost = half_cost(problem)
+    y, status, taken = jnp.zeros_like(origin), "steps", 0
+    try:
+        state = _begun(cost, solver, origin, unit, unravel, y)
+        while taken < steps:
+            y, state, done, sound = _step(cost, solver, origin, unit, unravel, y, state)
+            taken += 1
+            if done:
+                status = "converged" if sound else "stuck"
+                break
+    except KeyboardInterrupt:
+        status = "interrupted"
+    end = unravel(origin + unit * y)
     there = linearize(problem, end)
-    status = "converged" if solution.result == optx.RESULTS.successful else "steps"
     if not usable(there) or there is None or there.cost > at.cost:
-        end, there, status = point, at, "stuck"
-    history = (at.cost, *np.full(int(solution.stats["num_steps"]) - 1, np.nan), there.cost)
+        end, there, status = point, at, status if status == "interrupted" else "stuck"
+    history = (at.cost, *np.full(max(taken - 1, 0), np.nan), there.cost)
     return Fit.of(problem, end, there, history, status, type(solver).__name__)
 
 
+# One step at a time, so that Ctrl-C finds the best so far: within one program nothing could be told of it.
+
+
 @compiled
-def _minimise(f, solver, origin, unit, unravel, steps):
-    return optx.minimise(
-        lambda y, _: f(unravel(origin + unit * y)), solver, jnp.zeros_like(origin), max_steps=steps, throw=False
-    )
+def _begun(cost, solver, origin, unit, unravel, y):
+    f = _of_round_unknowns(cost, origin, unit, unravel)
+    return solver.init(f, y, None, {}, *jax.eval_shape(f, y, None), frozenset())
+
+
+@compiled
+def _step(cost, solver, origin, unit, unravel, y, state):
+    """The unknowns and the state after a step, whether that was the last, and whether all is well with it."""
+    f = _of_round_unknowns(cost, origin, unit, unravel)
+    y, state, _ = solver.step(f, y, None, {}, state, frozenset())
+    done, result = solver.terminate(f, y, None, {}, state, frozenset())
+    return y, state, done | (result != optx.RESULTS.successful), result == optx.RESULTS.successful
+
+
+def _of_round_unknowns(cost, origin, unit, unravel):
+    return lambda y, _: (cost(unravel(origin + unit * y)), None)

@@ -12,6 +12,7 @@ import optax
 from jaxtyping import Array
 from tqdm import tqdm
 
+from .._digest import digest
 from ._blocks import Eliminated, eliminate
 from ._checkpoint import Checkpoint
 from ._model import Point
@@ -74,9 +75,13 @@ def gradient_descent(
     # What one step hands to the next: the way gone in the round coordinates, those coordinates, and their unit.
     y, directions, unit = jnp.zeros_like(start.x), jnp.eye(p, dtype=start.x.dtype), jnp.zeros((), start.x.dtype)
     memory = descent.init(y)
-    file = Checkpoint(checkpoint, problem, "gradient descent")
+    chosen = "default"
+    if checkpoint is not None and optimizer is not None:
+        with jax.numpy_dtype_promotion("standard"):
+            chosen = digest(jax.make_jaxpr(optimizer.update)(y, memory, y))
+    file = Checkpoint(checkpoint, problem, method="gradient descent", optimizer=chosen, refresh=refresh)
     like = {"y": y, "directions": directions, "unit": unit, "memory": memory, "best": start}
-    saved = file.read(start, **like)
+    saved = file.read(point=start, history=0.0, **like)
     if saved is None:
         point, at = settle(problem, start)
         history, best = [at.cost], (point, at)

@@ -55,8 +55,8 @@ def least_squares(
     """
     method = "Levenberg-Marquardt" if damping else "Gauss-Newton"
     start = problem.start if start is None else start
-    file = Checkpoint(checkpoint, problem, method)
-    saved = file.read(start)
+    file = Checkpoint(checkpoint, problem, method=method)
+    saved = file.read(point=start, damping=0.0, history=0.0)
     if saved is None:
         for share in horizons:
             start = least_squares(_part(problem, share), steps=steps, rtol=1e-3, start=start, progress=progress).point

@@ -21,7 +21,7 @@ class MultiStart:
     """What came of many first guesses; print it for a table.
 
     - `fits`: those that ran, the best first; `guesses`: the values that each began with, by name.
-    - `failures`: why the others could not be simulated.
+    - `failures`: why the others could not be simulated. `untried`: how many were left when Ctrl-C came.
     - `agreeing`: how many fits ended where the best did (their cost within 0.1 %, or 0.1 % of the residuals' number).
     - `spread`: by name, the standard deviation of these estimates: what is left of the first guess in the answer.
     """
@@ -29,6 +29,7 @@ class MultiStart:
     fits: tuple[Fit, ...]
     guesses: tuple[dict[str, float], ...]
     failures: tuple[str, ...]
+    untried: int = 0
 
     @property
     def best(self) -> Fit:
@@ -60,6 +61,8 @@ class MultiStart:
         lines.append(f"{self.agreeing} of {total} first guesses end at the best.")
         if self.agreeing == 1 and total > 1:
             lines.append("Nothing confirms that this is the lowest minimum: try more, or shorter windows.")
+        if self.untried:
+            lines.append(f"Interrupted: {self.untried} more first guesses were not tried.")
         return "\n".join([*lines, *self.failures])
 
     __repr__ = __str__
@@ -89,7 +92,7 @@ def multi_start(
     - `candidates`: draw so many guesses, and fit the `n` with the lowest cost; by default `n`.
     - `seed`: of the random numbers. `method`: an optimizer, `options` go to it.
 
-    **Returns:** a `MultiStart`.
+    **Returns:** a `MultiStart`; after an interruption (Ctrl-C) of what was tried until then.
 
     **Raises:** `ValueError` where no guess can be simulated.
     """
@@ -100,15 +103,24 @@ def multi_start(
     if len(points) > n:
         costs = np.nan_to_num([cost(problem, point) for point in points], nan=np.inf)
         points = [points[i] for i in np.argsort(costs)[:n]]
-    found, failures = [], []
-    for point in tqdm(points, disable=not progress, desc="first guesses"):
+    found, failures, untried = [], [], 0
+    for i, point in enumerate(tqdm(points, disable=not progress, desc="first guesses")):
         values = np.asarray(problem.parameters.values(point.x)).tolist()
         guess = dict(zip(problem.parameters.names, values, strict=True))
         try:
             found.append((method(problem, start=point, **options), guess))
         except ValueError as error:
             failures.append(f"From {', '.join(f'{k} = {v:.4g}' for k, v in guess.items())}: {error}")
+            continue
+        except KeyboardInterrupt:  # before its first step
+            if not found:
+                raise
+            untried = len(points) - i
+            break
+        if found[-1][0].status == "interrupted":
+            untried = len(points) - i - 1
+            break
     if not found:
         raise ValueError(f"None of {n} first guesses can be simulated. The last: {failures[-1]}")
     found.sort(key=lambda pair: pair[0].cost)
-    return MultiStart(tuple(f for f, _ in found), tuple(g for _, g in found), tuple(failures))
+    return MultiStart(tuple(f for f, _ in found), tuple(g for _, g in found), tuple(failures), untried)

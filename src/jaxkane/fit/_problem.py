@@ -322,7 +322,7 @@ def linearize(problem: Problem, point: Point) -> Linearization | None:
     found = _starts(problem, point)
     if found is None:
         return None
-    blocks = blocks_of_all if problem.processes else blocks_of
+    blocks: Any = blocks_of_all if problem.processes else blocks_of
     return Linearization(*blocks(problem.model, problem.windows, problem.by_trial, point, *found))
 
 
@@ -349,5 +349,5 @@ def _costs(problem: Problem, point: Point, starts: Array) -> tuple[Array, Array]
 def _starts(problem: Problem, point: Point) -> tuple[Array, Array] | None:
     try:
         return starts_of(problem.model, problem.windows, point)
-    except RuntimeError:  # Newton's linear solver raises on what is not finite
+    except eqx.EquinoxRuntimeError:  # Newton's linear solver raises on what is not finite
         return None

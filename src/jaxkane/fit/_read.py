@@ -34,11 +34,12 @@ def read_trials(
     - `t`: the column of the times [s]. `by`: the column that tells the trials apart; without it the file is one trial.
     - `sigma`: as `Trial` takes it.
 
-    An empty cell, or one that says NaN, is a gap.
+    An empty cell, or one that says NaN, is a gap. The file is UTF-8, with or without a byte-order mark.
 
     **Returns:** trials in the order of the file, named after the file and the value of `by`.
 
-    **Raises:** `ValueError` that names file, line and column for a missing column, a short line, or text in a number.
+    **Raises:** `ValueError` that names file, line and column for a column that is missing or there twice, a short line,
+    text in a number, or another encoding.
     """
     path = Path(path)
     groups = [dict(measured), dict(inputs or {}), dict(initial or {})]
@@ -54,10 +55,21 @@ def read_trials(
 
 def _read(path: Path, columns: list[str], by: str | None) -> dict[str, dict[str, np.ndarray]]:
     """For every trial its columns (n_t,)."""
-    with path.open(newline="") as file:
+    try:
+        return _tables(path, columns, by)
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise ValueError(f"{path} is no CSV file in UTF-8: {error}.") from None
+
+
+def _tables(path: Path, columns: list[str], by: str | None) -> dict[str, dict[str, np.ndarray]]:
+    with path.open(newline="", encoding="utf-8-sig") as file:  # with or without a byte-order mark
         lines = csv.reader(file)
         header = [cell.strip() for cell in next(lines, [])]
-        refuse_unknown((*columns, *([by] if by else [])), header, f"{path}: no column")
+        needed = (*columns, *([by] if by else []))
+        refuse_unknown(needed, header, f"{path}: no column")
+        twice = sorted({column for column in needed if header.count(column) > 1})
+        if twice:
+            raise ValueError(f"{path}: more than one column is called {', '.join(twice)}: which is meant? Rename one.")
         places = [header.index(c) for c in columns]
         found: dict[str, list[list[float]]] = {}
         for line in lines:

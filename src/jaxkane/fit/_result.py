@@ -7,11 +7,11 @@ import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._reads import compiled
 from .._system import System
 from .._trajectory import Trajectory
 from . import _suspicions as suspicions
@@ -358,12 +358,12 @@ class Fit:
     __repr__ = __str__
 
 
-@eqx.filter_jit
+@compiled
 def _values(parameters: Parameters, x: Any) -> Any:
     return parameters.values(x)
 
 
-@eqx.filter_jit
+@compiled
 def _slopes(parameters: Parameters, x: Any) -> Any:
     return parameters.slopes(x)
 

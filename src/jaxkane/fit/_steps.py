@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +24,13 @@ def moved(point: Point, x: Array, eliminated: Eliminated) -> Point:
 def usable(at: Linearization | None) -> bool:
     """Whether a step led to finite residuals and derivatives."""
     return at is not None and bool(np.all(at.good))
+
+
+def uninterrupted(fit: Any) -> Any:
+    """A fit that is a part of a study. **Raises:** `KeyboardInterrupt` where Ctrl-C ended it: that ends the study."""
+    if fit.status == "interrupted":
+        raise KeyboardInterrupt
+    return fit
 
 
 def settle(problem: Problem, point: Point, steps: int = 8, rtol: float = 1e-2) -> tuple[Point, Linearization]:

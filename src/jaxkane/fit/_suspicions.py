@@ -13,7 +13,7 @@ import numpy as np
 from .._check import check_system
 from ._bijections import PossibleBody
 from ._problem import Problem
-from ._steps import settle
+from ._steps import settle, uninterrupted
 
 if TYPE_CHECKING:
     from ._result import Fit
@@ -115,7 +115,7 @@ def _if_better(fit: Fit, windows, what: str) -> list[str]:
         # From both ends: a fit to the wrong sign may have led the parameters far away.
         costs = [settle(problem, point, steps=4)[1].cost for point in (fit.point, problem.start)]
         if min(costs) > 0.5 * fit.cost:
-            costs = [least_squares(problem, steps=4, rtol=1e-2).cost]
+            costs = [uninterrupted(least_squares(problem, steps=4, rtol=1e-2)).cost]
     except ValueError:
         return []
     if min(costs) < 0.5 * fit.cost:

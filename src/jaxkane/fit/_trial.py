@@ -7,6 +7,11 @@ from typing import Any
 
 import numpy as np
 
+_FEEDBACK = (
+    "A trial holds what was measured. Feedback, as of a controller or a rider, belongs into the system's `loads`, "
+    "where it follows the simulated motion, and its gains can be free parameters."
+)
+
 
 class Trial:
     """Measurements of one motion, to be fitted.
@@ -16,10 +21,11 @@ class Trial:
     **Arguments:**
 
     - `t` (n_t,) [s]: increasing times.
-    - `measured`: by channel, samples (n_t,) in the channel's unit; NaN where there is a gap. A channel is the name of a
-        coordinate, speed or dependent speed, or of one of the `outputs` that the fit is told.
+    - `measured`: by channel, samples (n_t,) in the channel's unit; NaN, or masked, where there is a gap. A channel is
+        the name of a coordinate, speed or dependent speed, or of one of the `outputs` that the fit is told.
     - `inputs`: by name, a number or samples (n_t,) without gaps, taken as linear between the times. Those left out are
-        zero.
+        zero. An input is what was measured: feedback (a controller, a rider) belongs into the system's `loads`, where
+        it follows the simulated motion and its gains are parameters that can be found.
     - `sigma`: by channel, the standard deviation of the measurement, a positive number or (n_t,): residuals are divided
         by it. One number serves all channels.
     - `initial`: by name, what is known of coordinates and speeds: a number, or samples (n_t,) from which every window
@@ -46,6 +52,10 @@ class Trial:
         self.t = self._times(t)
         if not isinstance(measured, Mapping) or not measured:
             raise ValueError(f"{self.name}: `measured` is a dict of channels, {{'roll': samples, ...}}, and not empty.")
+        for group, given in (("inputs", inputs), ("initial", initial)):
+            if given is not None and not isinstance(given, Mapping):
+                what = f"a function. {_FEEDBACK}" if callable(given) else f"{type(given).__name__}."
+                raise ValueError(f"{self.name}: `{group}` is a dict by name, {{'name': samples, ...}}; got {what}")
         self.measured = {key: self._samples("measured", key, value) for key, value in measured.items()}
         self.inputs = {
             key: self._samples("inputs", key, value, number=True, gaps=False) for key, value in (inputs or {}).items()
@@ -77,7 +87,11 @@ class Trial:
         return t
 
     def _numbers(self, label: str, value: Any) -> np.ndarray:
+        if callable(value):
+            raise ValueError(f"{self.name}: {label} is a function, and no samples (n_t,). {_FEEDBACK}")
         try:
+            if isinstance(value, np.ma.MaskedArray):  # what is masked was not measured
+                value = np.ma.filled(value.astype(float), np.nan) if value.dtype.kind in "iuf" else value.data
             array = np.asarray(value)
             if array.dtype.kind not in "iuf":
                 raise ValueError(f"it holds {array.dtype}")

@@ -15,7 +15,7 @@ from .._lookup import hint
 from ._blocks import eliminate
 from ._model import Point
 from ._problem import Problem
-from ._steps import settle
+from ._steps import settle, uninterrupted
 
 if TYPE_CHECKING:
     from ._result import Fit
@@ -89,7 +89,8 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
         for value in side:
             pinned = fit.problem.with_priors({name: (float(value), 1e-4 * error)})
             try:
-                there = least_squares(pinned, start=pinned.at({name: float(value)}, point), rtol=1e-5)
+                start = pinned.at({name: float(value)}, point)
+                there = uninterrupted(least_squares(pinned, start=start, rtol=1e-5))
             except ValueError:  # outside its bounds, or nothing that can be simulated
                 break
             if there.status != "converged":
@@ -172,7 +173,7 @@ def cross_validate(fit: Fit, folds: int | Sequence[Sequence[int]] | None = None)
     held, estimates = np.full(T, np.nan), {name: [] for name in fit.names}
     for group in groups:
         others = fit.problem.only(set(range(T)) - set(group))
-        found = least_squares(others, start=fit.point)
+        found = uninterrupted(least_squares(others, start=fit.point))
         held[group] = costs_by_trial(fit.problem, found.point)[group]
         for name, value in found.estimates.items():
             estimates[name].append(value)

@@ -1,0 +1,218 @@
+"""Files of fits and trials, and Ctrl-C: what is refused is named, and the best so far is never lost."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from systems import Track
+
+import jaxkane.fit._problem as posing
+from jaxkane.fit import Problem, Trial, bfgs, gradient_descent, least_squares, multi_start, profile, read_trials
+from jaxkane.fit._problem import cost, linearize
+from jaxkane.sweep import grid
+
+t = np.linspace(0.0, 1.0, 11)
+PUSH = np.sin(3.0 * t)
+SEEN = 0.4 * t**2 + 0.02 * np.cos(40.0 * t)
+
+
+def pose(**options):
+    trial = Trial(t, {"x": SEEN}, {"push": PUSH}, sigma=0.1, initial={"x": 0.0, "x_dot": 0.0})
+    return Problem.of(Track(), trial, ["gain", "drift"], **options)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return pose(step=0.1)
+
+
+def after(n):
+    """A callback that is stopped by Ctrl-C after n calls."""
+    calls = []
+
+    def callback(point, cost):
+        calls.append(cost)
+        if len(calls) > n:
+            raise KeyboardInterrupt
+
+    return callback
+
+
+def kept(problem, path, method=gradient_descent, **options):
+    assert method(problem, steps=5, checkpoint=path, callback=after(1), **options).status == "interrupted"
+    return path
+
+
+OPTIMIZERS = {
+    "stateless": lambda rate=0.1: optax.sgd(rate),
+    "momentum": lambda rate=0.1: optax.sgd(rate, momentum=0.5),
+    "adam": lambda rate=0.1: optax.adam(rate),
+}
+
+
+@pytest.mark.parametrize("name", OPTIMIZERS)
+def test_a_descent_goes_on_with_its_own_optimizer_only(name, problem, tmp_path):
+    path = kept(problem, tmp_path / "fit.npz", optimizer=OPTIMIZERS[name]())
+    for other in OPTIMIZERS.values():
+        for optimizer in (other(0.2), *([other()] if other is not OPTIMIZERS[name] else [None])):
+            with pytest.raises(ValueError, match=r"fit.npz is the state of another fit. It differs in optimizer \("):
+                gradient_descent(problem, steps=5, checkpoint=path, optimizer=optimizer)
+    resumed = gradient_descent(problem, steps=5, checkpoint=path, optimizer=OPTIMIZERS[name]())
+    whole = gradient_descent(problem, steps=5, optimizer=OPTIMIZERS[name]())
+    assert resumed.history == pytest.approx(whole.history, rel=1e-12)
+
+
+def test_a_checkpoint_says_in_what_another_fit_differs(problem, tmp_path):
+    path = kept(problem, tmp_path / "fit.npz")
+    others = {
+        r"method \(gradient descent there, Levenberg-Marquardt here\)": lambda: least_squares(problem, checkpoint=path),
+        r"refresh \(10 there, 3 here\)": lambda: gradient_descent(problem, refresh=3, checkpoint=path),
+        r"free parameters \(gain, drift there, gain here\)": lambda: gradient_descent(
+            Problem.of(Track(), problem.trials, ["gain"], step=0.1), checkpoint=path
+        ),
+        r"rtol \(": lambda: gradient_descent(pose(rtol=1e-9), checkpoint=path),
+        r"first guesses, priors \(": lambda: gradient_descent(
+            problem.with_priors({"gain": (1.0, 0.1)}), checkpoint=path
+        ),
+        r"unknown starts \(none there, x here\)": lambda: gradient_descent(
+            pose(step=0.1, unknown=["x"]), checkpoint=path
+        ),
+    }
+    before = path.read_bytes()
+    for message, run in others.items():
+        with pytest.raises(ValueError, match=rf"fit.npz is the state of another fit. It differs in .*{message}"):
+            run()
+    assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("how", ["empty", "zeros", "cut", "text", "older"])
+def test_a_checkpoint_that_cannot_be_read_is_named(how, problem, tmp_path):
+    path = kept(problem, tmp_path / "fit.npz", least_squares)
+    data = path.read_bytes()
+    path.write_bytes({"empty": b"", "zeros": bytes(500), "cut": data[:-40], "text": b"thesis"}.get(how, data))
+    if how == "older":
+        np.savez(path, key=np.array("3f" * 32), damping=np.ones(()))
+    with pytest.raises(ValueError, match=r"fit.npz cannot be read as the state of a fit .*Delete it, or name another"):
+        least_squares(problem, checkpoint=path)
+    assert [p.name for p in tmp_path.iterdir()] == ["fit.npz"]
+
+
+def test_bfgs_keeps_the_best_when_it_is_interrupted(problem, monkeypatch):
+    from jaxkane.fit import _bfgs
+
+    whole = bfgs(problem)
+    assert whole.status == "converged"
+    assert bfgs(problem, steps=2).status == "steps"
+    step, calls = _bfgs._step, []
+
+    def interrupted(*args):
+        calls.append(1)
+        if len(calls) > 6:
+            raise KeyboardInterrupt
+        return step(*args)
+
+    monkeypatch.setattr(_bfgs, "_step", interrupted)
+    best = bfgs(problem)
+    assert best.status == "interrupted"
+    assert whole.cost <= best.cost < best.history[0]
+    assert best.cost == pytest.approx(cost(problem, best.point), rel=1e-10)
+    assert len(best.history) == 7
+    calls += [1] * 10
+    at_once = bfgs(problem)
+    assert at_once.status == "interrupted"
+    assert at_once.cost == at_once.history[0]
+
+
+def test_many_starts_end_with_ctrl_c(problem):
+    once = after(3)
+    found = multi_start(problem, 4, method=least_squares, callback=once, steps=20)
+    assert [f.status for f in found.fits].count("interrupted") == 1
+    assert len(found.fits) + found.untried == 4
+    assert found.untried > 0
+    assert f"Interrupted: {found.untried} more first guesses were not tried" in str(found)
+
+
+def test_studies_of_fits_end_with_ctrl_c(problem, monkeypatch):
+    from jaxkane.fit import _uncertainty
+
+    fit = least_squares(problem)
+    stopped = lambda *args, **options: least_squares(*args, **{**options, "callback": after(0)})  # noqa: E731
+    monkeypatch.setattr("jaxkane.fit._least_squares.least_squares", stopped)
+    monkeypatch.setattr(_uncertainty, "least_squares", stopped, raising=False)
+    with pytest.raises(KeyboardInterrupt):
+        profile(fit, "gain")
+
+
+def test_lack_of_memory_is_not_taken_for_a_bad_start(problem, monkeypatch):
+    def exhausted(*_):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 bytes.")
+
+    monkeypatch.setattr(posing, "starts_of", exhausted)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="RESOURCE_EXHAUSTED"):
+        linearize(problem, problem.start)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
+def test_a_file_may_begin_with_a_byte_order_mark(encoding, tmp_path):
+    path = tmp_path / "rides.csv"
+    path.write_text("t,angle,Länge\n0,1,2\n0.1,,3\n", encoding=encoding)
+    (trial,) = read_trials(path, {"roll": "angle", "length": "Länge"}, sigma=1.0)
+    np.testing.assert_array_equal(trial.t, [0.0, 0.1])
+    np.testing.assert_array_equal(trial.measured["roll"], [1.0, np.nan])
+    np.testing.assert_array_equal(trial.measured["length"], [2.0, 3.0])
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (b"t,angle,angle\n0,1,2\n0.1,2,3\n", "rides.csv: more than one column is called angle: which"),
+        (b"t,t,angle\n0,1,2\n0.1,2,3\n", "rides.csv: more than one column is called t: which"),
+        ("t,angle\n0,1\n0.1,2\n".encode("utf-16"), "rides.csv is no CSV file in UTF-8"),
+        ("t,angle,Länge\n0,1,2\n".encode("latin-1"), "rides.csv is no CSV file in UTF-8"),
+        (b"t,angle\n0.1,1\n0,2\n", "the times are unsorted"),
+    ],
+)
+def test_files_that_say_two_things_are_refused(data, message, tmp_path):
+    (tmp_path / "rides.csv").write_bytes(data)
+    with pytest.raises(ValueError, match=message):
+        read_trials(tmp_path / "rides.csv", {"roll": "angle"}, sigma=1.0)
+
+
+def test_columns_that_nobody_asks_for_may_be_there_twice(tmp_path):
+    (tmp_path / "rides.csv").write_text("t,angle,note,note\n0,1,,\n0.1,2,a,b\n")
+    (trial,) = read_trials(tmp_path / "rides.csv", {"roll": "angle"}, sigma=1.0)
+    np.testing.assert_array_equal(trial.measured["roll"], [1.0, 2.0])
+
+
+def masked(values, *places):
+    mask = np.zeros(len(values), bool)
+    mask[list(places)] = True
+    return np.ma.array(values, mask=mask)
+
+
+def test_what_is_masked_was_not_measured():
+    for values in (SEEN, SEEN.astype(np.float32), np.arange(11)):
+        trial = Trial(t, {"x": masked(values, 2, 3)}, sigma=0.1)
+        np.testing.assert_array_equal(np.isnan(trial.measured["x"]), np.isin(np.arange(11), (2, 3)))
+        np.testing.assert_allclose(trial.measured["x"][4:], values[4:])
+    for changes, message in (
+        ({"t": masked(t, 3)}, r"t\[3\] is not finite"),
+        ({"inputs": {"push": masked(PUSH, 3)}}, r"inputs\['push'\]\[3\] is NaN"),
+        ({"initial": {"x": masked(PUSH, 0)}}, r"initial\['x'\]\[0\] is NaN"),
+        ({"sigma": {"x": masked(PUSH + 2, 5)}}, r"sigma\['x'\]\[5\] is NaN"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Trial(**{"t": t, "measured": {"x": SEEN}, "sigma": 0.1, **changes})
+    with pytest.raises(ValueError, match="'mass' has masked entries"):
+        grid(mass=masked(t, 1))
+
+
+@pytest.mark.parametrize(
+    "inputs",
+    [{"push": lambda t, state: -state["x"]}, lambda t, state: {"push": 0.0}, {"push": jnp.sin}],
+    ids=["function", "controller", "jax"],
+)
+def test_feedback_belongs_into_loads(inputs):
+    with pytest.raises(ValueError, match=r"(is|got) a function.*Feedback.* belongs into the system's `loads`"):
+        Trial(t, {"x": SEEN}, inputs, sigma=0.1)
