@@ -51,7 +51,9 @@ def configure(
         plenty. By default JAX decides: one, unless XLA_FLAGS says otherwise.
     - `native`: right-hand sides and their derivatives as machine code through LLVM (the extra `native`), called by XLA;
         on the CPU only. By default where llvmlite is installed, unless the environment has JAXKANE_NATIVE=0. False
-        leaves all work to XLA. Both agree to rounding errors.
+        leaves all work to XLA. Both agree to rounding errors. On a machine that has called none yet, a first one is
+        tried in another process, which takes a second; the verdict is kept beside the programs, or else in the
+        user's folder of caches.
     - `verbose`: print in a few lines what was done; once, if it is called again.
 
     **Returns:** a `Configuration`. Processes that are started from this one, such as Dask's workers, inherit precision,

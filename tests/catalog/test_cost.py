@@ -4,6 +4,8 @@ import jax
 import jax.numpy as jnp
 import pytest
 
+import jaxkane as jk
+from jaxkane import _fuse
 from jaxkane._fuse import _Program
 from jaxkane._native import Scalars
 from jaxkane._rates import _state_rates
@@ -57,3 +59,23 @@ def test_the_programs_do_not_grow(name):
     for one in (program, tangent, cotangent):
         assert one.is_plain
         assert Scalars(one.program).graph.nodes  # raises, with the operation, where one is unknown
+
+
+OF_STATES = "equations_of_motion accelerations partial_velocities generalized_inertia_forces coordinate_rates"
+OF_CONSTRAINTS = "dependent_speeds dependent_accelerations constraint_jacobian_rate constraint_forces"
+
+
+@pytest.mark.filterwarnings("error:.*its description uses")
+@pytest.mark.parametrize("name", CATALOG)
+def test_every_public_function_is_one_program_of_scalars(name, monkeypatch):
+    """Traced, and not compiled: what cannot be part of one function is told of, and is an error here."""
+    entry, programs = CATALOG[name], []
+    system, q, u = entry.example(), jnp.array(entry.q), jnp.array(entry.u)
+    prepared = _fuse._Program.__init__
+    monkeypatch.setattr(_fuse._Program, "__init__", lambda self, *args: prepared(self, *args) or programs.append(self))
+    jk.forget()
+    names = f"{OF_STATES} {OF_CONSTRAINTS if system.dependent_speeds else ''}".split()
+    for f in (getattr(jk, name) for name in names):
+        jax.eval_shape(lambda system, q, u, f=f: f(system, 0.0, q, u), system, q, u)
+    assert len(programs) >= len(names)
+    assert all(one.is_plain and Scalars(one.program).graph.nodes for one in programs)
