@@ -49,6 +49,56 @@ def test_cyclic_coordinates():
     assert cyclic_coordinates(jk.catalog.DoublePendulum(mass=1.0, length=1.0)) == ()
 
 
+class Sailing(jk.System):
+    """A cart on a rail, pushed by a wind that shears: it matters where the cart is only while the wind blows."""
+
+    stiffness: Scalar = parameter(0.0)  # [N/m] of a spring to a second cart
+    far: Scalar = parameter(0.0)  # [N/m^2] of a stop that begins at 5 m
+    coordinates = ("x", "y", "z")
+    speeds = ("x_dot", "y_dot", "z_dot")
+    inputs = ("wind",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        place = lambda i, axis: O.moving(q[i] * axis, u[i] * axis)  # noqa: E731
+        carts = [
+            jk.Body(2.0, 0.0, place(i, axis), name=name)
+            for i, (name, axis) in enumerate((("cart", N.x), ("other", N.y), ("third", N.z)))
+        ]
+        return jk.Motion(carts)
+
+    def loads(self, t, q, u, motion, inputs):
+        N = motion.N
+        stop = -self.far * jnp.maximum(q["z"] - 5.0, 0.0)
+        return (
+            jk.Force(inputs["wind"] * (1 + 0.5 * q["x"]) * N.x, motion["cart"]),
+            jk.Force(-self.stiffness * q["y"] * N.y, motion["other"]),
+            jk.Force(stop * N.z, motion["third"]),
+        )
+
+
+def test_what_matters_under_an_input_or_far_away_is_not_cyclic():
+    """x_ddot = wind (1 + x / 2) / m: the model about a wind that another force balances has its mode."""
+    system = Sailing()
+    assert cyclic_coordinates(system) == ()
+    still = jk.State(jnp.zeros(3), jnp.zeros(3))
+    at = jk.stability.linearize(system, still, {"wind": -4.0}, steady=False)
+    np.testing.assert_allclose(at.A[at.states.index("x_dot"), at.states.index("x")], -4.0 * 0.5 / 2.0, rtol=1e-14)
+    np.testing.assert_allclose(np.sort(at.eigenvalues.imag)[[0, -1]], [-1.0, 1.0], rtol=1e-12)
+
+
+class Unreal(Sailing):
+    """A wind that no parameter makes real."""
+
+    def loads(self, t, q, u, motion, inputs):
+        return (jk.Force(jnp.sqrt(-1.0 - q["x"] ** 2) * motion.N.x, motion["cart"]),)
+
+
+def test_where_nothing_is_finite_nothing_is_called_cyclic():
+    with pytest.raises(ValueError, match="Unreal: which coordinates are cyclic cannot be told"):
+        cyclic_coordinates(Unreal())
+
+
 # -- closed forms
 
 

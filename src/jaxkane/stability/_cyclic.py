@@ -6,12 +6,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._check import configuration_residual
+from .._check import configuration_residual, is_concrete
 from .._rates import state_rates
+from .._reads import on_forget, version_of
 from .._system import System
 
 _FOUND: dict[tuple, tuple[str, ...]] = {}
-_TRIALS = 3
+_TRIALS = 3  # at which the rates are finite
+_MOST_TRIALS = 12
+_SHIFTS = (0.3, -7.0, 150.0)  # of a coordinate [rad, m]: what begins far away counts too
+_INPUTS = (1.0, 30.0, 1000.0)  # sizes of trial inputs
+
+on_forget(_FOUND.clear)
 
 
 def cyclic_coordinates(system: System) -> tuple[str, ...]:
@@ -20,11 +26,15 @@ def cyclic_coordinates(system: System) -> tuple[str, ...]:
     Neither the accelerations, nor the configuration constraints, nor the rates of the other coordinates depend on
     them: a bicycle's wheel angles, yaw and place. They may grow in a steady motion, in which the others stand still.
 
-    Found by shifting each coordinate at trial states with trial parameters, once for each class and shape of the
-    parameters: a dependence that vanishes for special parameters (a spring of zero stiffness) counts as one.
+    Found by shifting each coordinate at trial states, times, inputs and parameters, once for each class and shape of
+    the parameters: a dependence that vanishes for special parameters (a spring of zero stiffness), or as long as an
+    input is zero (a force that follows a steer angle), counts as one.
+
+    **Raises:** `ValueError` where no trial has finite accelerations.
     """
     leaves, treedef = jax.tree.flatten(system)
-    key = (type(system), str(treedef), tuple((jnp.shape(x), str(jnp.result_type(x))) for x in leaves))
+    shapes = tuple((jnp.shape(x), str(jnp.result_type(x))) for x in leaves)
+    key = (type(system), str(treedef), shapes, version_of(system))
     if key not in _FOUND:
         with jax.ensure_compile_time_eval():
             _FOUND[key] = _search(system, leaves, treedef)
@@ -32,31 +42,55 @@ def cyclic_coordinates(system: System) -> tuple[str, ...]:
 
 
 def _search(system: System, leaves: list, treedef) -> tuple[str, ...]:
-    names = system.coordinates
-    n_q, n = len(names), len(system.speeds)
-    notices = np.zeros((n_q + 1, n_q), bool)  # row: a rate, the last those of the speeds and the constraints
+    names, n_q = system.coordinates, len(system.coordinates)
     rng = np.random.default_rng(0)
     dtype = jnp.result_type(*leaves) if leaves else jnp.zeros(()).dtype
-    eps = float(jnp.finfo(dtype).eps)
-    for _ in range(_TRIALS):
+    as_floats = lambda x: jnp.asarray(x, dtype)  # noqa: E731
+
+    @jax.jit
+    def rates(trial, t, q, u, w):
+        q_dot, u_dot = state_rates(trial, t, q, u, w)
+        return q_dot, jnp.concatenate([u_dot, configuration_residual(trial, t, q)])
+
+    notices = np.zeros((n_q + 1, n_q), bool)  # row: a rate, the last those of the speeds and the constraints
+    compared = 0
+    for k in range(_MOST_TRIALS):
+        # Parameters are about one; where these cannot be, those of the system itself.
         trial = jax.tree.unflatten(treedef, [jnp.asarray(rng.uniform(0.5, 1.5, x.shape), x.dtype) for x in leaves])
-        q, u = rng.uniform(-0.4, 0.4, n_q), rng.uniform(-1.0, 1.0, n)
-
-        def at(q, trial=trial, u=u):
-            q, u = jnp.asarray(q, dtype), jnp.asarray(u, dtype)
-            q_dot, u_dot = state_rates(trial, jnp.zeros((), dtype), q, u, {})
-            h = configuration_residual(trial, jnp.zeros((), dtype), q)
-            return np.asarray(q_dot), np.concatenate([u_dot, h])
-
-        rates, rest = at(q)
+        if k >= _MOST_TRIALS // 2 and is_concrete(leaves):
+            trial = system
+        q, u = rng.uniform(-0.4, 0.4, n_q), rng.uniform(-1.0, 1.0, len(system.speeds))
+        size = _INPUTS[compared % len(_INPUTS)]
+        w = {name: as_floats(size * rng.choice([-1, 1]) * rng.uniform(0.5, 1.5)) for name in system.inputs}
+        t, u = as_floats(rng.uniform(0.0, 2.0)), as_floats(u)
+        at = lambda q, trial=trial, t=t, u=u, w=w: tuple(map(np.asarray, rates(trial, t, as_floats(q), u, w)))  # noqa: E731
+        here = at(q)
+        if not all(np.all(np.isfinite(x)) for x in here):
+            continue
         for i in range(n_q):
-            rates_i, rest_i = at(q + 0.3 * np.eye(n_q)[i])
-            for row, (a, b) in enumerate([*zip(rates, rates_i, strict=True), (rest, rest_i)]):
-                a, b = np.atleast_1d(a), np.atleast_1d(b)
-                finite = np.isfinite(a) & np.isfinite(b)
-                size = 1.0 + np.abs(a[finite]).max(initial=0.0)
-                notices[row, i] |= bool(np.any(np.abs(b - a)[finite] > eps**0.6 * size))
+            for shift in _SHIFTS:
+                notices[:, i] |= _noticed(here, at(q + shift * np.eye(n_q)[i]), 1 + abs(shift))
+        compared += 1
+        if compared == _TRIALS:
+            break
+    if not compared:
+        raise ValueError(
+            f"{type(system).__name__}: which coordinates are cyclic cannot be told: at none of {_MOST_TRIALS} trial "
+            "states, with parameters of about one and with its own, are its accelerations finite."
+        )
     kept = notices[-1].copy()  # not cyclic: the accelerations notice them,
     while (more := kept | notices[:-1][kept].any(axis=0)).sum() > kept.sum():
         kept = more  # or the rate of one that is not cyclic does
     return tuple(name for name, k in zip(names, kept, strict=True) if not k)
+
+
+def _noticed(here: tuple[np.ndarray, ...], there: tuple[np.ndarray, ...], rounding: float) -> np.ndarray:
+    """Which rates of the coordinates, and last whether any of the others, differ beyond rounding."""
+    eps = float(np.finfo(here[0].dtype).eps)
+    rows = []
+    for a, b in (*zip(here[0], there[0], strict=True), (here[1], there[1])):
+        a, b = np.atleast_1d(a), np.atleast_1d(b)
+        size = rounding * (1.0 + np.abs(a).max(initial=0.0))
+        # What is not finite after a shift of a cyclic coordinate was not finite before.
+        rows.append(not np.all(np.abs(b - a) <= eps**0.6 * size))
+    return np.array(rows)

@@ -9,9 +9,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from .. import _native as native
+from .._nan import _spread
 from ._qr import CHUNK, SIZES, qr_eigenvalues
 
 MOST_CONDITION = 1e6
+_APART = 1e4  # rounding errors of the largest eigenvalue: nearer ones are one, whose vectors are any of a plane
 
 
 class Eig(NamedTuple):
@@ -19,7 +21,7 @@ class Eig(NamedTuple):
 
     `values` (n,) [1/s]; `vectors` (n, n), right eigenvectors of unit length in its columns, and `left`; `condition`
     (n,): 1 / |y^H x| of the left and right eigenvectors of unit length, by how much an error of A is magnified in the
-    eigenvalue, infinite where two coalesce. Only the values have derivatives.
+    eigenvalue, infinite where two coalesce.
     """
 
     values: Complex[Array, "*batch n"]
@@ -33,11 +35,11 @@ def eig(A: Float[Array, "*batch n n"]) -> Eig:
 
         d lambda = y^H dA x / (y^H x)
 
-    Where two eigenvalues coalesce they have no derivative, and near it this formula loses its digits: there, at a
-    `condition` above 1e6, the derivative is NaN.
+    and so any number of times, the eigenvectors' part included. Where two eigenvalues coalesce they have no derivative,
+    and near it this formula loses its digits: there, at a `condition` above 1e6, the derivatives are NaN.
     """
     values, left, vectors = jnp.vectorize(_decomposed, signature="(n,n)->(n),(n,n),(n,n)")(A)
-    return Eig(values, vectors, left, _condition(left, vectors))
+    return Eig(values, vectors, left, _condition(values, left, vectors))
 
 
 def eigvals(A: Float[Array, "*batch n n"]) -> Complex[Array, "*batch n"]:
@@ -45,9 +47,13 @@ def eigvals(A: Float[Array, "*batch n n"]) -> Complex[Array, "*batch n"]:
     return jnp.vectorize(_values, signature="(n,n)->(n)")(A)
 
 
-def _condition(left, right):
+def _condition(values, left, right):
     s = jnp.abs(jnp.sum(left.conj() * right, axis=-2))
-    return 1.0 / jnp.where(s > 0, s, jnp.finfo(s.dtype).tiny)
+    far = jax.lax.stop_gradient(jnp.abs(values[..., :, None] - values[..., None, :]))
+    far = jnp.where(jnp.eye(values.shape[-1], dtype=bool), jnp.inf, far)
+    size = jnp.max(jnp.abs(jax.lax.stop_gradient(values)), axis=-1, keepdims=True)
+    apart = jnp.min(far, axis=-1) > _APART * jnp.finfo(s.dtype).eps * size
+    return jnp.where((apart & (s > 0)) | jnp.isnan(s), 1.0 / jnp.where(s == 0, 1.0, s), jnp.inf)
 
 
 # LAPACK gets one matrix at a time. jaxlib cuts a batch into tasks for XLA's pool of threads and waits for them; where
@@ -84,14 +90,18 @@ def _values(A):
 @_decomposed.defjvp
 def _(primals, tangents):
     (A,), (dA,) = primals, tangents
-    values, left, right = _decomposed(A)
-    y, x = jax.lax.stop_gradient((left, right))
+    values, Y, X = _decomposed(A)
+    lost = jax.lax.stop_gradient(_condition(values, Y, X)) >= MOST_CONDITION
+    A_c, dA_c = A.astype(X.dtype), dA.astype(X.dtype)
+    # What is lost is held still here, so that its NaN does not meet the zeros of who does not read it.
+    still, y, x = (jnp.where(lost, jax.lax.stop_gradient(z), z) for z in (values, Y, X))
     # Y^H dA X, of which the diagonal; per unit of y^H x
-    moved = jnp.einsum("ji,jk,ki->i", y.conj(), dA.astype(x.dtype), x)
-    weight = 1.0 / jnp.sum(y.conj() * x, axis=0)
-    weight = jnp.where(_condition(y, x) < MOST_CONDITION, weight, jnp.nan)
-    zeros = jax.tree.map(jnp.zeros_like, (left, right))
-    return (values, left, right), (_weighted(weight, moved), *zeros)
+    d_values = jnp.einsum("ji,jk,ki->i", y.conj(), dA_c, x) / jnp.where(lost, 1.0, jnp.sum(y.conj() * x, axis=0))
+    dX = _turned(A_c, dA_c, still, x, lost)
+    dY = _turned(A_c.conj().T, dA_c.conj().T, still.conj(), y, lost)
+    none = _spread(dA, A, lost.shape)
+    none = jax.lax.complex(none, none)
+    return (values, Y, X), tuple(jnp.where(lost, none, d) for d in (d_values, dY, dX))
 
 
 @_values.defjvp
@@ -99,12 +109,20 @@ def _(primals, tangents):
     return jax.jvp(lambda A: _decomposed(A)[0], primals, tangents)
 
 
-def _weighted(weight, x):
-    # weight * x, whose transpose leaves alone what no cotangent asks for: NaN of one eigenvalue is not that of all.
-    # JAX lets the transpose of a linear solve be written, so this is one, of the diagonal 1 / weight.
-    return jax.lax.custom_linear_solve(
-        lambda y: y / weight,
-        x,
-        solve=lambda _, x: weight * x,
-        transpose_solve=lambda _, ct: jnp.where(ct == 0, jnp.zeros_like(ct), weight * ct),
-    )
+def _turned(A, dA, values, X, lost):
+    """dX (n, n) of the eigenvectors in the columns of X, of unit length and with a real largest entry, as LAPACK's.
+
+        (lambda - A) dx + d lambda x = dA x,   x^H dx = 0,   and a turn i x so that the largest entry stays real
+
+    Unlike a sum over the other eigenvectors this holds where others coalesce, as long as this one is separated.
+    """
+
+    def one(value, x, lost):
+        bordered = jnp.block([[value * jnp.eye(len(A), dtype=x.dtype) - A, x[:, None]], [x.conj()[None], 0j]])
+        bordered = jnp.where(lost, jnp.eye(len(A) + 1, dtype=x.dtype), bordered)
+        dx = jnp.linalg.solve(bordered, jnp.append(dA @ x, jnp.zeros(1, x.dtype)))[:-1]
+        k = jnp.argmax(jnp.abs(jax.lax.stop_gradient(x)))
+        turn = (dx[k] / x[k]).imag
+        return dx - jax.lax.complex(jnp.zeros_like(turn), turn) * x
+
+    return jax.vmap(one, in_axes=(0, 1, 0), out_axes=1)(values, X, lost)
