@@ -117,3 +117,28 @@ def test_a_load_that_nothing_felt_is_found_out(anew):
     assert not audit.ok  # with the torque felt, the energy does not balance; else the words are these
     assert ("move nothing" in str(audit)) == anew
     np.testing.assert_allclose(audit.lost_work, 0.2 * 2.0 * np.asarray(ts) * anew, atol=1e-14)
+
+
+class Geared(jk.System):
+    """Two particles on rails, 1e-9 a + b = 0 of their speeds, solved for a."""
+
+    coordinates = ("x", "y")
+    speeds = ("b",)
+    dependent_speeds = ("a",)
+
+    def q_dot(self, t, q, u):
+        return u["a"], u["b"]
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P, Q = O.moving(q["x"] * N.x, u["a"] * N.x), O.moving(q["y"] * N.y, u["b"] * N.y)
+        bodies = [jk.Body(1.0, 0.0, P, name="P"), jk.Body(1.0, 0.0, Q, name="Q")]
+        return jk.Motion(bodies, [1e-9 * u["a"] + u["b"]])
+
+
+def test_one_residual_is_conditioned_by_the_speeds_beside_it():
+    """C_dep alone is (1 x 1) and has the condition number 1, whatever it is."""
+    ride = jk.simulate(Geared(), jk.State(jnp.zeros(2), jnp.array([1e-9])), jnp.linspace(0.0, 0.1, 6))
+    audit = jk.audit(Geared(), ride)
+    np.testing.assert_allclose(audit.condition_C_dep, 1e9, rtol=1e-6)
+    assert [verdict for what, _, verdict in audit.lines() if what == "condition of C_dep"] == ["look"]

@@ -1,10 +1,15 @@
 """Derivatives of eigenvalues of any order, and where there are none; derivatives of what was not found."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from test_stability_linear import RodOnPin
 
+import jaxkane as jk
+from jaxkane.stability import critical_speeds, eigenvalues, equilibrium, linearize
 from jaxkane.stability._eig import eig, eigvals
 
 
@@ -28,7 +33,7 @@ MODES = {
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("f", [lambda A: eig(A).values, eigvals], ids=["eig", "eigvals"])
-@pytest.mark.parametrize("d, k", [(0.3, 2.0), (1.5, 0.7)], ids=["oscillating", "decaying"])
+@pytest.mark.parametrize(("d", "k"), [(0.3, 2.0), (1.5, 0.7)], ids=["oscillating", "decaying"])
 def test_second_derivatives_have_closed_forms(f, mode, d, k):
     rtol = 1e-11
     exact = {
@@ -69,6 +74,7 @@ def test_one_that_is_separated_does_not_mind_that_others_coalesce():
     rtol = 1e-11
     B = jnp.array([[0.1, 0.4, 0.2], [0.3, 0.2, -0.5], [0.7, 0.6, 0.5]])
     second = [jax.jit(mode(lambda p, A: eigvals(A + p * B).real)) for mode in MODES.values()]
+    hessian_of_third = jax.jit(jax.hessian(lambda A: eigvals(A).real[2]))
     for coupled in (1.0, 0.0):
         A = jnp.array([[1.0, coupled, 0.2], [0.0, 1.0, 0.3], [0.0, 0.0, 3.0]])
         for derivative in second:
@@ -80,17 +86,118 @@ def test_one_that_is_separated_does_not_mind_that_others_coalesce():
             P = np.eye(3) - np.outer(x, y)
             S = P @ np.linalg.inv(values[2] * np.eye(3) - np.asarray(A) + np.outer(x, y)) @ P
             np.testing.assert_allclose(found[2], 2 * y @ B @ S @ B @ x, rtol=rtol)
-        of_third = jax.jit(jax.hessian(lambda A: eigvals(A).real[2]))(A)
+        of_third = hessian_of_third(A)
         assert np.isfinite(of_third).all()  # in reverse mode what is not read says nothing
         assert np.isinf(eig(A).condition[:2]).all()
         assert np.isfinite(eig(A).condition[2])
 
 
 def test_in_single_precision_and_in_batches_of_none():
-    slope = jax.jacfwd(lambda p: eigvals(pair(p)).real)(jnp.array([1.5, 0.7], jnp.float32))
+    slope = jax.jit(jax.jacfwd(lambda p: eigvals(pair(p)).real))(jnp.array([1.5, 0.7], jnp.float32))
     assert slope.dtype == jnp.float32
     assert np.isfinite(slope).all()
-    assert jax.vmap(lambda p: jax.hessian(lambda p: eigvals(pair(p)).real)(p))(jnp.zeros((0, 2))).shape == (0, 2, 2, 2)
-    found = eig(jnp.full((3, 3), jnp.nan))
+    none = jax.eval_shape(jax.vmap(jax.hessian(lambda p: eigvals(pair(p)).real)), jnp.zeros((0, 2)))
+    assert none.shape == (0, 2, 2, 2)
+    assert eigvals(jnp.zeros((0, 3, 3))).shape == (0, 3)
+    found = jax.jit(eig)(jnp.full((3, 3), jnp.nan))
     assert np.isnan(found.values).all()
     assert np.isnan(found.condition).all()
+
+
+# -- what was not found has no derivative
+
+
+class Pushed(jk.System):
+    """A pendulum about a pin, pushed by a torque: it stands still at sin(angle) = torque / (m g l), if that is one."""
+
+    length: jk.Scalar = jk.parameter(0.5, positive=True)  # [m]
+    spring: jk.Scalar = jk.parameter(0.0)  # [N m/rad]
+    damper: jk.Scalar = jk.parameter(1.0)  # [N m s/rad]
+    coordinates = ("angle",)
+    speeds = ("rate",)
+    inputs = ("torque",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        rod = N.rotate(3, q["angle"], u["rate"])
+        return jk.Motion([jk.Body(2.0, 0.0, O.fixed(-self.length * rod.y), rod)], frames={"rod": rod})
+
+    def loads(self, t, q, u, motion, inputs):
+        torque = inputs["torque"] - self.damper * u["rate"] - self.spring * q["angle"]
+        return jk.weight(motion, -9.81 * motion.N.y), jk.Torque(torque * motion.N.z, motion["rod"])
+
+
+def standing(length, torque):
+    return equilibrium(Pushed(length=length), {"angle": 0.2}, {"torque": torque})["angle"]
+
+
+LIMIT = 2.0 * 9.81 * 0.5  # [N m] that weight can balance at 0.5 m
+
+
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+def test_an_equilibrium_that_is_not_found_has_no_derivative(derivative):
+    value_and_slope = jax.jit(lambda *at: (standing(*at), derivative(standing, (0, 1))(*at)))
+    value, slope = value_and_slope(0.5, 1.2 * LIMIT)
+    assert np.isnan([value, *slope]).all()
+    value, slope = value_and_slope(0.5, 0.3 * LIMIT)
+    np.testing.assert_allclose(value, np.arcsin(0.3), rtol=1e-12)
+    np.testing.assert_allclose(slope[1], 1 / (LIMIT * np.cos(value)), rtol=1e-10)
+
+
+def test_a_member_that_is_not_found_leaves_the_others_their_derivative():
+    """Shared length, a batch of torques, of which the second is too large: nobody reads it, or everything is told."""
+    torques = jnp.array([0.3, 1.2, 0.5]) * LIMIT
+
+    @jax.jit
+    def some(length, weights):
+        angles = jax.vmap(lambda torque: standing(length, torque))(torques)
+        return jnp.sum(jnp.where(weights > 0, weights * angles, 0.0))
+
+    slope = jax.jit(jax.grad(some))
+    s = np.array([0.3, 0.5])
+    np.testing.assert_allclose(slope(0.5, jnp.array([1.0, 0.0, 1.0])), -np.sum(s / np.sqrt(1 - s**2)) / 0.5, rtol=1e-9)
+    assert np.isnan(slope(0.5, jnp.ones(3)))
+
+
+def softest(length, damper=1.0):
+    """The spring from which on it hangs still."""
+    hanging = jk.State(jnp.zeros(1), jnp.zeros(1))
+    at = lambda system, spring: (dataclasses.replace(system, spring=spring), hanging)  # noqa: E731
+    return critical_speeds(Pushed(length=length, damper=damper), jnp.linspace(-20.0, 5.0, 6), at)["mode 1"]
+
+
+def test_a_critical_value_that_is_not_there_has_no_derivative():
+    """Hanging, a spring of -m g l makes it unstable; with a damper that drives it, nothing makes it stable."""
+    both = jax.jit(jax.value_and_grad(softest))
+    np.testing.assert_allclose(both(0.5, 1.0), [-LIMIT, -2 * 9.81], rtol=1e-11)
+    assert np.isnan(both(0.5, -1.0)).all()
+
+
+def test_a_motion_that_is_not_steady_has_no_linear_model_under_a_trace():
+    """It was the model of an instant, without a word: now NaN in its row, as it is an error alone."""
+    tilts = jnp.array([0.0, 0.4, np.pi])
+    found = eigenvalues(Pushed(), tilts, lambda system, angle: jk.State(angle[None], jnp.zeros(1)))
+    np.testing.assert_array_equal(np.isnan(found.eigenvalues), [[False] * 2, [True] * 2, [False] * 2])
+    assert "NaN at 0.4: no steady motion there" in repr(found)
+
+    @jax.jit
+    def stiffness(length, angle):
+        state = jk.State(angle[None], jnp.zeros(1))
+        return jnp.stack([linearize(Pushed(length=length), state, steady=s).A[1, 0] for s in (True, False)])
+
+    values, slopes = (jax.jit(jax.vmap(f, (None, 0)))(0.5, tilts) for f in (stiffness, jax.jacrev(stiffness)))
+    exact = -9.81 / 0.5 * np.cos(tilts)
+    np.testing.assert_allclose(values[:, 1], exact, rtol=1e-12)
+    np.testing.assert_allclose(slopes[:, 1], -exact / 0.5, rtol=1e-12)
+    for x in (values, slopes):
+        np.testing.assert_array_equal(np.isnan(x[:, 0]), [False, True, False])
+    with pytest.raises(ValueError, match="angle is not finite: there is no linear model there"):
+        linearize(Pushed(), jk.State(jnp.array([jnp.nan]), jnp.zeros(1)), steady=False)
+
+
+def test_off_the_constraints_there_is_no_linear_model_of_an_instant_either():
+    rod = RodOnPin(length=0.7)
+    off = jk.State(jnp.array([0.1, 0.1]), jnp.zeros(1))
+    with pytest.raises(ValueError, match="violate the configuration constraints"):
+        linearize(rod, off, steady=False)
+    assert np.isnan(jax.jit(lambda q: linearize(rod, jk.State(q, off.u), steady=False).A)(off.q)).all()

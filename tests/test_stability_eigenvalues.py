@@ -71,7 +71,7 @@ def test_modes_are_followed_and_named(found):
     A = linearize(BIKE, straight_ahead(BIKE, 5.0), states=LATERAL).A
     X, lam = found.vectors[50], found.eigenvalues[50]
     np.testing.assert_allclose(A.astype(complex) @ X, X * lam[None, :], atol=1e-12)
-    with pytest.raises(KeyError, match="no mode 'wobble'; there are weave, capsize, castering"):
+    with pytest.raises(KeyError, match="no 'wobble' in these modes; there are weave, capsize, castering"):
         found["wobble"]
 
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from .._check import is_concrete
 from .._lookup import not_there
+from .._nan import nan_where
 from .._reads import compiled
 from .._system import System
 from ._eig import eig
@@ -28,13 +29,14 @@ class CriticalSpeeds(eqx.Module):
 
     Attributes: `values` (m,); `frequency` (m,) [rad/s], zero where the mode does not oscillate; `direction` (m,): 1
     where the mode becomes unstable, -1 where it becomes stable; `mode` (m,): its place in `modes`, the names.
-    `found["weave"]` is the first value of that mode, NaN without one.
+    `found["weave"]` is the first value of that mode; without one it is `none`, which is NaN with its derivatives.
     """
 
     values: Float[Array, " m"]
     frequency: Float[Array, " m"]
     direction: Int[Array, " m"]
     mode: Int[Array, " m"]
+    none: Float[Array, ""]
     modes: tuple[str, ...] = eqx.field(static=True)
 
     def __getitem__(self, name: str) -> Float[Array, ""]:
@@ -43,8 +45,8 @@ class CriticalSpeeds(eqx.Module):
         columns = np.array([i for i, mode in enumerate(self.modes) if mode == name])
         mine = jnp.any(self.mode[:, None] == columns[None, :], axis=1) & jnp.isfinite(self.values)
         if not mine.shape[0]:
-            return jnp.asarray(jnp.nan, self.values.dtype)
-        return jnp.where(jnp.any(mine), self.values[jnp.argmax(mine)], jnp.nan)
+            return self.none
+        return jnp.where(jnp.any(mine), self.values[jnp.argmax(mine)], self.none)
 
     def __repr__(self) -> str:
         if not is_concrete(self.values):
@@ -90,9 +92,11 @@ def critical_speeds(
     row, column, is_one = _sign_changes(found, most)
     critical, frequency = _refine(system, found, at, states, row, column)
     direction = jnp.sign(_real(found, row + 1, column) - _real(found, row, column)).astype(int)
-    critical, frequency = (jnp.where(is_one, x, jnp.nan) for x in (critical, frequency))
+    origin = (system, values)
+    critical, frequency = nan_where(~is_one, (critical, frequency), origin)
+    none = nan_where(jnp.array(True), jnp.zeros((), values.dtype), origin)
     order = jnp.argsort(jax.lax.stop_gradient(critical))
-    return CriticalSpeeds(critical[order], frequency[order], direction[order], column[order], found.modes)
+    return CriticalSpeeds(critical[order], frequency[order], direction[order], column[order], none, found.modes)
 
 
 def _default_grid(system: System, values: Any, motion: MotionAt) -> Any:

@@ -91,10 +91,10 @@ def _values(A):
 def _(primals, tangents):
     (A,), (dA,) = primals, tangents
     values, Y, X = _decomposed(A)
-    lost = jax.lax.stop_gradient(_condition(values, Y, X)) >= MOST_CONDITION
+    lost = ~(jax.lax.stop_gradient(_condition(values, Y, X)) < MOST_CONDITION)
     A_c, dA_c = A.astype(X.dtype), dA.astype(X.dtype)
-    # What is lost is held still here, so that its NaN does not meet the zeros of who does not read it.
-    still, y, x = (jnp.where(lost, jax.lax.stop_gradient(z), z) for z in (values, Y, X))
+    # Ones stand for what is lost, so that its NaN does not meet the zeros of who does not read it.
+    still, y, x = (jnp.where(lost, 1.0, z) for z in (values, Y, X))
     # Y^H dA X, of which the diagonal; per unit of y^H x
     d_values = jnp.einsum("ji,jk,ki->i", y.conj(), dA_c, x) / jnp.where(lost, 1.0, jnp.sum(y.conj() * x, axis=0))
     dX = _turned(A_c, dA_c, still, x, lost)

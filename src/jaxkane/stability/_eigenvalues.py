@@ -66,6 +66,9 @@ class Eigenvalues(eqx.Module):
         at = np.asarray(self.values)[np.asarray(self.coalescing).any(axis=1)]
         if at.size:
             text += f"; modes coalesce at {', '.join(f'{x:.6g}' for x in at)}: no derivative there"
+        none = np.asarray(self.values)[~np.isfinite(np.asarray(self.eigenvalues)).all(axis=1)]
+        if none.size:
+            text += f"; NaN at {', '.join(f'{x:.6g}' for x in none)}: no steady motion there"
         return f"Eigenvalues({text})"
 
 

@@ -17,6 +17,7 @@ from .._fuse import fused
 from .._kane import as_array, checked_inputs, refuse_incomplete
 from .._linear import as_vector, solve, stack
 from .._lookup import hint, refuse_unknown
+from .._nan import nan_where
 from .._rates import state_rates
 from .._reads import compiled
 from .._system import State, System, Values
@@ -95,7 +96,8 @@ def linearize(
     **Returns:** a `LinearModel`; `A, B, C, D = linearize(...)` works too.
 
     **Raises:** `ValueError` for unknown names, a motion that is not steady, coordinates off the constraints, or as many
-    dependent coordinates as there are not constraints.
+    dependent coordinates as there are not constraints. Under a trace the matrices are NaN, with their derivatives,
+    where the motion is not steady, not finite or off the constraints.
     """
     name = type(system).__name__
     if isinstance(motion, SteadyMotion):
@@ -108,6 +110,7 @@ def linearize(
     w = checked_inputs(system, inputs)
     w = jnp.stack([jnp.asarray(w[k], q.dtype) for k in system.inputs]) if w else jnp.zeros(0, q.dtype)
     check_system(system, t, q, u)
+    origin = (system, t, q, u, w)
     n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q).shape[0]
     dependent = tuple(system.dependent_coordinates if dependent is None else dependent)
     if len(dependent) != n_h:
@@ -121,9 +124,15 @@ def linearize(
     functions = dict(outputs) if isinstance(outputs, Mapping) else {}
     known = (*system.coordinates, *system.speeds, *system.dependent_speeds)
     refuse_unknown(rows, (*known, *functions), f"{name}: outputs are functions, or by name; it has no output", "it has")
-    if steady and is_concrete(system, t, q, u, w):
-        _check_steady(system, t, q, u, w)
-    A, B, C, D = _derivatives((system, t, q, u, w), _Choice(dependent, kept, rows), _Functions(functions))
+    if is_concrete(system, t, q, u, w):
+        _check_state(system, t, q, u, w, steady)
+        wrong = jnp.array(False)
+    else:
+        wrong = _is_wrong(system, t, q, u, w, steady)
+    # Numbers in the place of what is none, so that its NaN does not meet the zeros of who does not read it.
+    t, q, u, w = (jnp.where(jnp.all(jnp.isfinite(x)), x, 0.1) for x in (t, q, u, w))
+    model = _derivatives((system, t, q, u, w), _Choice(dependent, kept, rows), _Functions(functions))
+    A, B, C, D = nan_where(wrong, model, origin)
     return LinearModel(A, B, C, D, kept, tuple(system.inputs), rows)
 
 
@@ -212,17 +221,42 @@ def _rates(system, t, q, u, w):
     return q_dot, u_dot, configuration_residual(system, t, q)
 
 
-def _check_steady(system: System, t, q, u, w) -> None:
+def _tolerances(system: System, u) -> tuple[float, Any]:
+    """How far coordinates may be off the constraints, and rates from zero."""
+    tol = float(jnp.finfo(u.dtype).eps) ** 0.4
+    return tol, tol * (1.0 + jnp.max(jnp.abs(u), initial=0.0))
+
+
+def _still(system: System) -> np.ndarray:
+    """Places of the coordinates that stand still in a steady motion."""
+    cyclic = cyclic_coordinates(system)
+    return np.array([i for i, k in enumerate(system.coordinates) if k not in cyclic], int)
+
+
+def _is_wrong(system: System, t, q, u, w, steady: bool):
+    """Whether a state is off the constraints, not finite or, where that is asked, not steady."""
+    q_dot, u_dot, h = _rates(system, t, q, u, w)
+    tol, slack = _tolerances(system, u)
+    rates = jnp.concatenate([u_dot, q_dot[_still(system)]]) if steady else jnp.zeros(0, q.dtype)
+    fine = jnp.all(jnp.abs(h) <= tol) & jnp.all(jnp.abs(rates) <= slack)
+    return jax.lax.stop_gradient(~(fine & jnp.all(jnp.isfinite(jnp.concatenate([q, u, w, t[None]])))))
+
+
+def _check_state(system: System, t, q, u, w, steady: bool) -> None:
     name = type(system).__name__
     q_dot, u_dot, h = map(np.asarray, _rates(system, t, q, u, w))
-    cyclic = cyclic_coordinates(system)
-    tol = float(jnp.finfo(q.dtype).eps) ** 0.4
-    if h.size and np.abs(h).max() > tol:
+    tol, slack = _tolerances(system, u)
+    named = ((system.coordinates, q), (system.speeds, u), (system.inputs, w), (("t",), t[None]))
+    bad = [k for names, x in named for k, value in zip(names, np.asarray(x), strict=True) if not np.isfinite(value)]
+    if bad:
+        raise ValueError(f"{name}: {', '.join(bad)} is not finite: there is no linear model there.")
+    if h.size and not np.abs(h).max() <= tol:
         raise ValueError(f"{name}: the coordinates violate the configuration constraints by {h}. Use assemble.")
+    if not steady:
+        return
     rates = {f"{k} is accelerated by": x for k, x in zip(system.speeds, u_dot, strict=True)}
-    rates |= {f"{k} changes with": x for k, x in zip(system.coordinates, q_dot, strict=True) if k not in cyclic}
-    scale = 1.0 + float(np.abs(u).max(initial=0.0))
-    moving = [f"{k} {float(x):.3g}" for k, x in rates.items() if not abs(x) <= tol * scale]
+    rates |= {f"{system.coordinates[i]} changes with": q_dot[i] for i in _still(system)}
+    moving = [f"{k} {float(x):.3g}" for k, x in rates.items() if not abs(x) <= float(slack)]
     if moving:
         raise ValueError(
             f"{name}: this motion is not steady: {', '.join(moving)}. Find one with equilibrium or steady_turn; or ask "

@@ -38,6 +38,7 @@ def _root_jvp(residual, primals, tangents):
     z = root(residual, guess, args)
     _, dF = jax.jvp(lambda args: residual(z, args), (args,), (tangents[1],))
     J = jacobian(lambda z: residual(z, args), z)
+    J = jnp.where(jnp.all(jnp.isfinite(J)), J, 0.0)  # what was not found has no slope, and says so elsewhere
     return z, -jnp.linalg.pinv(J) @ dF
 
 

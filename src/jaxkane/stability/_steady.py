@@ -14,6 +14,7 @@ from .._check import check_system, configuration_residual, is_concrete
 from .._equations import dependent_speeds
 from .._kane import as_array, checked_inputs
 from .._lookup import by_name, hint
+from .._nan import nan_where
 from .._rates import state_rates
 from .._reads import compiled
 from .._system import State, System
@@ -186,13 +187,14 @@ def _solve(problem: Problem, guess, args):
     scale = 1.0 + jnp.max(jnp.abs(J)) * 1e-2
     good = (r <= eps**0.6 * scale) & (slopes[-1] > eps**0.6)
     q, u, inputs = problem.parts(z, q, known)
-    return as_motion(system, t, q, u, inputs, r, good), slopes, J
+    return as_motion(system, t, q, u, inputs, r, ~good, (guess, args)), slopes, J
 
 
-def as_motion(system, t, q, u, inputs, residual, good=True) -> SteadyMotion:
-    """A `SteadyMotion`, NaN unless `good`."""
+def as_motion(system, t, q, u, inputs, residual, missing=None, origin=()) -> SteadyMotion:
+    """A `SteadyMotion`, NaN with its derivatives by `origin` where it is `missing`."""
     u_dep = dependent_speeds(system, t, q, u) if system.dependent_speeds else jnp.zeros(0, q.dtype)
-    q, u, u_dep = (jnp.where(good, x, jnp.nan) for x in (q, u, u_dep))
+    if missing is not None:
+        q, u, u_dep, inputs = nan_where(missing, (q, u, u_dep, inputs), origin)
     names = (tuple(system.coordinates), tuple(system.speeds), tuple(system.dependent_speeds))
     return SteadyMotion(q, u, u_dep, dict(inputs), t, residual, names)
 
