@@ -86,12 +86,32 @@ def test_the_state_of_an_entry_is_consistent(example):
     assert_close(np.array([float(x) for x in q.configuration(T, q.q)]), 0.0, 1e-14, scale=1.0)
 
 
-def test_rates_keep_the_configuration_constraints(example):
+# Laws that only some entries can obey: those with constraints of the configuration, and with dependent speeds.
+CONSTRAINED = [k for k, entry in CATALOG.items() if len(entry.example().configuration_constraints(T, entry.q))]
+DEPENDENT = [k for k, entry in CATALOG.items() if entry.example().dependent_speeds]
+
+
+def test_some_entries_have_constraints():
+    assert {"RigidBody", "AircraftEulerParameters", "SpinningTop", "WhippleBicycle"} <= set(CONSTRAINED)
+    assert "WhippleBicycle" in DEPENDENT
+
+
+@pytest.mark.parametrize("name", CONSTRAINED)
+def test_rates_keep_the_configuration_constraints(name):
+    example = _example(name)
     now = Instant(*example.at)
-    if not now.configuration(now.t, now.q):
-        return
     _, h_dot = example.along_motion(lambda t, q, u: jnp.stack(now.configuration(t, tuple(q))))
     assert_close(h_dot, 0.0, 1e-13, scale=np.abs(example.q_dot).max())
+
+
+@pytest.mark.parametrize("name", DEPENDENT)
+def test_dependent_speeds_keep_the_velocity_constraints_and_change_as_their_accelerations_say(name):
+    example = _example(name)
+    now = Instant(*example.at)
+    assert_close(jnp.stack(now.residuals(now.t, now.q, now.u_all)), 0.0, 1e-13, scale=np.abs(now.u_all).max())
+    u_dep, u_dep_dot = example.along_motion(lambda t, q, u: jk.dependent_speeds(example.system, t, q, u))
+    assert u_dep.shape == (len(example.system.dependent_speeds),)
+    assert_close(jk.dependent_accelerations(*example.at, example.inputs), u_dep_dot, 1e-11)
 
 
 def test_mass_matrix_is_symmetric_and_positive_definite(example):
