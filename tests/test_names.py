@@ -87,6 +87,11 @@ def test_dicts_wherever_coordinates_and_speeds_are_taken():
     np.testing.assert_array_equal(model.A, jk.stability.linearize(PENDULUM, jk.State([0.0, 0.0], [0.0, 0.0])).A)
 
 
+def test_a_state_of_something_else_is_refused():
+    with pytest.raises(TypeError, match=r"state\.u is an array of numbers, or a dict by name; got None"):
+        jk.simulate(PENDULUM, jk.State([0.1, 0.2], None), TS)
+
+
 def test_a_dependent_coordinate_that_is_left_out_is_no_zero():
     circle, match = OnACircle(), r"OnACircle: y is left out of q.*jaxkane\.assemble"
     for evaluate in (

@@ -368,4 +368,7 @@ def as_state(system: System, state: State) -> State:
         by_names(values, names, f"{title}: state.{label}") if isinstance(values, Mapping) else values
         for label, values, names in (("q", state.q, system.coordinates), ("u", state.u, system.speeds))
     )
+    for label, values in (("q", q), ("u", u)):
+        if not hasattr(values, "shape"):
+            raise TypeError(f"{title}: state.{label} is an array of numbers, or a dict by name; got {values!r}.")
     return State(q, u.astype(q.dtype) if isinstance(state.u, Mapping) else u)
