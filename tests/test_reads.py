@@ -4,11 +4,13 @@ import array
 import dataclasses
 import functools
 import gc
+import re
 import sys
 import threading
 import types
 import weakref
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import diffrax
@@ -233,6 +235,7 @@ class Holder(eqx.Module):
         return self.gain * self.f(t, state)
 
 
+@pytest.mark.slow
 def test_sweeps_fits_models_and_forces_follow(monkeypatch):
     table = {"mass": np.array([1.0, 2.0])}
     trial = jk.fit.Trial(TS, {"x": fall(1.62) * (TS / TS[-1]) ** 2}, sigma=1.0)
@@ -394,3 +397,12 @@ def test_a_look_walks_through_nothing(monkeypatch):
     version = version_of(system)
     monkeypatch.setattr("jaxkane._reads._Walk", None)  # it would be called to look anew
     assert version_of(system) == version
+
+
+def test_every_compiled_function_of_the_library_follows():
+    """One at module level that is compiled by itself would keep what was read when it was traced."""
+    source = Path(jk.__file__).parent
+    wrong = r"^@(eqx\.filter_jit|jax\.jit)\s+def (\w+)"
+    found = {m[2] for path in source.rglob("*.py") for m in re.finditer(wrong, path.read_text(), re.MULTILINE)}
+    of_numbers = {"eliminate", "_solved_by_lapack", "_det_by_lapack"}
+    assert found <= of_numbers, f"compile {found} with `_reads.compiled`, or show that they read no description"

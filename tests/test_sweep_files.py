@@ -101,6 +101,7 @@ def test_numbers_that_inputs_and_reduce_read_belong_to_the_sweep(tmp_path):
     np.testing.assert_array_equal(run(tmp_path, inputs=inputs, reduce=reduce).values, first)
 
 
+@pytest.mark.slow
 def test_a_digest_outlives_the_process_and_tells_programs_apart():
     code = """
 import jax, jax.numpy as jnp, numpy as np, dataclasses, jaxkane as jk

@@ -98,6 +98,7 @@ def test_a_checkpoint_that_cannot_be_read_is_named(how, problem, tmp_path):
     assert [p.name for p in tmp_path.iterdir()] == ["fit.npz"]
 
 
+@pytest.mark.slow
 def test_bfgs_keeps_the_best_when_it_is_interrupted(problem, monkeypatch):
     from jaxkane.fit import _bfgs
 

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .. import _native
+from .._reads import on_forget
 from ._solve import Job, Part
 
 _FLAGS = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_numpy_rank_promotion")
@@ -80,6 +81,9 @@ def _job(common: bytes) -> Job:
     import cloudpickle
 
     return jax.tree.map(lambda x: jnp.asarray(x) if isinstance(x, np.ndarray) else x, cloudpickle.loads(common))
+
+
+on_forget(_job.cache_clear)
 
 
 def _as_numpy(x: Any) -> Any:
