@@ -108,20 +108,18 @@ def test_without_a_cache_nothing_but_the_precision_changes():
     ]
 
 
-def test_it_warns_when_it_comes_too_late():
+def test_it_warns_when_it_comes_too_late_and_refuses_no_devices():
     code = (
         "x = jax.numpy.ones(3)\nimport warnings\nwith warnings.catch_warnings(record=True) as told:\n"
         "    warnings.simplefilter('always')\n    jk.configure(cache=False, devices=2, verbose=False)\n"
-        "print(*[w.message for w in told], sep='\\n'); print(told[0].filename)"
+        "print(*[w.message for w in told], sep='\\n'); print(told[0].filename)\njk.configure(cache=False, devices=0)"
     )
-    late, devices, where = python(code).stdout.splitlines()
+    run = python(code, status=1)
+    late, devices, where = run.stdout.splitlines()
     assert "came late: 1 float32 array had been made before" in late
     assert "too late for devices=2: JAX has started with 1" in devices
     assert where == "<string>"
-
-
-def test_what_is_refused():
-    assert "`devices` is a number of CPU devices" in python("jk.configure(devices=0)", status=1).stderr
+    assert "ValueError: `devices` is a number of CPU devices" in run.stderr
 
 
 def test_without_llvm_xla_does_the_work_and_says_so():

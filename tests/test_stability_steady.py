@@ -284,7 +284,7 @@ def test_a_turn_depends_on_parameters_as_differences_say():
 
 
 def test_faults_of_a_family_are_named(beside_capsize):
-    with pytest.raises(ValueError, match="`towards` is one name with .*; did you mean .steer."):
+    with pytest.raises(ValueError, match=r"`towards` is one name with .*; did you mean .steer."):
         family(BIKE, beside_capsize, towards={"speed": 1})
     with pytest.raises(ValueError, match="too much is held"):
         family(BIKE, beside_capsize, towards={"roll": 1}, hold=("roll",))
