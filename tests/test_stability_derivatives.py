@@ -173,12 +173,26 @@ def test_a_critical_value_that_is_not_there_has_no_derivative():
     assert np.isnan(both(0.5, -1.0)).all()
 
 
+def test_a_critical_value_among_those_given_and_one_beside_none():
+    """Exactly at a given value the sign is that of rounding; beside a value without a motion nothing can be told."""
+    hanging = jk.State(jnp.zeros(1), jnp.zeros(1))
+    at = lambda system, spring: (dataclasses.replace(system, spring=spring), hanging)  # noqa: E731
+    found = critical_speeds(Pushed(), jnp.array([-20.0, -LIMIT, 0.0]), at)
+    np.testing.assert_allclose(found.values, [-LIMIT], rtol=1e-12)
+    with pytest.raises(ValueError, match="there is no steady motion at nan"):
+        critical_speeds(Pushed(), jnp.array([-20.0, jnp.nan, 0.0]), at)
+    assert np.isnan(jax.jit(lambda x: critical_speeds(Pushed(), x, at).values)(jnp.array([-20.0, jnp.nan, 0.0]))).all()
+    assert critical_speeds(Pushed(), jnp.zeros(0), at).values.shape == (0,)
+
+
 def test_a_motion_that_is_not_steady_has_no_linear_model_under_a_trace():
     """It was the model of an instant, without a word: now NaN in its row, as it is an error alone."""
     tilts = jnp.array([0.0, 0.4, np.pi])
     found = eigenvalues(Pushed(), tilts, lambda system, angle: jk.State(angle[None], jnp.zeros(1)))
     np.testing.assert_array_equal(np.isnan(found.eigenvalues), [[False] * 2, [True] * 2, [False] * 2])
     assert "NaN at 0.4: no steady motion there" in repr(found)
+    with pytest.raises(ValueError, match="there is no steady motion, and no mode"):
+        jk.plot.mode_shapes(found, at=0.4)
 
     @jax.jit
     def stiffness(length, angle):

@@ -46,6 +46,8 @@ def mode_shapes(
     refuse_unknown(labels if only is None else only, labels, "mode_shapes: there is no state")
     rows = [i for i, state in enumerate(labels) if only is None or state in only]
     drawn = [k for k in range(len(lam)) if lam[k].imag >= -1e-9 * abs(lam[k])]
+    if not np.all(np.isfinite(lam)):
+        raise ValueError("mode_shapes: the eigenvalues are not finite here: there is no steady motion, and no mode.")
     if axes is None:
         axes = plt.subplots(
             1,

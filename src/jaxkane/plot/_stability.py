@@ -121,6 +121,8 @@ def _table(values: Any, eigenvalues: Any, modes: Sequence[str] | None) -> tuple[
         raise ValueError(
             f"The eigenvalues (m, n) stand at m values of the parameter, at least two; got {lam.shape} at {x.shape}."
         )
+    if not np.any(np.isfinite(lam)):
+        raise ValueError("None of the eigenvalues is finite: there is no steady motion at these values.")
     names = [""] * lam.shape[1] if modes is None else list(modes)
     if len(names) != lam.shape[1]:
         raise ValueError(f"There are {lam.shape[1]} modes, and {len(names)} names: {', '.join(names)}.")

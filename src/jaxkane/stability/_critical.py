@@ -85,11 +85,21 @@ def critical_speeds(
 
     with NaN where the mode has no derivative because it coalesces with another.
 
-    **Raises:** `ValueError` as `eigenvalues`.
+    **Raises:** `ValueError` as `eigenvalues`, and where some of `values` have no steady motion; under a trace all are
+    NaN then.
     """
     values, at, states, _ = family_of(system, _default_grid(system, values, motion), motion, states)
     found = eigenvalues(system, values, motion, states=states, modes=modes)
+    is_known = jnp.all(jnp.isfinite(jax.lax.stop_gradient(found.eigenvalues)))
+    if is_concrete(is_known) and not bool(is_known):
+        gone = np.asarray(found.values)[~np.isfinite(np.asarray(jax.lax.stop_gradient(found.eigenvalues))).all(axis=1)]
+        places = ", ".join(f"{x:.6g}" for x in gone)
+        raise ValueError(
+            f"critical_speeds({type(system).__name__}): there is no steady motion at {places}, so that what becomes "
+            "stable or unstable beside it would be missed. Give values at which there is one."
+        )
     row, column, is_one = _sign_changes(found, most)
+    is_one = is_one & is_known
     critical, frequency = _refine(system, found, at, states, row, column)
     direction = jnp.sign(_real(found, row + 1, column) - _real(found, row, column)).astype(int)
     origin = (system, values)
@@ -112,7 +122,10 @@ def _sign_changes(found: Eigenvalues, most: int) -> tuple[Any, Any, Any]:
     x = jax.lax.stop_gradient(found.eigenvalues)
     upper = (x.imag[:-1] >= 0) & (x.imag[1:] >= 0)
     # What neither grows nor decays (an undamped oscillation) has a real part of rounding errors only.
-    sign = jnp.sign(jnp.where(jnp.abs(x.real) > 1e-10 * jnp.max(jnp.abs(x)), x.real, 0.0))
+    sign = jnp.sign(jnp.where(jnp.abs(x.real) > 1e-10 * jnp.max(jnp.abs(x), initial=0.0), x.real, 0.0))
+    # One that is zero at a value itself, between two signs, has passed it.
+    before, after = jnp.concatenate([sign[:1], sign[:-1]]), jnp.concatenate([sign[1:], sign[-1:]])
+    sign = jnp.where((sign == 0) & (before * after < 0), after, sign)
     changes = (sign[:-1] * sign[1:] < 0) & upper
     if is_concrete(changes):
         row, column = map(jnp.asarray, np.nonzero(np.asarray(changes)))
@@ -139,6 +152,7 @@ def _refine(system, found: Eigenvalues, motion, states, rows, columns):
     def one(place):
         row, column = place
         lower, upper = fixed.values[row], fixed.values[row + 1]
+        beside = 1e-3 * (upper - lower)  # a zero at one of them has the sign of its rounding
         a, b = fixed.eigenvalues[row, column], fixed.eigenvalues[row + 1, column]
         s = a.real / (a.real - b.real)
         near = jax.lax.complex(jnp.zeros_like(s), a.imag + s * (b.imag - a.imag))
@@ -149,7 +163,7 @@ def _refine(system, found: Eigenvalues, motion, states, rows, columns):
             optx.Bisection(rtol=eps, atol=eps, flip="detect"),
             lower + s * (upper - lower),
             args,
-            options={"lower": lower, "upper": upper},
+            options={"lower": lower - beside, "upper": upper + beside},
             max_steps=64,
             throw=False,
         )
