@@ -17,6 +17,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.core import Tracer
 
 
 def digest(value: Any) -> str:
@@ -49,6 +50,8 @@ class _Hash:
     def add(self, value: Any) -> None:
         if value is None or isinstance(value, (bool, int, float, complex, str, bytes)):
             self.say(type(value).__name__, value if isinstance(value, bytes) else repr(value))
+        elif isinstance(value, Tracer):  # a rule of an operation that was traced within another, which holds the value
+            self.say("traced", value.dtype, value.shape)
         elif isinstance(value, (np.ndarray, np.generic, jax.Array)):
             array = np.asarray(value)
             self.say("array", array.dtype.str, array.shape, np.ascontiguousarray(array).tobytes())
