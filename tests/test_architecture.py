@@ -25,6 +25,7 @@ FLOORS = [
     ["loads", "_units"],
     ["catalog"],
     ["_kane"],
+    ["_description"],
     ["_check"],
     ["_drift"],
     ["_rates"],

@@ -1,6 +1,7 @@
 """Wrong descriptions and bad numbers: each is caught with an error that names what is wrong."""
 
 import dataclasses
+import warnings
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,8 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane.catalog import DoublePendulum, RigidBody, WhippleBicycle
+from jaxkane._check import _is_possible
+from jaxkane.catalog import DoublePendulum, WhippleBicycle
 
 
 class Slider(jk.System):
@@ -40,7 +42,7 @@ def test_the_right_one_passes():
 
 def test_no_motion():
     class Empty(jk.System):
-        coordinates = speeds = ("x",)
+        coordinates, speeds = ("x",), ("x_dot",)
 
     with pytest.raises(NotImplementedError, match="Empty must define motion"):
         evaluate(Empty(), [0.0], [0.0])
@@ -155,7 +157,7 @@ def test_what_motion_and_loads_return():
         def loads(self, t, q, u, motion, inputs):
             return [3.0]
 
-    with pytest.raises(TypeError, match="`loads` returns Forces and Torques"):
+    with pytest.raises(TypeError, match=r"BadLoad.loads returns Forces and Torques"):
         evaluate(BadLoad())
     with pytest.raises(TypeError, match="first argument is a Vector"):
         jk.Force(3.0, None)
@@ -197,20 +199,164 @@ def test_a_negative_mass_of_a_parameter_that_was_not_declared_positive():
         evaluate(Slider(mass=-1.0))
 
 
-def test_inertias_that_no_body_can_have():
+class Spinner(jk.System):
+    """A body on a hinge, with any inertia."""
+
+    I11: jk.Scalar = jk.parameter()
+    I22: jk.Scalar = jk.parameter()
+    I33: jk.Scalar = jk.parameter()
+    mass: jk.Scalar = jk.parameter(1.0)
+    coordinates, speeds = ("angle",), ("rate",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        B = N.rotate(3, q[0], u[0])
+        return jk.Motion([jk.Body(self.mass, (self.I11, self.I22, self.I33), O.fixed(2.0 * B.x), B, name="disk")])
+
+
+class AnyInertia(Spinner):
+    check_inertia = False
+
+
+RESTING = jk.State(np.array([0.3]), np.array([1.0]))
+TS = np.linspace(0.0, 0.1, 3)
+ASKED = {
+    "accelerations": lambda body: jk.accelerations(body, 0.0, RESTING.q, RESTING.u),
+    "assemble": lambda body: jk.assemble(body, RESTING.q, RESTING.u),
+    "simulate": lambda body: jk.simulate(body, RESTING, TS),
+    "linearize": lambda body: jk.stability.linearize(body, RESTING, steady=False),
+    "grad": lambda body: jax.grad(lambda body: jk.kinetic_energy(body, 0.0, RESTING.q, RESTING.u))(body),
+}
+
+
+@pytest.mark.parametrize("asked", ASKED.values(), ids=ASKED)
+def test_one_rule_for_inertias_that_no_body_can_have(asked):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        asked(Spinner(1.0, 1.0, 2.0))  # a flat plate
+        asked(Spinner(1.0, 1.0, 2.003))  # rounded
+        asked(Spinner(0.0, 0.0, 2.0))  # a rotor: the moment about its axis alone
+        asked(AnyInertia(1.0, 1.0, 3.0))
+    with pytest.warns(UserWarning, match=r"Spinner, body 'disk': .* 1, 1, 2.1 kg m\^2.*triangle inequality"):
+        asked(Spinner(1.0, 2.1, 1.0))
+    with pytest.raises(ValueError, match=r"triangle inequality.*beyond 5 % they are refused.*check_inertia = False"):
+        asked(Spinner(1.0, 1.0, 2.2))
     with pytest.raises(ValueError, match="none may be negative"):
-        evaluate(Slider(inertia=-0.1))
-    body = RigidBody()
-    names = [name for name in ("I11", "I22", "I33") if hasattr(body, name)] or [
-        f.name for f in dataclasses.fields(body) if "inertia" in f.name.lower() or f.name.startswith("I")
-    ][:3]
-    flat = dataclasses.replace(body, **dict(zip(names, (1.0, 1.0, 3.0), strict=True)))
-    q = np.zeros(len(body.coordinates))
-    q[-1] = 1.0
-    with pytest.warns(UserWarning, match="triangle inequality"):
-        jk.accelerations(flat, 0.0, q, np.ones(6))
-    with pytest.raises(ValueError, match="triangle inequality"):
-        jk.simulate(flat, jk.State(q, np.ones(6)), [0.0, 1.0])
+        asked(AnyInertia(1.0, -0.1, 1.0))
+
+
+def test_in_a_batch_bodies_that_cannot_be_have_a_status():
+    # possible, rounded, measured, refused, negative
+    I33 = np.array([2.0, 2.003, 2.1, 2.2, -0.1])
+    right = [0, 0, 0, 4, 4]
+    body = Spinner(1.0, 1.0, 1.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rides = jk.sweep.sweep(body, RESTING, TS, table=jk.sweep.grid(I33=I33))
+        by_vmap = jax.jit(jax.vmap(lambda I: jk.simulate(dataclasses.replace(body, I33=I), RESTING, TS).status))(I33)
+    np.testing.assert_array_equal(rides.status, right)
+    assert np.isnan(rides.q[3:]).all()
+    np.testing.assert_array_equal(by_vmap, right)
+    possible = lambda check, *moments: _is_possible(jnp.array(1.0), jnp.diag(jnp.array(moments)), check)  # noqa: E731
+    assert [bool(possible(True, 1.0, 1.0, x)) for x in I33] == [code == 0 for code in right]
+    assert [bool(possible(False, 1.0, 1.0, x)) for x in I33] == [True, True, True, True, False]
+    assert possible(True, 0.0, 0.0, 2.0)  # a rotor
+    assert possible(True, 0.0, 0.0, 0.0)  # a particle
+    assert possible(True, 0.0, 2.0, 2.0)  # a line
+    lopsided = np.random.default_rng(0).normal(size=(200, 3, 3))
+    turned = np.linalg.qr(lopsided)[0]
+    moments = np.abs(np.random.default_rng(1).normal(size=(200, 3)))
+    largest = np.sort(moments)[:, 2]
+    expected = (2 * largest - moments.sum(1)) / largest <= 0.05
+    I = np.einsum("nij,nj,nkj->nik", turned, moments, turned)
+    found = jax.vmap(lambda I: _is_possible(jnp.array(1.0), I, True))(jnp.array(I))
+    np.testing.assert_array_equal(found, expected)
+    assert 20 < expected.sum() < 180
+
+
+def test_an_inertia_needs_a_frame():
+    N, O = jk.inertial()
+    with pytest.raises(ValueError, match=r"'rod' has an inertia, but no frame to turn with"):
+        jk.Body(1.0, (0.1, 0.1, 0.1), O, name="rod")
+    with pytest.raises(ValueError, match="no frame"):
+        jk.Body(1.0, jnp.eye(3), O)
+    jk.Body(1.0, 0, O), jk.Body(1.0, (0.0, 0, 0.0), O), jk.Body(1.0, np.zeros(3), O)
+    jk.Body(1.0, (0.1, 0.1, 0.1), O, angular_velocity=2.0 * N.z)  # a ball that turns
+    with pytest.raises(TypeError, match="the mass centre of 'rod' is a Point"):
+        jk.Body(1.0, 0.0, N, name="rod")
+    with pytest.raises(TypeError, match="the frame of 'rod' is a Frame"):
+        jk.Body(1.0, 0.0, O, O, name="rod")
+
+
+# -- names
+
+
+def test_one_name_for_two_parts_of_a_motion():
+    N, O = jk.inertial()
+    A, P = N.rotate(3, 0.1, 0.0, "A"), O.fixed(N.x)
+    rod, other, unnamed = (jk.Body(1.0, 0.0, O, name=name) for name in ("A", "A", "body"))
+    for parts, kinds in [
+        (([rod], {"frames": {"A": A}}), "a body and a frame"),
+        (([rod], {"points": {"A": P}}), "a body and a point"),
+        (([rod, other], {}), "a body and a body"),
+        (([unnamed], {"points": {"A": P}, "frames": {"A": A}}), "a point and a frame"),
+    ]:
+        with pytest.raises(ValueError, match=rf"two parts have the name 'A', {kinds}: motion\['A'\] could be either"):
+            jk.Motion(parts[0], **parts[1])
+    several = jk.Motion([unnamed, jk.Body(2.0, 0.0, P)], points={"P": P})
+    assert several["P"] is P
+    with pytest.raises(KeyError, match="Several bodies of this motion have no name"):
+        several["body"]
+    assert jk.Motion(unnamed)["body"] is unnamed
+    for wrong in ({"points": {"P": A}}, {"frames": {"A": P}}, {"points": {1: P}}):
+        with pytest.raises(TypeError, match="Motion: "):
+            jk.Motion([unnamed], **wrong)
+    with pytest.raises(TypeError, match="this is no Body"):
+        jk.Motion([P])
+
+
+@pytest.mark.parametrize(
+    ("names", "error", "message"),
+    [
+        (
+            {"inputs": ("torque")},
+            TypeError,
+            r"inputs is a tuple of names; 'torque' is a string. One name is \('torque',\)",
+        ),
+        ({"coordinates": "x"}, TypeError, "coordinates is a tuple of names; 'x' is a string"),
+        ({"speeds": ("x_dot", 2)}, TypeError, "speeds is a tuple of names"),
+        ({"dependent_speeds": None}, TypeError, "dependent_speeds is a tuple of names"),
+        ({"auxiliary_speeds": ("",)}, TypeError, "auxiliary_speeds is a tuple of names"),
+        ({"coordinates": ("x", "x")}, ValueError, "the name 'x' stands twice in `coordinates`"),
+        ({"speeds": ("x", "angle_dot")}, ValueError, "the name 'x' stands in `coordinates` and in `speeds`"),
+        ({"dependent_speeds": ("x_dot",)}, ValueError, "'x_dot' stands in `speeds` and in `dependent_speeds`"),
+        ({"inputs": ("angle",)}, ValueError, "'angle' stands in `coordinates` and in `inputs`"),
+        ({"dependent_coordinates": ("y",)}, ValueError, "names coordinates, each once: y is none"),
+        ({"dependent_coordinates": ("x", "x")}, ValueError, "names coordinates, each once: x is none, or stands"),
+    ],
+)
+def test_names_of_a_class(names, error, message):
+    with pytest.raises(error, match=message):
+        type("Named", (Slider,), names)()
+    properties = {kind: property(lambda self, given=given: given) for kind, given in names.items()}
+    with pytest.raises(error, match=message):
+        type("Named", (Slider,), properties)()
+
+
+def test_lists_of_names_and_the_name_of_an_auxiliary_speed():
+    listed = type("Listed", (Slider,), {"coordinates": ["x", "angle"]})
+    assert listed.coordinates == ("x", "angle")
+    assert np.isfinite(evaluate(listed())).all()
+
+    class Held(Slider):
+        auxiliary_speeds = ("P",)
+
+        def motion(self, t, q, u):
+            motion = super().motion(t, q, u)
+            return jk.Motion(motion.bodies, points={"P": motion["rod"].center})
+
+    with pytest.raises(ValueError, match="Held: P is the name of an auxiliary speed and of a point or a frame"):
+        evaluate(Held())
 
 
 def test_shapes_and_names():

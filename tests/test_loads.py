@@ -128,3 +128,37 @@ def test_loads_take_bodies_for_their_mass_centres():
 
     u_dot = jk.accelerations(Bodies(), 0.0, jnp.array(Q0), jnp.zeros(4))
     np.testing.assert_allclose(u_dot[:2], 2.5 * ALONG, rtol=RTOL)
+
+
+def test_axes_and_normals_may_have_any_length():
+    class Long(Hinged):
+        def loads(self, t, q, u, motion, inputs):
+            N, shaft, disk = motion.N, motion["shaft"], motion["disk"]
+            axis = jnp.array(3.0) * N.z
+            return (
+                jk.loads.torsional_spring(disk, shaft, 2.0 * N.z, q["disk"] - q["shaft"], lambda a: 8.0 * jnp.sin(a)),
+                jk.loads.torsional_damper(disk, shaft, axis, 0.3),
+                jk.loads.torsional_friction(shaft, None, 0.5 * N.z, 0.7, rate=1e-8),
+            )
+
+    at = jnp.array([0.2, 0.7]), jnp.array([1.5, -0.5])
+    np.testing.assert_allclose(jk.accelerations(Long(), 0.0, *at), jk.accelerations(Hinged(), 0.0, *at), rtol=1e-14)
+    rub = lambda n: lambda P, Q, i: jk.loads.friction(P, None, 20.0, 0.5, n * P.velocity.frame.y)  # noqa: E731
+    moving = (3.0, 4.0, 0.0, 0.0)
+    np.testing.assert_allclose(forces(rub(7.0), Q0, moving), forces(rub(1.0), Q0, moving), rtol=1e-14)
+
+
+@pytest.mark.parametrize("length", [0, 0.0, np.float64(0.0), np.int64(0), jnp.array(0.0)])
+def test_no_length_however_it_is_written(length):
+    together = (1.0, 1.0, 1.0, 1.0)
+    law = lambda P, Q, i: jk.loads.spring(P, Q, 10.0, length)  # noqa: E731
+    if isinstance(length, jax.Array):  # an array is a number that may change: it has no direction where it is zero
+        with pytest.raises(ValueError, match=r"Two: the force at 'P', the force at 'Q' are not finite \(between two"):
+            forces(law, together)
+        return
+    np.testing.assert_array_equal(forces(law, together), np.zeros((2, 2)))
+
+
+def test_a_spring_between_points_that_are_always_in_one_place():
+    with pytest.raises(ValueError, match=r"the force at 'P', the force at \"P'\" are not finite"):
+        forces(lambda P, Q, i: jk.loads.spring(P, P.fixed(0.0 * P.velocity.frame.x), 10.0, 0.5), Q0)

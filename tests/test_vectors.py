@@ -113,3 +113,43 @@ def test_a_point_known_by_its_velocity_alone_has_no_position():
     assert not P.fixed(N.y, N).has_position
     with pytest.raises(ValueError, match="not known"):
         _ = P.position
+
+
+@pytest.mark.parametrize("axis", [N.x + N.y, 2.0 * N.z, N.vector(jnp.array(1.0), 2.0, -0.5), -3.0 * N.x + 4.0 * N.y])
+def test_an_axis_of_any_length_turns_by_the_angle(axis):
+    unit = np.asarray(axis.to(N)) / np.linalg.norm(axis.to(N))
+    K = np.array([[0, -unit[2], unit[1]], [unit[2], 0, -unit[0]], [-unit[1], unit[0], 0]])
+    rodrigues = np.eye(3) + np.sin(0.6) * K + (1 - np.cos(0.6)) * K @ K  # takes components in B to components in N
+    B = N.rotate(axis, jnp.array(0.6), jnp.array(1.5))
+    np.testing.assert_allclose(N.matrix(B), rodrigues, atol=1e-15)
+    np.testing.assert_allclose(B.angular_velocity.to(N), 1.5 * unit, rtol=1e-14)
+
+
+def test_a_unit_axis_costs_nothing():
+    count = lambda axis: len(  # noqa: E731
+        jax.make_jaxpr(lambda a, r: N.rotate(axis, a, r).angular_velocity.dot(N.rotate(3, a, r).y))(0.1, 0.2).eqns
+    )
+    assert count(N.x) == count(1)
+    assert count(2.0 * N.x) == count(N.x)
+    assert count(N.vector(0.6, 0.8, 0.0)) == count(N.vector(0.6, 0.8, 0.0).normalize()) == count(3.0 * N.x + 4.0 * N.y)
+    assert (N.x + N.y).normalize().components == pytest.approx((0.5**0.5, 0.5**0.5, 0.0), rel=1e-15)
+    assert N.x.norm() == 1.0
+    assert N.x.normalize() is N.x
+
+
+def test_an_axis_without_a_direction():
+    with pytest.raises(ValueError, match="is zero, and has no direction"):
+        N.rotate(N.x - N.x, 0.1, 0.0)
+    lost = N.rotate(N.vector(*jnp.zeros(3)), jnp.array(0.1), 1.0)  # an array is not known while it is traced
+    assert np.isnan(lost.matrix(N)).all()
+    assert np.isnan(lost.angular_velocity.to(N)).all()
+
+
+def test_the_direction_of_an_axis_has_derivatives():
+    def place(a):
+        return N.rotate(N.vector(a, 1.0, 2.0), 0.7, 0.0).y.to(N)
+
+    h = 1e-6
+    numeric = (place(jnp.array(0.5 + h)) - place(jnp.array(0.5 - h))) / (2 * h)
+    np.testing.assert_allclose(jax.jacfwd(place)(0.5), numeric, atol=1e-9)
+    np.testing.assert_allclose(jax.jacrev(place)(0.5), numeric, atol=1e-9)

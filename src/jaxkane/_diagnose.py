@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from ._drift import constraint_rows, dependent_speeds_from
+from ._kane import Instant
 from ._rates import rates_and_equations
 from ._reads import compiled
-from ._system import System
+from ._system import Force, System
 
 ROUNDING = 1e-12
 
@@ -34,9 +35,12 @@ def diagnosis(system: System, t: Any, q: Any, u: Any, inputs: Any = None) -> str
         C, c0 = (np.asarray(x, dtype=float) for x in constraint_rows(system, t, q))
         found = dependent_speeds_from(C, c0, (*system.speeds, *system.dependent_speeds), system.dependent_speeds, name)
         if not found.condition < 1 / ROUNDING:
+            n = len(system.speeds)
+            absent = [speed for speed, column in zip(system.dependent_speeds, C.T[n:], strict=True) if not column.any()]
+            cause = f"no velocity residual depends on {_listed(absent)}" if absent else "det C_dep = 0"
             return (
                 f"{name}: the constraints cannot be solved for {_listed(system.dependent_speeds)} at {place} "
-                f"(det C_dep = 0): {found.advice()}"
+                f"({cause}): {found.advice()}"
             )
     q_dot, M, f = (np.asarray(x, dtype=float) for x in _equations(system, t, q, u, inputs or {}))
     if np.all(np.isfinite(M)):
@@ -56,8 +60,19 @@ def diagnosis(system: System, t: Any, q: Any, u: Any, inputs: Any = None) -> str
             "lock). Start elsewhere; or describe the orientation with Euler parameters, or with another sequence."
         )
     if not np.all(np.isfinite(f)):
-        return f"{name}: the loads are not finite at {place}."
+        return f"{name}: {_loads_not_finite(system, t, q, u, inputs or {})} at {place}."
     return ""
+
+
+def _loads_not_finite(system: System, t: Any, q: Any, u: Any, inputs: Any) -> str:
+    now = Instant(system, t, q, u, inputs)
+    loads = now.loads(now.motion(now.t, now.q, now.u_all))
+    wrong = [x for x in loads if not all(np.isfinite(float(c)) for c in x.vector.components)]
+    places = [f"the force at {x.point.name!r}" if isinstance(x, Force) else "a torque" for x in wrong]
+    if not places:
+        return "the loads are not finite"
+    hint = " (between two points in one place there is no direction)" if len(places) > 1 else ""
+    return f"{_listed(places)} {'is' if len(places) == 1 else 'are'} not finite{hint}"
 
 
 def _massless(M: np.ndarray, speeds: tuple[str, ...]) -> str:

@@ -36,7 +36,7 @@ def _arrays(system: System, t: Component, q: Any, u: Any, inputs: InputValues = 
     checked_inputs(system, inputs)
     if left_out:
         q = met_or_refused(system, t, q, left_out)
-    check_system(system, t, q, u)
+    check_system(system, t, q)
     return system, t, q, u, {name: jnp.asarray(x, dtype=q.dtype) for name, x in (inputs or {}).items()}
 
 

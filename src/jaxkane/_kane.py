@@ -19,7 +19,7 @@ are projected onto all speeds at once by the transpose of the map u -> (v, omega
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -29,7 +29,7 @@ from jaxtyping import Array
 from ._components import add, add3, component, cross, dot, is_exact, is_zero, matvec, mul, scale3
 from ._linear import Rows, solve, solve_positive
 from ._lookup import refuse_unknown
-from ._system import Body, Load, Motion, System, flatten_loads
+from ._system import Body, Load, Motion, System, flatten_loads, flatten_residuals
 from ._types import Component
 
 Row = tuple[Component, ...]
@@ -86,29 +86,14 @@ def unit(n: int, r: int) -> Row:
     return tuple(1.0 if i == r else 0.0 for i in range(n))
 
 
-class Instant:
-    """A system at one time, with its coordinates and independent speeds, and what its description says there.
+class Reading:
+    """What the description of a system says, at any time, coordinates and speeds."""
 
-    `u_dep`, `q_dot` and the columns of `J` are formed at once, since everything else needs them.
-    """
-
-    def __init__(self, system: System, t: Component, q: Any, u: Any, inputs: Mapping[str, Component] | None = None):
+    def __init__(self, system: System, inputs: Mapping[str, Component] | None = None):
         self.system = system
         self.name = type(system).__name__
         self.n, self.k = len(system.speeds), len(system.dependent_speeds)
-        self.t = component(t)
-        self.q = as_row(q, system.coordinates, f"{self.name}: q")
-        self.u = as_row(u, system.speeds, f"{self.name}: u")
         self.inputs = checked_inputs(system, inputs)
-        self.C_ind, self.C_dep, c0 = self._constraint_rows()
-        known = [add(x, y) for x, y in zip(matvec(self.C_ind, self.u), c0, strict=True)]
-        *columns, u_dep = solve(self.C_dep, *zip(*self.C_ind, strict=True), known) if self.k else [()] * (self.n + 1)
-        self.J = [_negative(column) for column in columns]  # n columns of (k,)
-        self.u_dep = _negative(u_dep)
-        self.u_all = (*self.u, *self.u_dep)
-        self.q_dot = self.rates(self.t, self.q, self.u_all)
-
-    # The description at this instant, or beside it.
 
     def motion(self, t: Component, q: Row, u: Row) -> Motion:
         motion = self.system.motion(t, q, u)
@@ -120,19 +105,12 @@ class Instant:
         q_dot = self.system.q_dot(t, q, u)
         return as_row(q_dot, self.system.coordinates, f"{self.name}.q_dot")
 
-    def loads(self, motion: Motion) -> tuple[Load, ...]:
-        return flatten_loads(self.system.loads(self.t, self.q, self.u_all, motion, self.inputs))
-
-    def along_speeds(self, f: Callable[[Row], Any], direction: Row) -> Any:
-        """The derivative of `f(u)` along a direction of speeds, at u = 0: all of it, since f is affine in them."""
-        return jvp(lambda s: f(tuple(mul(s, x) for x in direction)), (self._zero(),), (jnp.ones_like(self._zero()),))[1]
-
-    def _zero(self) -> Array:
-        return jnp.zeros((), jnp.result_type(*([x for x in (*self.q, *self.u) if not is_exact(x)] or [float])))
+    def loads_at(self, t: Component, q: Row, u: Row, motion: Motion) -> tuple[Load, ...]:
+        return flatten_loads(self.system.loads(t, q, u, motion, self.inputs), f"{self.name}.loads")
 
     def configuration(self, t: Component, q: Row) -> Row:
         residuals = self.system.configuration_constraints(t, q)
-        return tuple(component(h) for h in residuals)
+        return flatten_residuals(residuals, f"{self.name}: the residuals of configuration_constraints")
 
     def residuals(self, t: Component, q: Row, u: Row) -> Row:
         """Velocity residuals c(t, q, u), one for each dependent speed."""
@@ -148,6 +126,37 @@ class Instant:
                 "there are velocity residuals; or as many as both together, and the constraints' rates are added."
             )
         return (*rolling, *h_dot)
+
+
+class Instant(Reading):
+    """A system at one time, with its coordinates and independent speeds, and what its description says there.
+
+    `u_dep`, `q_dot` and the columns of `J` are formed at once, since everything else needs them.
+    """
+
+    def __init__(self, system: System, t: Component, q: Any, u: Any, inputs: Mapping[str, Component] | None = None):
+        super().__init__(system, inputs)
+        self.t = component(t)
+        self.q = as_row(q, system.coordinates, f"{self.name}: q")
+        self.u = as_row(u, system.speeds, f"{self.name}: u")
+        self.C_ind, self.C_dep, c0 = self._constraint_rows()
+        known = [add(x, y) for x, y in zip(matvec(self.C_ind, self.u), c0, strict=True)]
+        *columns, u_dep = solve(self.C_dep, *zip(*self.C_ind, strict=True), known) if self.k else [()] * (self.n + 1)
+        self.J = [_negative(column) for column in columns]  # n columns of (k,)
+        self.u_dep = _negative(u_dep)
+        self.u_all = (*self.u, *self.u_dep)
+        self.q_dot = self.rates(self.t, self.q, self.u_all)
+
+    def loads(self, motion: Motion, u: Row | None = None) -> tuple[Load, ...]:
+        """The loads, at the speeds of this instant or at others."""
+        return self.loads_at(self.t, self.q, self.u_all if u is None else u, motion)
+
+    def along_speeds(self, f: Callable[[Row], Any], direction: Row) -> Any:
+        """The derivative of `f(u)` along a direction of speeds, at u = 0: all of it, since f is affine in them."""
+        return jvp(lambda s: f(tuple(mul(s, x) for x in direction)), (self._zero(),), (jnp.ones_like(self._zero()),))[1]
+
+    def _zero(self) -> Array:
+        return jnp.zeros((), jnp.result_type(*([x for x in (*self.q, *self.u) if not is_exact(x)] or [float])))
 
     def _constraint_rows(self) -> tuple[Rows, Rows, Row]:
         # c = C_ind u + C_dep u_dep + c0
@@ -170,7 +179,10 @@ class Instant:
         """Velocities (v, omega) of the bodies, and those that the loads act on, at speeds `u`."""
         motion = self.motion(self.t, self.q, u)
         bodies = [(b.center.velocity.components, b.angular_velocity.components_in(b.frame)) for b in motion.bodies]
-        return bodies, [load.velocity.components for load in self.loads(motion)]
+        # `loads` makes points of its own from the speeds that it is given. What it makes vectors of is dropped here, so
+        # that no exact zero may divide there.
+        given = tuple(jnp.asarray(x, self._zero().dtype) if is_exact(x) else x for x in u)
+        return bodies, [load.velocity.components for load in self.loads(motion, given)]
 
     def body_velocities(self, u: Row) -> list:
         return self.velocities(u)[0]
@@ -301,7 +313,12 @@ def as_row(values: Any, names: Sequence[str], label: str) -> Row:
     if hasattr(values, "shape"):
         array = as_array(values, names, label)
         return tuple(array[i] for i in range(len(names)))
-    row = tuple(component(x) for x in values)
+    if not isinstance(values, Iterable):
+        raise TypeError(f"{label} must be {len(names)} numbers in a sequence ({', '.join(names)}), got {values!r}.")
+    try:
+        row = tuple(component(x) for x in values)
+    except TypeError as error:
+        raise TypeError(f"{label} must be {len(names)} numbers ({', '.join(names)}): {error}") from None
     if len(row) != len(names):
         raise ValueError(f"{label} must have {len(names)} entries ({', '.join(names)}), got {len(row)}.")
     return row

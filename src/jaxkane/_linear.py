@@ -6,6 +6,7 @@ ones), which keeps exact zeros and lets a batch stay component-major; larger one
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -32,6 +33,8 @@ def solve(A: Rows, *rights: Sequence[Component]) -> list[tuple[Component, ...]]:
         solution = _solved_by_lapack(matrix, jnp.stack([stack([b])[0] for b in rights], axis=-1))
         return [tuple(solution[i, j] for i in range(n)) for j in range(len(rights))]
     adjugate, det = _adjugate(A)
+    if is_zero(det):  # an unknown that no equation holds: no number is right, and a zero must not hide it
+        return [(math.nan,) * n for _ in rights]
     reciprocal = 1.0 / det
     return [tuple(mul(dot(row, b), reciprocal) for row in adjugate) for b in rights]
 
@@ -90,16 +93,22 @@ def solve_positive(M: Rows, b: Sequence[Component]) -> tuple[Component, ...]:
             entry = M[j][i]
             for k in range(j):
                 entry = sub(entry, mul(mul(L[i][k], L[j][k]), d[k]))
-            L[i][j] = entry if is_zero(entry) else entry / pivot
+            L[i][j] = entry if is_zero(entry) else _quotient(entry, pivot)
     y = list(b)
     for i in range(n):
         for k in range(i):
             y[i] = sub(y[i], mul(L[i][k], y[k]))
-    x = [y_i if is_zero(y_i) else y_i / d_i for y_i, d_i in zip(y, d, strict=True)]
+    x = [_quotient(y_i, d_i) for y_i, d_i in zip(y, d, strict=True)]
     for i in reversed(range(n)):
         for k in range(i + 1, n):
             x[i] = sub(x[i], mul(L[k][i], x[k]))
     return tuple(x)
+
+
+def _quotient(a: Component, b: Component) -> Component:
+    if is_zero(b):
+        return math.nan
+    return a if is_zero(a) else a / b
 
 
 def as_vector(row: Sequence[Component], like: Any) -> Any:

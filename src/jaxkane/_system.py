@@ -14,7 +14,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from ._components import add, component, dot, mul, sub
+from ._components import add, component, dot, is_zero, mul, sub
 from ._lookup import not_there
 from ._types import Component, Triple
 from ._vectors import Frame, Point, Vector
@@ -70,6 +70,9 @@ def _to_float(value: Any) -> Any:
     return value
 
 
+UNNAMED = "body"  # the name of bodies that were not given one
+
+
 class Body:
     """A rigid body: mass, central inertia, mass centre and frame.
 
@@ -79,12 +82,14 @@ class Body:
     - `inertia` [kg m^2] about the mass centre, resolved in `frame`: three principal moments, or a (3, 3) matrix
         whose off-diagonal entries are matrix entries (minus the integrals of xy). 0.0 for a particle.
     - `center`: the mass centre, a Point.
-    - `frame`: a Frame in which the inertia does not change. A particle needs none.
+    - `frame`: a Frame in which the inertia does not change. A particle needs none, anything else does.
     - `angular_velocity`: a Vector, by default the frame's. An axisymmetric body (a wheel, a rotor) may stand in a
         frame that does not spin with it, with its own angular velocity: the textbook's Examples 5 and 7.
-    - `name`: for error messages, forces and pictures.
+    - `name`: for error messages, forces, pictures and `motion["name"]`.
     - `about`: a Point that is fixed in `frame`, about which `inertia` is given instead: it is taken to the mass centre
         by the parallel axis theorem, I - m (r.r 1 - r r).
+
+    **Raises:** `ValueError` for an inertia of another shape, and for one without a frame to turn with.
     """
 
     __slots__ = ("about", "angular_velocity", "center", "frame", "inertia", "mass", "name")
@@ -96,11 +101,22 @@ class Body:
         center: Point,
         frame: Frame | None = None,
         angular_velocity: Vector | None = None,
-        name: str = "body",
+        name: str = UNNAMED,
         about: Point | None = None,
     ):
+        if not isinstance(center, Point):
+            raise TypeError(
+                f"Body(mass, inertia, center, ...): the mass centre of {name!r} is a Point, got {center!r}."
+            )
+        if not isinstance(frame, (Frame, type(None))):
+            raise TypeError(f"Body(mass, inertia, center, frame): the frame of {name!r} is a Frame, got {frame!r}.")
         self.mass = component(mass)
         self.inertia = _inertia(inertia, name)
+        if frame is None and angular_velocity is None and not all(is_zero(x) for row in self.inertia for x in row):
+            raise ValueError(
+                f"Body(mass, inertia, center): {name!r} has an inertia, but no frame to turn with. Give its frame, "
+                "Body(mass, inertia, center, frame); for a particle write 0.0 for the inertia."
+            )
         self.center = center
         self.frame = center.velocity.frame.root if frame is None else frame
         self.angular_velocity = self.frame.angular_velocity if angular_velocity is None else angular_velocity
@@ -191,13 +207,29 @@ def weight(motion: Motion, gravity: Vector) -> tuple[Force, ...]:
     return tuple(Force(body.mass * gravity, body.center) for body in motion.bodies)
 
 
-def flatten_loads(loads: Any) -> tuple[Load, ...]:
+def flatten_loads(loads: Any, method: str = "`loads`") -> tuple[Load, ...]:
     """Loads out of nested tuples and lists."""
     if isinstance(loads, (Force, Torque)):
         return (loads,)
-    if isinstance(loads, Iterable) and not isinstance(loads, (str, Vector)):
-        return tuple(load for item in loads for load in flatten_loads(item))
-    raise TypeError(f"`loads` returns Forces and Torques, got {loads!r}.")
+    if isinstance(loads, Iterable) and not isinstance(loads, (str, Mapping)):
+        return tuple(load for item in loads for load in flatten_loads(item, method))
+    hint = " Does it end without a `return`?" if loads is None else ""
+    raise TypeError(f"{method} returns Forces and Torques, got {loads!r}.{hint}")
+
+
+def flatten_residuals(given: Any, what: str) -> tuple[Component, ...]:
+    """Residuals out of numbers, arrays, Vectors (three components each) and nested tuples and lists of these."""
+    if isinstance(given, Vector):
+        return given.components
+    if isinstance(given, (jax.Array, np.ndarray)) and given.ndim:
+        return tuple(component(x) for x in given.reshape(-1))
+    if isinstance(given, Iterable) and not isinstance(given, (str, Mapping, jax.Array, np.ndarray)):
+        return tuple(x for item in given for x in flatten_residuals(item, what))
+    try:
+        return (component(given),)
+    except TypeError:
+        hint = " Does the method end without a `return`?" if given is None else ""
+        raise TypeError(f"{what} are numbers and Vectors in a list, got {given!r}.{hint}") from None
 
 
 class Motion:
@@ -209,9 +241,11 @@ class Motion:
     - `constraints`: velocity residuals [m/s or rad/s] that are zero in the motion and affine in the speeds; a Vector
         counts as its three components.
     - `points`, `frames`: those that `loads`, pictures or a user need, by name: `motion["P"]`.
+
+    **Raises:** `ValueError` where one name stands for two of these; `TypeError` for what is no body, point or frame.
     """
 
-    __slots__ = ("N", "bodies", "constraints", "frames", "points", "vanishing")
+    __slots__ = ("N", "_named", "bodies", "constraints", "frames", "points", "vanishing")
 
     def __init__(
         self,
@@ -221,25 +255,50 @@ class Motion:
         points: Mapping[str, Point] | None = None,
         frames: Mapping[str, Frame] | None = None,
     ):
-        self.bodies = tuple(bodies)
+        self.bodies = (bodies,) if isinstance(bodies, Body) else tuple(bodies)
         if not self.bodies:
             raise ValueError("A Motion needs at least one Body.")
-        residuals: list[Component] = []
-        self.vanishing = tuple(constraints)  # the residuals as they were given
-        for c in self.vanishing:
-            residuals.extend(c.components if isinstance(c, Vector) else [component(c)])
-        self.constraints = tuple(residuals)
+        given = (constraints,) if isinstance(constraints, (Vector, float, int, jax.Array)) else tuple(constraints)
+        self.vanishing = given  # the residuals as they were given
+        self.constraints = flatten_residuals(given, "Motion(bodies, constraints): the velocity residuals")
         self.points = dict(points or {})
         self.frames = dict(frames or {})
+        self._named = self._by_name()
         self.N: Frame = self.bodies[0].center.velocity.frame.root
         for name, part in (*self.points.items(), *self.frames.items()):
             part.name = name
 
+    def _by_name(self) -> dict[str, Body | Point | Frame]:
+        named: dict[str, Any] = {}
+        kinds = (
+            (Body, [(getattr(body, "name", None), body) for body in self.bodies]),
+            (Point, self.points.items()),
+            (Frame, self.frames.items()),
+        )
+        for kind, parts in kinds:
+            for name, part in parts:
+                if not isinstance(part, kind):
+                    raise TypeError(f"Motion: this is no {kind.__name__}, but stands among these: {part!r}.")
+                if not isinstance(name, str):
+                    raise TypeError(f"Motion: the name of {part!r} must be a string, got {name!r}.")
+                if name in named and not (name == UNNAMED and kind is Body):
+                    raise ValueError(
+                        f"Motion: two parts have the name {name!r}, {_told(named[name])} and {_told(part)}: "
+                        f"motion[{name!r}] could be either. Give them different names."
+                    )
+                named[name] = part
+        return named
+
     def __getitem__(self, name: str) -> Any:
-        named: dict[str, Any] = {body.name: body for body in self.bodies} | self.points | self.frames
-        if name not in named:
-            raise not_there(name, named, "this motion, among its bodies, points and frames")
-        return named[name]
+        if name not in self._named:
+            raise not_there(name, self._named, "this motion, among its bodies, points and frames")
+        if name == UNNAMED and sum(body.name == UNNAMED for body in self.bodies) > 1:
+            raise KeyError("Several bodies of this motion have no name of their own: Body(..., name=...).")
+        return self._named[name]
+
+
+def _told(part: Body | Point | Frame) -> str:
+    return f"a {type(part).__name__.lower()}"
 
 
 class Values(Sequence[Component]):
@@ -343,6 +402,9 @@ class System(eqx.Module):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
+        for kind in NAMES:
+            if kind in cls.__dict__ and not hasattr(cls.__dict__[kind], "__get__"):  # a property is read of an instance
+                setattr(cls, kind, _checked_names(cls.__name__, kind, cls.__dict__[kind]))
         for method in ("motion", "q_dot", "loads", "configuration_constraints", "events"):
             if method in cls.__dict__:
                 setattr(cls, method, _named(cls.__dict__[method]))
@@ -362,8 +424,11 @@ class System(eqx.Module):
     units: ClassVar[Mapping[str, str]] = {}
     """Units of coordinates, speeds and inputs by name, for pictures: `{"q0": "rad", "push": "N"}`. Those of usual
     names, as "roll", "x" or "steer_torque", are known without."""
+    check_inertia: ClassVar[bool] = True
+    """Whether bodies are refused whose principal moments of inertia no body can have; see `describing.md`."""
 
     def __check_init__(self) -> None:
+        _check_names(self)
         _check_fields(self)
         for name, info in parameter_info(self).items():
             check_parameter(f"{type(self).__name__}.{name}", getattr(self, name), info)
@@ -395,6 +460,46 @@ class System(eqx.Module):
         return {}
 
 
+NAMES = ("coordinates", "speeds", "dependent_speeds", "auxiliary_speeds", "dependent_coordinates", "inputs")
+_FOUND_BY_NAME = tuple(kind for kind in NAMES if kind != "dependent_coordinates")  # these are coordinates
+
+
+def _checked_names(system: str, kind: str, given: Any) -> tuple[str, ...]:
+    if isinstance(given, str):
+        raise TypeError(f"{system}.{kind} is a tuple of names; {given!r} is a string. One name is ({given!r},).")
+    if not isinstance(given, (tuple, list)) or not all(isinstance(name, str) and name for name in given):
+        raise TypeError(f"{system}.{kind} is a tuple of names, such as ('angle',); got {given!r}.")
+    return tuple(given)
+
+
+def _check_names(system: System) -> None:
+    """Refuse names that stand for two things."""
+    name = type(system).__name__
+    names = {kind: _checked_names(name, kind, getattr(system, kind)) for kind in NAMES}
+    owners: dict[str, str] = {}
+    for kind in _FOUND_BY_NAME:
+        for each in names[kind]:
+            if each in owners:
+                places = f"twice in `{kind}`" if owners[each] == kind else f"in `{owners[each]}` and in `{kind}`"
+                raise ValueError(f"{name}: the name {each!r} stands {places}: q, u and trajectories are read by name.")
+            owners[each] = kind
+    dependent = names["dependent_coordinates"]
+    strange = [each for i, each in enumerate(dependent) if each not in names["coordinates"] or each in dependent[:i]]
+    if strange:
+        have = ", ".join(names["coordinates"]) or "none"
+        raise ValueError(
+            f"{name}.dependent_coordinates names coordinates, each once: {', '.join(strange)} is none, or stands there "
+            f"twice. The coordinates are: {have}."
+        )
+
+
+_ASKED_FOR_A_VALUE = (
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+    jax.errors.ConcretizationTypeError,
+)
+
+
 def _named(method: Callable[..., Any]) -> Callable[..., Any]:
     """A method of a description whose `q` and `u` may be any sequence, and are read by place and by name."""
 
@@ -404,7 +509,16 @@ def _named(method: Callable[..., Any]) -> Callable[..., Any]:
         if rest:
             names = (*self.speeds, *self.dependent_speeds, *self.auxiliary_speeds)
             rest = (_values(rest[0], names, f"{type(self).__name__}: u", len(self.auxiliary_speeds)), *rest[1:])
-        return method(self, t, q, *rest, **more)
+        try:
+            return method(self, t, q, *rest, **more)
+        except _ASKED_FOR_A_VALUE as error:
+            raise TypeError(
+                f"{type(self).__name__}.{method.__name__} asks for the value of a number that has none while the "
+                "description is traced: time, coordinates, speeds, parameters, and what follows from them. Write "
+                "jnp.sin for np.sin and math.sin, jnp.where(a > b, x, y) for `if`, jnp.maximum and jnp.minimum for max "
+                "and min, and neither float() nor .item(). A number that a description counts with, as that of its "
+                "links, is a static field: `links: int = equinox.field(static=True)`."
+            ) from error
 
     return call
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import contextvars
+import math
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from . import rotations
-from ._components import ZERO3, add3, component, cross, dot, is_zero, matvec, mul, scale3
+from ._components import ZERO3, add3, component, cross, dot, is_exact, is_zero, matvec, mul, scale3
 from ._linear import stack
 from ._types import Component, Triple
 from .rotations import Matrix
@@ -108,14 +109,17 @@ class Frame:
 
         **Arguments:**
 
-        - `axis`: 1, 2 or 3, or a unit vector that is fixed in this frame (a hinge in any direction).
+        - `axis`: 1, 2 or 3, or a vector that is fixed in this frame (a hinge in any direction). Its length is of no
+            account: an exact one is brought to 1 beforehand, and a unit vector costs nothing.
         - `angle`: right-hand rotation about the axis [rad].
         - `rate`: its time derivative [rad/s]; 0.0 for a fixed tilt.
         - `name`: for error messages and pictures.
+
+        **Raises:** `ValueError` for an axis that is none of these, or a vector that is exactly zero.
         """
         angle, rate = component(angle), component(rate)
         if isinstance(axis, Vector):
-            direction = axis.components_in(self)
+            direction = axis.normalize().components_in(self)
             c, s = jnp.cos(angle), jnp.sin(angle)
             rotation = rotations.rodrigues_matrix(direction, c, s)
         else:
@@ -318,11 +322,21 @@ class Vector:
 
     def norm(self) -> Component:
         """The length. Its derivative is infinite where the vector is zero."""
+        if all(is_exact(a) for a in self.components):
+            return math.hypot(*self.components)
         return jnp.sqrt(dot(self.components, self.components))
 
     def normalize(self) -> Vector:
-        """The unit vector in this direction."""
-        return self / self.norm()
+        """The unit vector in this direction. **Raises:** `ValueError` for a vector that is exactly zero."""
+        length = self.norm()
+        if not is_exact(length):
+            return self / length
+        if length == 0.0:
+            raise ValueError(
+                f"The vector {self} is zero, and has no direction: an axis, a normal, or the line between two points "
+                "that are always in one place."
+            )
+        return self if abs(length - 1.0) < 1e-15 else self / length
 
     def _is_denser_than(self, other: Vector) -> bool:
         count = lambda v: sum(not is_zero(a) for a in v.components)  # noqa: E731
@@ -342,7 +356,7 @@ class Point:
     the one-point theorem, `located` differentiates a position function.
     """
 
-    __slots__ = ("_base", "_offset", "name", "number", "velocity")
+    __slots__ = ("_base", "_claim", "_offset", "name", "number", "velocity")
 
     def __init__(self, velocity: Vector, base: Point | None = None, offset: Vector | None = None, name: str = "point"):
         N = velocity.frame.root
@@ -354,6 +368,7 @@ class Point:
         self.name = name
         self._base = base
         self._offset = offset
+        self._claim: Claim | None = None
 
     def __repr__(self) -> str:
         return f"Point({self.name})"
@@ -378,10 +393,12 @@ class Point:
             v_Q = v_P + omega x r
 
         **Arguments:** `r` [m]; `frame`: the frame in which both points are fixed, by default the one that `r` is
-        written in.
+        written in. With a frame the point may be that of a body which is at `r` now: of a wheel, at its contact.
         """
-        frame = frame or _own_frame(r, "fixed")
-        return Point(self.velocity + frame.angular_velocity.cross(r), self, r, name or f"{self.name}'")
+        carrier = frame or _own_frame(r, "fixed")
+        point = Point(self.velocity + carrier.angular_velocity.cross(r), self, r, name or f"{self.name}'")
+        point._claim = Claim(carrier, Vector(carrier, ZERO3)) if frame is None else None
+        return point
 
     def moving(self, r: Vector, velocity: Vector, frame: Frame | None = None, name: str | None = None) -> Point:
         """The point now at `r` from this one, that moves in a frame in which this one is fixed (one-point theorem).
@@ -393,7 +410,9 @@ class Point:
         """
         frame = frame or _own_frame(r, "moving")
         carried = self.velocity + frame.angular_velocity.cross(r)
-        return Point(carried + velocity, self, r, name or f"{self.name}'")
+        point = Point(carried + velocity, self, r, name or f"{self.name}'")
+        point._claim = Claim(frame, velocity)
+        return point
 
     def located(
         self,
@@ -423,7 +442,9 @@ class Point:
         The contact point of a wheel that rolls is `Point.at(0.0 * N.x)`: a point of the wheel that is at rest now. It
         has no position, since the ground under the wheel is another point at every instant.
         """
-        return Point(velocity, None, position, name)
+        point = Point(velocity, None, position, name)
+        point._claim = None if position is None else Claim(velocity.frame.root, velocity)
+        return point
 
     def position_from(self, other: Point) -> Vector:
         """The vector from `other` to this point [m]."""
@@ -444,6 +465,17 @@ def inertial() -> tuple[Frame, Point]:
     N = Frame("N", None, rotations.IDENTITY, ZERO3)
     N._virtual = _VIRTUAL.get()
     return N, Point(Vector(N, ZERO3), None, Vector(N, ZERO3), "O")
+
+
+class Claim(NamedTuple):
+    """How a point is said to move: its place, as seen in `frame` from the point it was made from, with `velocity`.
+
+    The place is a function of time and coordinates, the velocity was given beside it: the two may contradict. A point
+    without a claim is only where it is now, as the point of a wheel that is in contact.
+    """
+
+    frame: Frame
+    velocity: Vector
 
 
 class Virtual(NamedTuple):

@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 
-from ._components import is_zero
+from ._components import component, is_zero
 from ._system import Body, Force, Torque
 from ._types import Component
 from ._vectors import Frame, Point, Vector
@@ -32,7 +32,7 @@ def spring(P: Point | Body, Q: Point | Body, stiffness: Law, length: Component =
     **Arguments:** `stiffness` [N/m], or a function extension [m] -> tension [N]; `length` at rest [m]. A linear spring
     of zero length may shrink to a point, any other may not: its direction is lost there.
     """
-    P, Q = _point(P), _point(Q)
+    P, Q, length = _point(P), _point(Q), component(length)
     r = Q.position_from(P)
     if is_zero(length) and not callable(stiffness):
         return _pair(stiffness * r, P, Q)
@@ -66,10 +66,10 @@ def torsional_spring(
 
         T = -stiffness * angle * axis
 
-    **Arguments:** `axis`: a unit Vector along the hinge; `angle` of `on` about it from rest, relative to `reaction_on`
-    (None: the ground) [rad]; `stiffness` [N m/rad], or a function angle -> torque [N m].
+    **Arguments:** `axis`: a Vector along the hinge, of any length; `angle` of `on` about it from rest, relative to
+    `reaction_on` (None: the ground) [rad]; `stiffness` [N m/rad], or a function angle -> torque [N m].
     """
-    return (Torque(-_law(stiffness, angle) * axis, on, reaction_on),)
+    return (Torque(-_law(stiffness, angle) * axis.normalize(), on, reaction_on),)
 
 
 def torsional_damper(on: Frame | Body, reaction_on: Frame | Body | None, axis: Vector, damping: Law) -> tuple[Torque]:
@@ -79,6 +79,7 @@ def torsional_damper(on: Frame | Body, reaction_on: Frame | Body | None, axis: V
 
     **Arguments:** as `torsional_spring`; `damping` [N m s/rad], or a function rate [rad/s] -> torque [N m].
     """
+    axis = axis.normalize()
     return (Torque(-_law(damping, _rate(on, reaction_on).dot(axis)) * axis, on, reaction_on),)
 
 
@@ -96,12 +97,13 @@ def friction(
         F = -coefficient * normal_force * v / sqrt(v . v + speed^2),   v the velocity of P relative to Q
 
     **Arguments:** `Q`: the point of the other body, None for the ground; `normal_force` [N], not negative; `normal`: a
-    unit Vector across the surface, of which v is cleared; `speed` [m/s]: well above it friction is Coulomb's, below it
-    viscous, so that nothing sticks: it creeps. The equations become stiff as it falls.
+    Vector across the surface, of any length, of which v is cleared; `speed` [m/s]: well above it friction is Coulomb's,
+    below it viscous, so that nothing sticks: it creeps. The equations become stiff as it falls.
     """
     P = _point(P)
     v = P.velocity if Q is None else P.velocity - _point(Q).velocity
     if normal is not None:
+        normal = normal.normalize()
         v = v - v.dot(normal) * normal
     F = -(coefficient * normal_force) * (v / jnp.sqrt(v.dot(v) + speed**2))
     return (Force(F, P),) if Q is None else (Force(F, P), Force(-F, _point(Q)))
@@ -111,6 +113,7 @@ def torsional_friction(
     on: Frame | Body, reaction_on: Frame | Body | None, axis: Vector, torque: Component, *, rate: Component = 1e-2
 ) -> tuple[Torque]:
     """Dry friction in a hinge along `axis`, smoothed: T = -torque * w / sqrt(w^2 + rate^2) [N m], w [rad/s]."""
+    axis = axis.normalize()
     w = _rate(on, reaction_on).dot(axis)
     return (Torque(-torque * w / jnp.sqrt(w * w + rate**2) * axis, on, reaction_on),)
 

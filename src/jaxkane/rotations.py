@@ -12,7 +12,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from ._components import add, cross, dot, matvec, mul, sub
+from ._components import add, cross, dot, is_exact, matvec, mul, sub
 from ._types import Component, Triple
 
 Matrix = tuple[Triple, Triple, Triple]
@@ -136,14 +136,15 @@ def euler_parameter_norm(parameters: Sequence[Component]) -> Component:
 
 def rodrigues_matrix(axis: Triple, c: Component, s: Component) -> Matrix:
     """[R] of a rotation about the unit vector `axis`, from the cosine and sine of its angle (Rodrigues' formula)."""
-    versine = sub(1.0, c)
+    is_along = all(is_exact(a) and abs(a) in (0.0, 1.0) for a in axis)  # one of the coordinate axes
+    versine = 0.0 if is_along else sub(1.0, c)
     rows: list[list[Component]] = []
     for i in range(3):
         row = []
         for j in range(3):
             entry = mul(mul(axis[i], axis[j]), versine)
             if i == j:
-                entry = add(entry, c)
+                entry = 1.0 if is_along and axis[i] else add(entry, c)
             else:
                 k = 3 - i - j
                 turn = mul(s, axis[k])

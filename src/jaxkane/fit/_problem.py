@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._check import check_system
 from .._simulate import settings_for
 from .._system import System
 from .._trajectory import Trajectory
@@ -100,6 +101,7 @@ class Problem:
             raise ValueError(f"{stuck[0]} is held from sample to sample: nothing changes smoothly with its delay.")
         parameters = parameters_of(system, free).with_priors(priors or {})
         windows, places = cut(system, trials, window, channels, chained=continuity is not None, delayed=bool(late))
+        check_system(system, windows.t[0, 0], jnp.nan_to_num(windows.start[0, : len(system.coordinates)]))
         varying = any(np.ptp(x) > 0 for t in trials for x in t.inputs.values())
         fixed = step is not None or (rtol is None and atol is None and varying)
         settings = settings_for(

@@ -131,7 +131,7 @@ def impossible_bodies(fit: Fit) -> list[str]:
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            check_system(fit.system, window.t[0], window.start[:n_q], window.start[n_q:])
+            check_system(fit.system, window.t[0], window.start[:n_q])
         except ValueError as error:
             notes.append(f"Not a possible body: {error}")
     return notes + [f"Not a possible body: {warning.message}" for warning in caught]

@@ -109,7 +109,7 @@ def linearize(
     t = jnp.asarray(0.0 if t is None else t, q.dtype)
     w = checked_inputs(system, inputs)
     w = jnp.stack([jnp.asarray(w[k], q.dtype) for k in system.inputs]) if w else jnp.zeros(0, q.dtype)
-    check_system(system, t, q, u)
+    check_system(system, t, q)
     origin = (system, t, q, u, w)
     n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q).shape[0]
     dependent = tuple(system.dependent_coordinates if dependent is None else dependent)

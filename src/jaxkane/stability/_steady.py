@@ -116,7 +116,7 @@ def steady_turn(
         elif x is not None and k in system.speeds:
             u = u.at[system.speeds.index(k)].set(jnp.asarray(x, q.dtype))
     t = jnp.asarray(t, q.dtype)
-    check_system(system, t, q, u)
+    check_system(system, t, q)
     guess = problem.unknowns(q, u, known)
     held = [problem.quantity(system, t, q, u, k) if x is None else x for k, x in values.items()]
     held = jnp.stack([jnp.asarray(x, q.dtype) for x in held]) if held else jnp.zeros(0, q.dtype)

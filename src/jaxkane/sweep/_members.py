@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._assembly import assemble
+from .._check import check_system, is_concrete
 from .._lookup import not_there
 from .._signals import Samples, as_signals
 from .._simulate import as_state, checked_state
@@ -59,6 +60,7 @@ def members_of(system: Any, state: Any, inputs: Inputs, table: Table | None, ts:
         listed = ", ".join(f"{name} ({n})" for name, n in lengths.items())
         raise ValueError(f"sweep: the batches differ in length: {listed}.")
     _check(members, shared, ts[0])
+    _check_description(members, shared, ts[0])
     return members, shared, next(iter(lengths.values()))
 
 
@@ -131,6 +133,16 @@ def _check(members: Tree, shared: Tree, t: Any) -> None:
             "independent speed or input of that name. Give `state` as a function of (system, row), or `system` as a "
             f"function of (row), which reads row[{unused[0]!r}]."
         )
+
+
+def _check_description(members: Tree, shared: Tree, t: Any) -> None:
+    """Refuse a description that contradicts itself, by the first member; a bad body is its member's own."""
+    system, state, _, columns = eqx.combine(jax.tree.map(lambda x: x[0], members), shared)
+    system, _ = _system(system, Row(columns))
+    q = as_state(system, state).q if isinstance(state, State) else None
+    if q is not None and is_concrete(q) and not np.all(np.isfinite(q)):
+        q = None
+    check_system(system, t, q, bodies=False)
 
 
 def _signals(inputs: Inputs, system: Any, columns: dict[str, Any], ts: Any) -> Any:

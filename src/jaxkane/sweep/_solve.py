@@ -17,6 +17,7 @@ import numpy as np
 from jax.sharding import AxisType, Mesh
 from jax.sharding import PartitionSpec as P
 
+from .._check import with_possible_bodies
 from .._reads import compiled
 from .._simulate import Settings, solve
 from .._system import State
@@ -55,6 +56,7 @@ class Job(eqx.Module):
     def from_start(self, own: Any, start: State) -> Part:
         """The motion of one member from its first state."""
         system, signals = system_and_signals(own, self.shared)
+        start = with_possible_bodies(system, self.ts[0], start)
         ride = solve(system, start, self.ts, signals, self.settings)
         if self.reduce is None:
             values = (ride.q, ride.u, ride.u_dep, ride.inputs)
