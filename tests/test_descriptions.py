@@ -149,6 +149,21 @@ def test_every_structure_is_looked_at():
         evaluate(Links(3), jk.State(np.zeros(3), np.zeros(3)))
 
 
+def test_what_is_prescribed_in_time_is_looked_at_when_it_moves():
+    class Driven(Slider):
+        factor: float = eqx.field(static=True, default=1.0)
+
+        def motion(self, t, q, u):
+            N, O = jk.inertial()
+            T = N.rotate(1, 0.5 * t**2, self.factor * t, "T")  # at rest at t = 0
+            B = T.rotate(3, q["angle"], u["angle_dot"], "B")
+            return jk.Motion([jk.Body(1.0, (0.1, 0.1, 0.1), O.moving(q["x"] * B.x, u["x_dot"] * B.x), B)])
+
+    assert np.isfinite(evaluate(Driven())).all()
+    with pytest.raises(ValueError, match="the frame 'T' turns with"):
+        evaluate(Driven(factor=2.0))
+
+
 # -- named points and frames, constraints
 
 

@@ -425,7 +425,7 @@ class System(eqx.Module):
     """Units of coordinates, speeds and inputs by name, for pictures: `{"q0": "rad", "push": "N"}`. Those of usual
     names, as "roll", "x" or "steer_torque", are known without."""
     check_inertia: ClassVar[bool] = True
-    """Whether bodies are refused whose principal moments of inertia no body can have; see `describing.md`."""
+    """Whether bodies are refused whose principal moments of inertia break the triangle inequality by more than 5 %."""
 
     def __check_init__(self) -> None:
         _check_names(self)

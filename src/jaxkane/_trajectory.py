@@ -26,8 +26,8 @@ class Status(enum.IntEnum):
     MAX_STEPS = 3
     """The solver took `max_steps` steps before the last time."""
     INVALID = 4
-    """A parameter or an initial value was not finite, a positive parameter was not positive, or the coordinates
-    violated a configuration constraint: nothing was solved."""
+    """A parameter or an initial value was not finite, a positive parameter was not positive, a body had a mass or an
+    inertia that no body has, or the coordinates violated a configuration constraint: nothing was solved."""
     INTERRUPTED = 5
     """A sweep was stopped before it came to this member."""
     NO_SOLUTION = 6

@@ -74,9 +74,9 @@ def sweep(
     - `progress`: show a progress bar.
     - `options`: those of `simulate`: rtol, atol, solver, step, adjoint, max_steps, project, stabilize.
 
-    **Returns:** a `Sweep`. A member that is not finite, has a parameter that must be positive and is not, or violates a
-    constraint gets the status `Status.INVALID`; one that falls or breaks down its own status; all with NaN from there
-    on. After Ctrl-C what is finished comes back, the rest as `INTERRUPTED`.
+    **Returns:** a `Sweep`. A member that is not finite, has a parameter that must be positive and is not, a mass or an
+    inertia that no body has, or violates a constraint gets the status `Status.INVALID`; one that falls or breaks down
+    its own status; all with NaN from there on. After Ctrl-C what is finished comes back, the rest as `INTERRUPTED`.
 
     **Raises:** `ValueError` when nothing is a batch, two batches differ in length, a column changes nothing, or the
     folder holds another sweep: the message says in what it differs.
