@@ -59,3 +59,9 @@ def test_every_requirement_says_its_lowest_version_and_jax_its_ceiling():
     jax = next(entry for entry in PROJECT["dependencies"] if entry.startswith("jax>"))
     assert re.fullmatch(r"jax>=[\d.]+,<[\d.]+", jax)
     assert floors["jax"] == re.match(r"jax>=([\d.]+)", jax)[1]
+
+
+def test_files_of_tests_have_names_of_their_own():
+    """pytest imports them by their names alone: two of one name end the whole run."""
+    names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
+    assert sorted(names) == sorted(set(names))

@@ -51,7 +51,7 @@ def test_what_reduce_keeps_is_what_it_would_make_of_the_motions(rides):
     np.testing.assert_array_equal(kept.status, rides.status)
     with pytest.raises(AttributeError, match="kept what `reduce` made"):
         _ = kept.q
-    with pytest.raises(KeyError, match="did you mean .theta1"):
+    with pytest.raises(KeyError, match=r"did you mean .theta1"):
         _ = kept["theta2"]
 
 
