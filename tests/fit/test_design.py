@@ -19,31 +19,47 @@ def push(c, t):
     return {"push": c[0] * jnp.sin(2.0 * t) + c[1] * jnp.cos(5.0 * t)}
 
 
-def test_links_between_windows_are_part_of_a_plan():
-    plan = design(Track(), t, push, C, ("gain", "drift"), sigma=SIGMA, initial={"x": 0.1}, steps=0, **CHAIN)
-    # In closed form: what is measured, by gain, drift and the start of the first window; a jump moves what follows it.
-    h, p = 0.1, np.asarray(push(C, jnp.asarray(t))["push"])
-    rows = [(0.0, 0.0)]
+def exact_errors(push):
+    """Errors of gain and drift in closed form, and the motion with a gain of one from rest.
+
+    Unknowns: gain, drift, the start of the first window, and the jumps to each later one, which move what follows.
+    """
+    h, rows = 0.1, [(0.0, 0.0)]
     for i in range(t.size - 1):
         x, v = rows[-1]
-        rows.append((x + v * h + (2 * p[i] + p[i + 1]) * h**2 / 6, v + (p[i] + p[i + 1]) * h / 2))
-    columns = [np.array(rows)[:, 0], t**2 / 2, np.ones_like(t), t]
-    deviations = []
+        rows.append((x + v * h + (2 * push[i] + push[i + 1]) * h**2 / 6, v + (push[i] + push[i + 1]) * h / 2))
+    motion = np.array(rows)[:, 0]
+    columns, jumps = [motion, t**2 / 2, np.ones_like(t), t], []
     for start in (1.0, 2.0, 3.0):
         later = t > start - 1e-9
         columns += [later * 1.0, later * (t - start)]
-        deviations += [0.002, 0.01]
-    A = np.column_stack(columns) / 0.01
-    information = A.T @ A + np.diag([0.0] * 4 + [d**-2 for d in deviations])
-    exact = np.sqrt(np.diag(np.linalg.inv(information))[:2])
-    assert list(plan.standard_errors.values()) == pytest.approx(exact, rel=1e-4)
-    motion = 0.1 + columns[0]  # with a gain of one, no drift, from rest
-    np.testing.assert_allclose(plan.trial.measured["x"], motion, atol=1e-9)
-    seen = least_squares(Problem.of(Track(), plan.trial, ("gain", "drift"), **CHAIN))
+        jumps += [0.002, 0.01]
+    A = np.column_stack(columns) / SIGMA["x"]
+    information = A.T @ A + np.diag([0.0] * 4 + [jump**-2 for jump in jumps])
+    return np.sqrt(np.diag(np.linalg.inv(information))[:2]), motion
+
+
+def test_a_designed_push_tells_more_and_as_much_as_it_says():
+    names, limit = ("gain", "drift"), 0.6
+    plan = design(
+        Track(), t, push, C, names, sigma=SIGMA, initial={"x": 0.1}, steps=12, rms={"push": 1.0}, limits={"x": limit},
+        **CHAIN,
+    )  # fmt: skip
+    assert plan.history[-1] < plan.history[0] - 1.0
+    assert np.sqrt(np.mean(plan.inputs["push"] ** 2)) == pytest.approx(1.0)
+    assert np.abs(plan.trial.measured["x"]).max() < 1.3 * limit
+    # Links between windows are part of what a plan tells.
+    first = np.asarray(push(C, jnp.asarray(t))["push"])
+    before, _ = exact_errors(first / np.sqrt(np.mean(first**2)))
+    after, motion = exact_errors(plan.inputs["push"])
+    assert list(plan.before.values()) == pytest.approx(before, rel=1e-4)
+    assert list(plan.standard_errors.values()) == pytest.approx(after, rel=1e-4)
+    # The plan is one motion through all windows, and what a fit of such a trial finds.
+    np.testing.assert_allclose(plan.trial.measured["x"], 0.1 + motion, atol=1e-9)
+    seen = least_squares(Problem.of(Track(), plan.trial, names, **CHAIN))
     assert seen.cost < 1e-12
     of_fit = np.sqrt(np.diag(np.linalg.inv(identifiability(seen).information)))
     assert list(plan.standard_errors.values()) == pytest.approx(of_fit, rel=1e-4)
-    assert plan.covariance == pytest.approx(plan.covariance_before)
 
 
 def test_the_gradient_of_a_plan_against_differences():

@@ -8,7 +8,7 @@ import scipy.special
 from scipy import stats
 from systems import Cart
 
-from jaxkane.fit import Free, Problem, Trial, fit, laplace, least_squares
+from jaxkane.fit import Free, Problem, Trial, bfgs, fit, gradient_descent, laplace, least_squares
 
 H, SIGMA = 0.25, 0.001
 t = np.arange(0.0, 10.0, H)
@@ -110,3 +110,21 @@ def test_the_evidence_by_quadrature(trial, by_exact_motion):
     log_p += stats.norm.logpdf(K, *priors["stiffness"]) + stats.norm.logpdf(C, *priors["damping"])
     cell = np.log(errors[0] * errors[1] * (grid[1] - grid[0]) ** 2)
     assert laplace(found).log_evidence == pytest.approx(scipy.special.logsumexp(log_p) + cell, abs=0.01)
+
+
+@pytest.fixture(scope="module")
+def beyond():
+    """Data of a spring that pushes: the minimum lies where a stiffness, declared positive, cannot be simulated."""
+    pushed = Trial(t, {"x": exact(-0.05, 2.0)}, {"push": PUSH}, sigma=SIGMA, initial={"x": 0.1, "x_dot": 0.0})
+    guess = Cart(mass=1.0, stiffness=0.5, damping=2.0)
+    return Problem.of(guess, pushed, Free("stiffness", bounds=(None, None)), step=0.05)
+
+
+@pytest.mark.parametrize("method", [least_squares, gradient_descent, bfgs])
+def test_no_method_converges_where_nothing_can_be_simulated(beyond, method):
+    found = method(beyond)
+    assert found.status in ("stuck", "steps"), found
+    assert not found.ok
+    assert np.isfinite(found.cost)
+    assert found.cost < found.history[0]
+    assert 0.0 < found.estimates["stiffness"] < 0.5

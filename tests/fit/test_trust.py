@@ -9,13 +9,13 @@ import pytest
 from systems import Cart
 from test_transcriptions import GUESS, TRUTH, record
 
+import jaxkane.fit._suspicions as suspicions
 from jaxkane.fit import (
     Fit,
     Free,
     Problem,
     Trial,
     cross_validate,
-    design,
     laplace,
     least_squares,
     log_density,
@@ -23,6 +23,8 @@ from jaxkane.fit import (
     profile,
 )
 from jaxkane.fit._residual_tests import residual_test
+from jaxkane.fit._steps import settle
+from jaxkane.fit._suspicions import contrary_rates, doubled_trials, empty_columns
 
 NAMES = ("mass", "stiffness", "damping")
 T = np.arange(0.0, 4.0, 0.1)
@@ -121,11 +123,14 @@ def test_trials_left_out(result):
 
 
 def test_other_trials_are_looked_at_with_the_parameters_held(result):
-    others = [record(T, seed) for seed in (20, 21)]
+    others = [record(T, seed) for seed in range(20, 26)]
     held = result.applied_to(others)
     assert held.status == "applied"
     assert held.estimates == result.estimates
-    assert held.cost < 1.5 * 2 * T.size < held.history[0]
+    # What is left is noise: the parameters were found elsewhere, only starts were found here.
+    n, unknown = held.problem.size
+    assert held.cost == pytest.approx(n - unknown, rel=0.25)
+    assert held.history[0] > 10 * held.cost
     assert "not fitted" in str(held)
 
 
@@ -156,54 +161,73 @@ def test_the_density_is_that_of_the_residuals(problem, result):
     assert extra == pytest.approx(float(problem.parameters.log_determinant(away.x)), abs=1e-9)
 
 
-def test_laplace_has_the_errors_of_given_sigma(result):
+def test_laplace_has_the_errors_of_given_sigma(problem, result):
     gaussian = laplace(result)
     draws = gaussian.sample(4000)
     for name, error in result.standard_errors.items():
         assert np.std(draws[name]) == pytest.approx(error / np.sqrt(result.variance), rel=0.1)
+        assert np.mean(draws[name]) == pytest.approx(result.estimates[name], abs=0.1 * error)
         assert np.all(draws[name] > 0)
-    assert np.isfinite(gaussian.log_evidence)
+    # Nothing says which values were likely before: there is no evidence. Twice as narrow priors are worth 3 ln 2.
+    assert np.isnan(gaussian.log_evidence)
+    assert "any value of mass, stiffness, damping is as likely" in gaussian.message
+    evidence = []
+    for width in (20.0, 10.0):
+        known = {name: (value, width * abs(value)) for name, value in result.estimates.items()}
+        evidence.append(laplace(least_squares(problem.with_priors(known), start=result.point)).log_evidence)
+    # Half of each of the two that are positive is cut off, a little less of the narrower.
+    assert evidence[1] - evidence[0] == pytest.approx(3 * np.log(2.0), abs=0.1)
+    with pytest.raises(ValueError, match="This is no minimum"):
+        laplace(least_squares(problem, steps=1))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("package", ["numpyro", "blackjax"])
-def test_samplers_find_the_laplace_approximation(trials, package):
+def test_samplers_find_the_laplace_approximation(package):
     sampler, key = pytest.importorskip(package), jax.random.key(0)
-    mode = least_squares(Problem.of(GUESS, trials[:2], NAMES, **UNKNOWN))
+    begun = record(T, 0, initial={"x": 0.2, "x_dot": 0.0})
+    mode = least_squares(Problem.of(GUESS, begun, ("mass", "stiffness")))
     density = log_density(mode, over="x")
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         if package == "numpyro":
-            kernel = sampler.infer.NUTS(potential_fn=lambda point: -density(point))
-            run = sampler.infer.MCMC(kernel, num_warmup=200, num_samples=600, progress_bar=False)
+            kernel = sampler.infer.NUTS(potential_fn=lambda point: -density(point), max_tree_depth=4)
+            run = sampler.infer.MCMC(kernel, num_warmup=150, num_samples=400, progress_bar=False)
             run.run(key, init_params=mode.point)
             x = run.get_samples().x
         else:
-            warm, _ = sampler.window_adaptation(sampler.nuts, density).run(key, mode.point, num_steps=200)
-            step = jax.jit(sampler.nuts(density, **warm.parameters).step)
-            x, state = [], warm.state
-            for one in jax.random.split(key, 600):
-                state, _ = step(one, state)
-                x.append(state.position.x)
+            warm, _ = sampler.window_adaptation(sampler.nuts, density).run(key, mode.point, num_steps=150)
+            kernel = sampler.nuts(density, **warm.parameters)
+            _, states = jax.jit(lambda keys: jax.lax.scan(lambda s, k: (kernel.step(k, s)[0],) * 2, warm.state, keys))(
+                jax.random.split(key, 400)
+            )
+            x = states.position.x
     approximation = laplace(mode)
     deviation = np.sqrt(approximation.covariance.diagonal())
-    np.testing.assert_allclose(np.mean(np.asarray(x), axis=0), approximation.mean, atol=0.5 * deviation.max())
-    np.testing.assert_allclose(np.std(np.asarray(x), axis=0), deviation, rtol=0.4)
+    np.testing.assert_allclose(np.mean(np.asarray(x), axis=0), approximation.mean, atol=0.3 * deviation.min())
+    np.testing.assert_allclose(np.std(np.asarray(x), axis=0), deviation, rtol=0.25)
 
 
-def test_priors_are_weighed_and_told(trials):
-    told = least_squares(
-        Problem.of(GUESS, trials[:1], NAMES, priors={"mass": (1.0, 1e-4), "other": (0.0, 1.0)}, **UNKNOWN)
-    )
+def test_priors_are_weighed_and_told(problem, result):
+    told = least_squares(problem.with_priors({"mass": (1.0, 1e-4), "other": (0.0, 1.0)}), start=result.point)
     assert told.estimates["mass"] == pytest.approx(1.0, abs=5e-4)
+    assert told.standard_errors["mass"] == pytest.approx(1e-4 * told.variance**0.5, rel=0.01)
+    # By trial, a prior is a measurement of its own, of the deviation that it was given.
+    assert told.clustered_errors["mass"] == pytest.approx(1e-4, rel=0.05)
     assert any("mass is known by its prior alone" in note for note in told.notes)
 
 
 # Suspicious data, each reported by name.
 
 
-def test_a_wrong_sign_of_an_input(problem, trials):
+def test_a_wrong_sign_of_an_input(problem, trials, monkeypatch):
     wrong = [Trial(t.t, t.measured, {"push": -t.inputs["push"]}, sigma=0.01, name=t.name) for t in trials]
-    assert any("the input push seems to have the wrong sign" in note for note in again(problem, wrong).notes)
+    found, fits = again(problem, wrong), []
+    monkeypatch.setattr(suspicions, "settle", lambda *a, **k: fits.append(1) or settle(*a, **k))
+    # To print a fit starts no other one.
+    assert "`notes` tries whether a sign is wrong" in str(found)
+    assert not fits
+    assert any("the input push seems to have the wrong sign" in note for note in found.notes)
+    assert fits
 
 
 def test_a_rate_against_its_coordinate_and_a_column_of_zeros(trials):
@@ -214,9 +238,11 @@ def test_a_rate_against_its_coordinate_and_a_column_of_zeros(trials):
         for t in trials[:2]
     ]
     rated[1].measured["x_dot"] = np.zeros(T.shape)
-    notes = least_squares(Problem.of(GUESS, rated, NAMES, **UNKNOWN), steps=3).notes
-    assert any("run 0: x_dot runs against the change of x" in note for note in notes)
-    assert any("run 1: x_dot is 0 throughout" in note for note in notes)
+    posed = Problem.of(GUESS, [*rated, rated[1]], NAMES, step=0.1, **UNKNOWN)
+    (note,) = contrary_rates(posed)
+    assert "run 0: x_dot runs against the change of x" in note
+    assert "run 1: x_dot is 0 throughout" in empty_columns(posed)[0]
+    assert doubled_trials(posed) == ["run 1 has the samples of run 1: what is measured once counts twice."]
 
 
 def test_what_runs_to_its_bound_is_told_so(trials):
@@ -274,23 +300,3 @@ def test_the_report_is_one_page_that_says_it_all(result, tmp_path):
     told = result.report(TRUTH)
     assert "95 % interval" in told
     assert "truth" in told
-
-
-def test_a_designed_push_tells_more():
-    t = np.arange(0.0, 4.0, 0.1)
-
-    def push(c, t):
-        return {"push": c[0] * jnp.sin(2.0 * jnp.pi * c[1] * t) + 1e-3}
-
-    plan = design(
-        TRUTH, t, push, jnp.array([1.0, 1.5]), NAMES, sigma={"x": 0.01}, rms={"push": 1.0}, limits={"x": 1.0},
-        unknown=("x", "x_dot"), steps=20,
-    )  # fmt: skip
-    assert plan.history[-1] < plan.history[0] - 3.0
-    assert all(plan.standard_errors[name] < plan.before[name] for name in NAMES)
-    assert np.abs(plan.trial.measured["x"]).max() < 1.1
-    assert np.sqrt(np.mean(plan.inputs["push"] ** 2)) == pytest.approx(1.0)
-    # It is what a fit of such a trial would find.
-    seen = least_squares(Problem.of(TRUTH, plan.trial, NAMES, unknown=("x", "x_dot")))
-    formal = {name: e / np.sqrt(seen.variance) for name, e in seen.standard_errors.items()}
-    assert formal == pytest.approx(plan.standard_errors, rel=0.02)

@@ -9,6 +9,7 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 
 from .._reads import compiled
+from ._blocks import eliminate
 from ._density import half_cost
 from ._model import Point
 from ._problem import Problem, linearize
@@ -64,6 +65,9 @@ def bfgs(
     there = linearize(problem, end)
     if not usable(there) or there is None or there.cost > at.cost:
         end, there, status = point, at, status if status == "interrupted" else "stuck"
+    elif status == "converged" and there.cost - float(eliminate(there.blocks, 0.0).step(1e-9)[1]) > 0.01 * there.cost:
+        # Steps also become short before what cannot be simulated: that is no minimum while others would lower the cost.
+        status = "stuck"
     history = (at.cost, *np.full(max(taken - 1, 0), np.nan), there.cost)
     return Fit.of(problem, end, there, history, status, type(solver).__name__)
 
