@@ -18,7 +18,7 @@ from . import _suspicions as suspicions
 from ._identifiability import Identifiability, look, residual_variance
 from ._model import Point
 from ._parameters import Parameters
-from ._problem import Linearization, Problem
+from ._problem import STEP_TOLERANCE, Linearization, Problem
 from ._residual_tests import ResidualTest, residual_test
 from ._steps import settle
 from ._trial import Trial
@@ -131,9 +131,10 @@ class Fit:
 
     @property
     def too_coarse(self) -> bool:
-        """Whether halving the fixed step moves a window's residuals by more than a share of what noise does."""
+        """Whether halving the fixed step moves all residuals together by more than a quarter of what noise does: by as
+        much of its standard errors an estimate may be off."""
         noise = max(1.0, np.nan_to_num(self.variance, nan=1.0)) ** 0.5
-        return bool(np.any(self._step_errors > noise * self.problem.step_tolerance))
+        return bool(self.step_error > noise * STEP_TOLERANCE[1])
 
     @property
     def singular_values(self) -> np.ndarray:
