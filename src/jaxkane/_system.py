@@ -255,7 +255,7 @@ class Motion:
         points: Mapping[str, Point] | None = None,
         frames: Mapping[str, Frame] | None = None,
     ):
-        self.bodies = (bodies,) if isinstance(bodies, Body) else tuple(bodies)
+        self.bodies: tuple[Body, ...] = (bodies,) if isinstance(bodies, Body) else tuple(bodies)
         if not self.bodies:
             raise ValueError("A Motion needs at least one Body.")
         given = (constraints,) if isinstance(constraints, (Vector, float, int, jax.Array)) else tuple(constraints)
