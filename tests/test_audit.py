@@ -65,7 +65,8 @@ def test_conditioning_of_the_bicycle():
     system, ride = run("WhippleBicycle", 1.0, 11)
     audit = jk.audit(system, ride)
     M = jk.mass_matrix(system, 0.0, ride.q[0], ride.u[0])
-    np.testing.assert_allclose(audit.condition_M[0], np.linalg.cond(M), rtol=1e-10)
+    size = np.sqrt(np.diag(M))
+    np.testing.assert_allclose(audit.condition_M[0], np.linalg.cond(M / np.outer(size, size)), rtol=1e-10)
     assert audit.velocity_residuals.shape == (11, 3)
     assert 1 < audit.condition_C_dep.max() < 10
     assert audit.plot().shape == (2, 2)
@@ -92,3 +93,26 @@ def test_a_batch_is_refused():
     batch = jk.Trajectory(**{f: getattr(swing, f) for f in swing.__dataclass_fields__} | {"t": swing.t[None]})
     with pytest.raises(ValueError, match="one member"):
         jk.audit(system, batch)
+
+
+class Satellite(jk.System):
+    """A point mass on a circle, in metres and radians."""
+
+    coordinates, speeds = ("r", "angle"), ("r_dot", "rate")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, q["angle"], u["rate"], "A")
+        P = O.moving(q["r"] * A.x, u["r_dot"] * A.x)
+        return jk.Motion([jk.Body(500.0, 0.0, P, name="satellite")], frames={"A": A})
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force(-500.0 * 3.986e14 / q["r"] ** 2 * motion["A"].x, motion["satellite"])
+
+
+def test_metres_beside_radians_are_no_bad_condition():
+    rate = np.sqrt(3.986e14 / 7e6**3)
+    ride = jk.simulate(Satellite(), jk.State([7e6, 0.0], [0.0, rate]), np.linspace(0.0, 0.1, 11) / rate)
+    audit = jk.audit(Satellite(), ride)
+    np.testing.assert_allclose(audit.condition_M, 1.0)
+    assert audit.ok

@@ -170,3 +170,68 @@ def test_the_pendulum_of_the_page_for_sympys_users_moves_as_sympys():
     exec(block, names)
     np.testing.assert_allclose([names["rates"]["vx"], names["rates"]["vy"]], [-4.943175, -3.2191], rtol=1e-12)
     np.testing.assert_allclose(names["f"] / names["M"][0], -4.943175, rtol=1e-12)
+
+
+class Slider(jk.System):
+    """A particle on a line, and a light arm beside it; `what` acts on them."""
+
+    what: object = eqx.field(static=True, default=None)
+    coordinates, speeds, inputs = ("x", "angle"), ("v", "rate"), ("push",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, q["angle"], u["rate"])
+        bead = jk.Body(2.0, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x), name="bead")
+        arm = jk.Body(1.0, (0.0, 0.0, 0.5), O, A, name="arm")
+        return jk.Motion([bead, arm])
+
+    def loads(self, t, q, u, motion, inputs):
+        return self.what(motion, inputs)
+
+
+def on_the_bead(motion, inputs):
+    return jk.Torque(motion.N.z, motion["bead"])
+
+
+def against_the_bead(motion, inputs):
+    return jk.loads.torsional_damper(motion["arm"], motion["bead"], motion.N.z, 0.1)
+
+
+@pytest.mark.parametrize("what", [on_the_bead, against_the_bead])
+def test_a_torque_on_a_particle_is_refused(what):
+    with pytest.raises(ValueError, match="'bead' is a particle"):
+        jk.accelerations(Slider(what), 0.0, [0.1, 0.2], [0.3, 0.4])
+
+
+def test_an_input_that_a_description_misspells_is_named_with_those_there_are():
+    misspelt = Slider(lambda motion, inputs: jk.Force(inputs["pusch"] * motion.N.x, motion["bead"]))
+    with pytest.raises(KeyError, match="'pusch' in the inputs of Slider; did you mean 'push'"):
+        jk.accelerations(misspelt, 0.0, [0.1, 0.2], [0.3, 0.4])
+
+
+@pytest.mark.parametrize("q", ["a", None, object()])
+def test_what_are_no_coordinates_is_refused_by_name(q):
+    with pytest.raises((TypeError, ValueError), match=r"Slider: q must be 2 numbers \(x, angle\), got"):
+        jk.accelerations(Slider(lambda motion, inputs: []), 0.0, q, [0.3, 0.4])
+
+
+N, O = jk.inertial()
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: N.x.dot(3.0), "dot takes a Vector"),
+        (lambda: N.x.cross([1, 2, 3]), "cross takes a Vector"),
+        (lambda: N.x.to(O), "asked for in a Frame"),
+        (lambda: O.fixed(3.0), "Point.fixed takes a Vector"),
+        (lambda: O.moving(N.x, 2.0), "Point.moving, as the velocity, takes a Vector"),
+        (lambda: jk.Body(1.0, (1, 1, 1), O, N, angular_velocity=3.0, name="wheel"), "'wheel' is a Vector"),
+        (lambda: jk.Body(1.0, (1, 1, 1), O, N, about=N.x, name="wheel"), "'wheel' is about a Point"),
+        (lambda: jk.Body(1.0, 2.0, O, N, name="wheel"), "wheel: the inertia is three principal moments"),
+        (lambda: jk.Body(1.0, 0.0, O, about=O.fixed(N.x), name="wheel"), "'wheel' has an inertia, but no frame"),
+    ],
+)
+def test_what_is_no_vector_frame_or_point_is_refused_in_words(call, words):
+    with pytest.raises((TypeError, ValueError), match=re.escape(words)):
+        call()

@@ -153,3 +153,14 @@ def test_the_direction_of_an_axis_has_derivatives():
     numeric = (place(jnp.array(0.5 + h)) - place(jnp.array(0.5 - h))) / (2 * h)
     np.testing.assert_allclose(jax.jacfwd(place)(0.5), numeric, atol=1e-9)
     np.testing.assert_allclose(jax.jacrev(place)(0.5), numeric, atol=1e-9)
+
+
+def test_a_fixed_rotation_takes_euler_parameters_of_any_norm():
+    N, _ = jk.inertial()
+    for e in ((0.0, 0.0, 1.2, 1.6), jnp.array([0.0, 0.0, 1.2, 1.6]), (0.0, 0.0, 0.6, 0.8)):
+        R = N.rotate_euler(e).matrix(N)  # cos = 0.8^2 - 0.6^2
+        np.testing.assert_allclose(R, [[0.28, 0.96, 0.0], [-0.96, 0.28, 0.0], [0.0, 0.0, 1.0]], atol=1e-15)
+    along = jax.grad(lambda s: N.rotate_euler(s * jnp.array([0.1, 0.2, 0.6, 0.8])).matrix(N).sum())(1.3)
+    np.testing.assert_allclose(along, 0.0, atol=1e-14)
+    with pytest.raises(ValueError, match="all zero"):
+        N.rotate_euler((0.0, 0.0, 0.0, 0.0))

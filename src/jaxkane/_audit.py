@@ -42,8 +42,9 @@ class Audit(eqx.Module):
         where a body has no position.
     - `configuration_residuals` (n_t, h), `velocity_residuals` (n_t, k): of all constraints, in their own units. Norms
         of Euler parameters are among the first.
-    - `condition_M`, `condition_C_dep` (n_t,): condition numbers of the mass matrix, and of what the dependent speeds
-        are solved from, as `best_dependent_speeds` has them (1 without dependent speeds).
+    - `condition_M`, `condition_C_dep` (n_t,): condition numbers of the mass matrix, its diagonal brought to 1, since
+        metres beside radians are no fault; and of what the dependent speeds are solved from, as
+        `best_dependent_speeds` has them (1 without dependent speeds).
     - `reason`: how the simulation ended.
     """
 
@@ -164,6 +165,8 @@ def audit(system: System, trajectory: Trajectory) -> Audit:
     **Raises:** `ValueError` for a batch, and for a trajectory that reached fewer than two of its times.
     """
     name = type(system).__name__
+    if not isinstance(trajectory, Trajectory):
+        raise TypeError(f"audit({name}): the second argument is a Trajectory, as from simulate, got {trajectory!r}.")
     if trajectory.t.ndim != 1:
         raise ValueError(
             f"audit({name}): takes one motion; of a batch of shape {trajectory.t.shape[:-1]} give one member."
@@ -188,7 +191,7 @@ def audit(system: System, trajectory: Trajectory) -> Audit:
         angular_momentum=now["H"],
         configuration_residuals=now["h"],
         velocity_residuals=now["c"],
-        condition_M=np.linalg.cond(now["M"]),
+        condition_M=_condition_of_masses(now["M"]),
         condition_C_dep=relative_condition(now["C"], range(len(system.speeds), now["C"].shape[-1]))
         if now["c"].size
         else np.ones_like(ts),
@@ -291,6 +294,14 @@ def _cumulative_integral(t: np.ndarray, x: np.ndarray, points: int) -> np.ndarra
     moments = np.array([2 / (j + 1) if j % 2 == 0 else 0.0 for j in range(m)])
     weights = np.linalg.solve(powers, np.broadcast_to(moments[:, None], (n - 1, m, 1)))[..., 0]
     return np.concatenate([[0.0], np.cumsum(half * np.sum(weights * x[places], axis=1))])
+
+
+def _condition_of_masses(M: np.ndarray) -> np.ndarray:
+    """Condition numbers (n_t,) of mass matrices (n_t, n, n), each speed in units in which it moves a mass of one: that
+    metres stand beside radians, as of a satellite, makes nothing badly conditioned."""
+    diagonal = np.sqrt(np.diagonal(M, axis1=-2, axis2=-1))
+    sizes = np.where(diagonal > 0, diagonal, 1.0)
+    return np.linalg.cond(M / (sizes[:, :, None] * sizes[:, None, :]))
 
 
 def _largest(x: np.ndarray) -> float:

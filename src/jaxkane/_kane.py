@@ -28,7 +28,7 @@ from jaxtyping import Array
 
 from ._components import add, add3, component, cross, dot, is_exact, is_zero, matvec, mul, scale3
 from ._linear import Rows, solve, solve_positive
-from ._lookup import refuse_unknown
+from ._lookup import not_there, refuse_unknown
 from ._system import Body, Load, Motion, System, flatten_loads, flatten_residuals
 from ._types import Component
 
@@ -93,7 +93,7 @@ class Reading:
         self.system = system
         self.name = type(system).__name__
         self.n, self.k = len(system.speeds), len(system.dependent_speeds)
-        self.inputs = checked_inputs(system, inputs)
+        self.inputs = Inputs(checked_inputs(system, inputs), f"the inputs of {self.name}")
 
     def motion(self, t: Component, q: Row, u: Row) -> Motion:
         motion = self.system.motion(t, q, u)
@@ -313,7 +313,7 @@ def as_row(values: Any, names: Sequence[str], label: str) -> Row:
     if hasattr(values, "shape"):
         array = as_array(values, names, label)
         return tuple(array[i] for i in range(len(names)))
-    if not isinstance(values, Iterable):
+    if not isinstance(values, Iterable) or isinstance(values, Mapping):
         raise TypeError(f"{label} must be {len(names)} numbers in a sequence ({', '.join(names)}), got {values!r}.")
     try:
         row = tuple(component(x) for x in values)
@@ -326,13 +326,20 @@ def as_row(values: Any, names: Sequence[str], label: str) -> Row:
 
 def as_array(values: Any, names: Sequence[str], label: str) -> Array:
     """Numbers, in their order or by name, as a float array of shape (len(names),). Those not named are zero."""
-    array = by_names(values, names, label) if isinstance(values, Mapping) else jnp.asarray(values)
+    array = by_names(values, names, label) if isinstance(values, Mapping) else _numbers(values, names, label)
     if not jnp.issubdtype(array.dtype, jnp.inexact):
         array = array.astype(float)
     if array.shape != (len(names),):
         hint = " For a batch use jax.vmap." if array.ndim > 1 else ""
         raise ValueError(f"{label} must have the shape ({len(names)},): {', '.join(names)}. Got {array.shape}.{hint}")
     return array
+
+
+def _numbers(values: Any, names: Sequence[str], label: str) -> Array:
+    try:
+        return jnp.asarray(values)
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"{label} must be {len(names)} numbers ({', '.join(names)}), got {values!r}.") from None
 
 
 def by_names(values: Mapping[str, Any], names: Sequence[str], label: str) -> Array:
@@ -366,6 +373,17 @@ def refuse_incomplete(system: System, q: Any, u: Any) -> None:
             f"{name}: {', '.join(given)} is a dependent speed, which follows from the others: leave it out of u. "
             "(jaxkane.assemble compares it with what the velocity residuals say.)"
         )
+
+
+class Inputs(dict[str, Component]):
+    """Inputs by name, as `loads` reads them. One that is not there is refused with the names that are."""
+
+    def __init__(self, values: Mapping[str, Component], of: str):
+        super().__init__(values)
+        self._of = of
+
+    def __missing__(self, name: str) -> Component:
+        raise not_there(name, self, self._of)
 
 
 def checked_inputs(system: System, inputs: Mapping[str, Component] | None) -> dict[str, Component]:

@@ -89,10 +89,11 @@ class Body:
     - `about`: a Point that is fixed in `frame`, about which `inertia` is given instead: it is taken to the mass centre
         by the parallel axis theorem, I - m (r.r 1 - r r).
 
-    **Raises:** `ValueError` for an inertia of another shape, and for one without a frame to turn with.
+    **Raises:** `ValueError` for an inertia of another shape, and for one without a frame to turn with; `TypeError` for
+    what is no point, frame or vector.
     """
 
-    __slots__ = ("about", "angular_velocity", "center", "frame", "inertia", "mass", "name")
+    __slots__ = ("about", "angular_velocity", "center", "frame", "inertia", "is_particle", "mass", "name")
 
     def __init__(
         self,
@@ -110,9 +111,15 @@ class Body:
             )
         if not isinstance(frame, (Frame, type(None))):
             raise TypeError(f"Body(mass, inertia, center, frame): the frame of {name!r} is a Frame, got {frame!r}.")
+        if not isinstance(angular_velocity, (Vector, type(None))):
+            raise TypeError(f"Body: the angular velocity of {name!r} is a Vector, got {angular_velocity!r}.")
+        if not isinstance(about, (Point, type(None))):
+            raise TypeError(f"Body(..., about=P): the inertia of {name!r} is about a Point, got {about!r}.")
         self.mass = component(mass)
         self.inertia = _inertia(inertia, name)
-        if frame is None and angular_velocity is None and not all(is_zero(x) for row in self.inertia for x in row):
+        self.is_particle = frame is None and angular_velocity is None
+        has_inertia = about is not None or not all(is_zero(x) for row in self.inertia for x in row)
+        if self.is_particle and has_inertia:
             raise ValueError(
                 f"Body(mass, inertia, center): {name!r} has an inertia, but no frame to turn with. Give its frame, "
                 "Body(mass, inertia, center, frame); for a particle write 0.0 for the inertia."
@@ -131,7 +138,8 @@ class Body:
 
 def _inertia(given: Any, name: str) -> tuple[Triple, Triple, Triple]:
     inertia: Any = (0.0, 0.0, 0.0) if isinstance(given, (int, float)) and given == 0 else given
-    shape = np.shape(inertia) if hasattr(inertia, "shape") else (len(inertia), *_inner(inertia))
+    has_length = not hasattr(inertia, "shape") and isinstance(inertia, Sequence)
+    shape = (len(inertia), *_inner(inertia)) if has_length else np.shape(inertia)
     if shape == (3,):
         a, b, c = (component(x) for x in inertia)
         return ((a, 0.0, 0.0), (0.0, b, 0.0), (0.0, 0.0, c))
@@ -179,6 +187,8 @@ class Torque:
     """A torque [N m] that acts on a body or on a frame; its reaction, if one is meant, on another.
 
     Torque(T * C.z, fork, reaction_on=frame)
+
+    **Raises:** `ValueError` for a particle, which has no frame that could turn.
     """
 
     __slots__ = ("vector", "velocity")
@@ -188,6 +198,11 @@ class Torque:
         for part in (on, reaction_on):
             if not isinstance(part, (Frame, Body, type(None))):
                 raise TypeError(f"Torque(vector, on): acts on a Body or a Frame, got {part!r}.")
+            if isinstance(part, Body) and part.is_particle:
+                raise ValueError(
+                    f"Torque(vector, on): {part.name!r} is a particle, which a torque does not move. Let it act on the "
+                    "frame that turns, or give the body that frame: Body(mass, inertia, center, frame)."
+                )
         self.velocity = on.angular_velocity
         if reaction_on is not None:
             self.velocity = on.angular_velocity - reaction_on.angular_velocity

@@ -173,12 +173,16 @@ class Frame:
 
         - `parameters`: (e1, e2, e3, e4) of unit norm, e4 the scalar: scalar last, as in the textbook.
         - `angular_velocity`: relative to this frame [rad/s]: three components in the new frame, or a Vector. None for a
-            fixed rotation, as of a sensor on its body.
+            fixed rotation, as of a sensor on its body; the norm of its parameters is of no account.
         """
         if len(parameters) != 4:
             raise ValueError(f"Euler parameters are four numbers, the scalar last; got {len(parameters)}.")
-        rotation = rotations.euler_parameters_matrix([component(e) for e in parameters])
-        return self._oriented(rotation, ZERO3 if angular_velocity is None else angular_velocity, name)
+        e = [component(x) for x in parameters]
+        if angular_velocity is None:
+            e = rotations.normalized(e)
+        return self._oriented(
+            rotations.euler_parameters_matrix(e), ZERO3 if angular_velocity is None else angular_velocity, name
+        )
 
     def rotate_by(
         self, orientation: Callable[..., Any], t: Component, q: Any, q_dot: Any, name: str | None = None
@@ -260,6 +264,8 @@ class Vector:
 
     def _resolve(self, frame: Frame) -> Triple:
         # Step by step, and every step is remembered: a vector that all links of a chain need costs each one step.
+        if not isinstance(frame, Frame):
+            raise TypeError(f"The components of a Vector are asked for in a Frame, got {frame!r}.")
         if self.frame.root is not frame.root:
             raise ValueError(
                 f"The frames {self.frame.name} and {frame.name} have no common inertial frame. Call "
@@ -312,11 +318,13 @@ class Vector:
 
     def dot(self, other: Vector) -> Component:
         """The scalar product."""
+        _refuse_other(other, "dot")
         frame = self.frame if self._is_denser_than(other) else other.frame
         return dot(self.components_in(frame), other.components_in(frame))
 
     def cross(self, other: Vector) -> Vector:
         """The vector product."""
+        _refuse_other(other, "cross")
         frame, a, b = _meet(self, other)
         return Vector(frame, cross(a, b), mixed=self.mixed or other.mixed or self.frame is not other.frame)
 
@@ -341,6 +349,11 @@ class Vector:
     def _is_denser_than(self, other: Vector) -> bool:
         count = lambda v: sum(not is_zero(a) for a in v.components)  # noqa: E731
         return count(self) >= count(other)
+
+
+def _refuse_other(given: Any, verb: str) -> None:
+    if not isinstance(given, Vector):
+        raise TypeError(f"{verb} takes a Vector such as 3.0 * N.x, got {given!r}.")
 
 
 def _meet(a: Vector, b: Vector) -> tuple[Frame, Triple, Triple]:
@@ -409,6 +422,7 @@ class Point:
         written in.
         """
         frame = frame or _own_frame(r, "moving")
+        _refuse_other(velocity, "Point.moving, as the velocity,")
         carried = self.velocity + frame.angular_velocity.cross(r)
         point = Point(carried + velocity, self, r, name or f"{self.name}'")
         point._claim = Claim(frame, velocity)
@@ -452,6 +466,7 @@ class Point:
 
 
 def _own_frame(r: Vector, verb: str) -> Frame:
+    _refuse_other(r, f"Point.{verb}")
     if r.mixed:
         raise ValueError(
             f"Point.{verb}: the vector adds parts written in different frames, so the frame it belongs to is not "

@@ -7,6 +7,7 @@ Source: Kamman, Volume II, Unit 5, Examples 2, 6, 7 and Exercises 5.6, 5.8.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Any
 
@@ -116,6 +117,20 @@ def euler_parameters_matrix(parameters: Sequence[Component]) -> Matrix:
         (2.0 * (e1 * e2 - e3 * e4), e2 * e2 - e1 * e1 - e3 * e3 + e4 * e4, 2.0 * (e2 * e3 + e1 * e4)),
         (2.0 * (e1 * e3 + e2 * e4), 2.0 * (e2 * e3 - e1 * e4), e3 * e3 - e1 * e1 - e2 * e2 + e4 * e4),
     )
+
+
+def normalized(parameters: Sequence[Component]) -> tuple[Component, ...]:
+    """Euler parameters brought to unit norm; exact ones stay exact.
+
+    **Raises:** `ValueError` where all are exactly zero.
+    """
+    square = dot(parameters, parameters)
+    if not is_exact(square):
+        norm = jnp.sqrt(square)
+        return tuple(_divide(e, norm) for e in parameters)
+    if square == 0.0:
+        raise ValueError("Euler parameters that are all zero are no rotation; (0.0, 0.0, 0.0, 1.0) is none at all.")
+    return tuple(parameters) if abs(square - 1.0) < 1e-15 else tuple(e / math.sqrt(square) for e in parameters)
 
 
 def euler_parameter_rates(parameters: Sequence[Component], omega: Sequence[Component]) -> tuple[Any, Any, Any, Any]:

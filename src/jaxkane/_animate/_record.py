@@ -50,6 +50,8 @@ def record(system: System, trajectory: Trajectory, figure: Figure | None) -> Rec
     its times.
     """
     name = type(system).__name__
+    if not isinstance(trajectory, Trajectory):
+        raise TypeError(f"animate({name}): the second argument is a Trajectory, as from simulate, got {trajectory!r}.")
     if trajectory.t.ndim != 1:
         raise ValueError(
             f"animate({name}): takes one motion; of a batch of shape {trajectory.t.shape[:-1]} give one member: "
