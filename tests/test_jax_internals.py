@@ -22,7 +22,7 @@ USED = {
     "jax.experimental.compilation_cache.compilation_cache": "reset_cache",
     "jax.experimental.multihost_utils": "process_allgather",
     "jax.ffi": "ffi_lowering pycapsule register_ffi_target",
-    "jax.core": "Tracer",
+    "jax.core": "Tracer eval_context",
     "equinox._errors": "EQX_ON_ERROR",
 }
 

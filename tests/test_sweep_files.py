@@ -214,6 +214,16 @@ def test_a_chunk_of_other_shapes_is_not_taken(copy, rides):
         np.testing.assert_array_equal(run(copy).q, rides.q)
 
 
+def test_chunks_that_changed_places_are_computed_again(copy, finished, rides):
+    first, second, _ = sorted(copy.glob("chunk-*.npz"))
+    whole = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    second.write_bytes(whole)
+    with pytest.warns(UserWarning, match=r"2 chunks cannot be read .*it belongs elsewhere"):
+        np.testing.assert_array_equal(run(copy).q, rides.q)
+    assert contents(copy) == contents(finished)
+
+
 def test_a_file_in_the_place_of_the_folder(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(ValueError, match="file is a file: `folder` is the name of a folder"):

@@ -18,6 +18,7 @@ from jax.core import Tracer
 from ._description import check_description
 from ._description import configuration_residual as configuration_residual
 from ._fuse import fused
+from ._jax_internals import concretely
 from ._kane import Reading
 from ._linear import stack
 from ._nan import nan_where
@@ -48,7 +49,7 @@ def check_system(system: System, t: Any, q: Any, *, bodies: bool = True) -> None
     if is_batch(system):
         return
     system, t, q = jax.tree.map(_value, (system, t, q))
-    with jax.ensure_compile_time_eval(), np.errstate(invalid="ignore", over="ignore"):
+    with concretely(), np.errstate(invalid="ignore", over="ignore"):
         check_description(system, t, q)
         if bodies and q is not None and is_concrete(system, t, q):
             check_bodies(system, t, q)

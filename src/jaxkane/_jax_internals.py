@@ -7,6 +7,7 @@ Each has a way back, so that where a release takes it away, results stay right a
 | jaxprs and primitives (`jax.extend`, `jax.interpreters`) | `FUSES` says why; right-hand sides are plain JAX |
 | the frontend attribute that makes one function of a program | XLA cuts the program as it does any other |
 | `reset_cache`, equinox's switch of its checks | programs are kept only where the environment says so from the start |
+| `eval_context` | a sweep on a cluster may be refused, since programs that were first traced in a check differ |
 | `process_allgather` | none: a fit by several processes raises ImportError |
 
 `tests/test_jax_internals.py` names what has gone.
@@ -77,6 +78,12 @@ def one_function() -> contextlib.AbstractContextManager[Any]:
         return set_xla_metadata(xla_cpu_small_call="true", inlineable="false")
     except (ImportError, TypeError):
         return contextlib.nullcontext()
+
+
+def concretely() -> contextlib.AbstractContextManager[Any]:
+    """Under it numbers that are at hand are computed with at once, inside a trace too; what is traced under it is the
+    same program as elsewhere, which `jax.ensure_compile_time_eval` does not promise."""
+    return getattr(jax.core, "eval_context", jax.ensure_compile_time_eval)()
 
 
 def settings() -> Any:

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._check import configuration_residual, is_concrete
+from .._jax_internals import concretely
 from .._rates import state_rates
 from .._reads import on_forget, version_of
 from .._system import System
@@ -36,7 +37,7 @@ def cyclic_coordinates(system: System) -> tuple[str, ...]:
     shapes = tuple((jnp.shape(x), str(jnp.result_type(x))) for x in leaves)
     key = (type(system), str(treedef), shapes, version_of(system))
     if key not in _FOUND:
-        with jax.ensure_compile_time_eval():
+        with concretely():
             _FOUND[key] = _search(system, leaves, treedef)
     return _FOUND[key]
 

@@ -16,7 +16,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._digest import differences
+from .._digest import differences, digest
 from .._whole_file import SCRATCH, write_whole
 
 MANIFEST = "sweep.json"
@@ -30,6 +30,7 @@ class Folder:
 
     def __init__(self, path: str | os.PathLike[str], manifest: Mapping[str, Any]):
         self.path = Path(path).expanduser()
+        self.sweep = digest(json.dumps(manifest))
         self.damaged: list[str] = []
         if self.path.exists() and not self.path.is_dir():
             raise ValueError(f"{self.path} is a file: `folder` is the name of a folder.")
@@ -49,10 +50,14 @@ class Folder:
     def file(self, start: int) -> Path:
         return self.path / f"chunk-{start:08d}.npz"
 
+    def mark(self, start: int) -> dict[str, str]:
+        """By which a chunk is known whose file was renamed, or came from another folder."""
+        return {"chunk of": f"{self.sweep} from {start}"}
+
     def write(self, start: int, part: Any) -> None:
         """Keep the chunk that begins with a member."""
         try:
-            write_whole(self.file(start), lambda file: np.savez(file, **_named(part)))
+            write_whole(self.file(start), lambda file: np.savez(file, **self.mark(start), **_named(part)))
         except FileNotFoundError:
             # Another process was done with the whole sweep, this chunk too, and has tidied up.
             if not self.file(start).exists():
@@ -70,6 +75,9 @@ class Folder:
             if bad is not None:
                 raise ValueError(f"{bad} is damaged")
             with np.load(path, allow_pickle=False) as found:
+                for name, mark in self.mark(start).items():
+                    if name not in found or str(found[name]) != mark:
+                        raise ValueError("it belongs elsewhere: renamed, or of another sweep")
                 leaves = [_checked(name, found[name], leaf, size) for name, leaf in _named(like).items()]
         except (MemoryError, PermissionError):
             raise

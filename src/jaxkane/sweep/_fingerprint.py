@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from importlib.metadata import version
+from platform import python_version_tuple
 from typing import Any
 
 import equinox as eqx
@@ -17,3 +19,9 @@ def traced(job: Job, own: Any) -> tuple[str, Part]:
     whole = lambda own, numbers: eqx.combine(numbers, rest).whole(own)  # noqa: E731
     program, like = jax.make_jaxpr(whole, return_shape=True)(own, numbers)
     return digest(program), like
+
+
+def versions() -> dict[str, str]:
+    """Of what traces and runs a program, by name."""
+    found = {name: version(name) for name in ("jaxkane", "jax", "jaxlib", "diffrax", "equinox")}
+    return found | {"python": ".".join(python_version_tuple()[:2])}

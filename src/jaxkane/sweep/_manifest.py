@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import inspect
-from importlib.metadata import version
-from platform import python_version_tuple
 from typing import Any
 
 import jax
@@ -15,6 +13,7 @@ from .._digest import digest
 from .._native import is_on
 from .._simulate import Settings
 from .._system import State, System
+from ._fingerprint import versions
 from ._table import Table
 
 
@@ -52,8 +51,7 @@ def manifest_of(
         "layout": dict(layout),
         "device": jax.default_backend(),
         "kernels": "native" if is_on() and jax.default_backend() == "cpu" else "XLA",  # they round differently
-        "version": {name: version(name) for name in ("jaxkane", "jax", "jaxlib", "diffrax", "equinox")}
-        | {"python": ".".join(python_version_tuple()[:2])},
+        "version": versions(),
     }
 
 

@@ -137,6 +137,8 @@ def _check(members: Tree, shared: Tree, t: Any) -> None:
 
 def _check_description(members: Tree, shared: Tree, t: Any) -> None:
     """Refuse a description that contradicts itself, by the first member; a bad body is its member's own."""
+    if any(x.shape[0] == 0 for x in jax.tree.leaves(members)):
+        return
     system, state, _, columns = eqx.combine(jax.tree.map(lambda x: x[0], members), shared)
     system, _ = _system(system, Row(columns))
     q = as_state(system, state).q if isinstance(state, State) else None
