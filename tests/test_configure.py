@@ -7,6 +7,7 @@ import sys
 import pytest
 
 from jaxkane import _native
+from jaxkane._configure import _split_cpu, _store_programs
 
 KERNELS = f"no native kernels ({_native.why_not()})" if _native.why_not() else "native kernels"
 HEAD = "import jaxkane as jk, numpy as np, jax\n"
@@ -138,3 +139,16 @@ def test_without_llvm_xla_does_the_work_and_says_so():
 
 def test_the_environment_may_switch_native_kernels_off():
     assert "switched off" in python("jk.configure(cache=False)", env={"JAXKANE_NATIVE": "0"}).stdout
+
+
+@pytest.mark.parametrize("devices", ["2", True, 2.5, 0])
+def test_devices_that_are_no_number(devices):
+    with pytest.raises(ValueError, match="`devices` is a number of CPU devices, 1 or more; got"):
+        _split_cpu(devices)
+
+
+def test_a_cache_in_the_place_of_a_file(tmp_path):
+    (tmp_path / "file").write_text("")
+    for folder in (tmp_path / "file", tmp_path / "file" / "inside"):
+        with pytest.raises(ValueError, match=r"file.* is a file, or lies in one: `cache` is the name of a folder"):
+            _store_programs(folder)

@@ -117,8 +117,8 @@ def _has_started() -> bool:
 
 
 def _split_cpu(devices: int) -> None:
-    if not devices >= 1:
-        raise ValueError(f"`devices` is a number of CPU devices, 1 or more; got {devices}.")
+    if not isinstance(devices, (int, np.integer)) or isinstance(devices, bool) or devices < 1:
+        raise ValueError(f"`devices` is a number of CPU devices, 1 or more; got {devices!r}.")
     if not _has_started():
         jax.config.update("jax_num_cpu_devices", int(devices))
         return
@@ -144,7 +144,10 @@ def _folder(cache: bool | str | os.PathLike[str]) -> Path:
 
 def _store_programs(folder: Path) -> None:
     """Have every compiled program kept in a folder."""
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError):
+        raise ValueError(f"{folder} is a file, or lies in one: `cache` is the name of a folder.") from None
     settings = {
         "jax_compilation_cache_dir": str(folder),
         "jax_enable_compilation_cache": True,

@@ -83,7 +83,11 @@ def one_function() -> contextlib.AbstractContextManager[Any]:
 def concretely() -> contextlib.AbstractContextManager[Any]:
     """Under it numbers that are at hand are computed with at once, inside a trace too; what is traced under it is the
     same program as elsewhere, which `jax.ensure_compile_time_eval` does not promise."""
-    return getattr(jax.core, "eval_context", jax.ensure_compile_time_eval)()
+    try:
+        from jax.core import eval_context
+    except ImportError:
+        return jax.ensure_compile_time_eval()
+    return eval_context()
 
 
 def settings() -> Any:
