@@ -215,6 +215,21 @@ def test_what_are_no_coordinates_is_refused_by_name(q):
         jk.accelerations(Slider(lambda motion, inputs: []), 0.0, q, [0.3, 0.4])
 
 
+@pytest.mark.parametrize(
+    ("system", "q", "inputs", "words"),
+    [
+        (Slider, [0.1, 0.2], None, "Make one: Slider(...)"),
+        (Slider(), [0.1j, 0.2], None, "Slider: q must be 2 real numbers"),
+        (Slider(), [0.1, 0.2], 3.0, "Slider: the inputs are numbers by name"),
+        (Slider(), [0.1, 0.2], {"push": "x"}, "the input 'push' must be one number"),
+        (Slider(), [0.1, 0.2], {"push": [1.0, 2.0]}, "the input 'push' must be one number"),
+    ],
+)
+def test_arguments_of_another_kind_are_refused_by_name(system, q, inputs, words):
+    with pytest.raises(TypeError, match=re.escape(words)):
+        jk.accelerations(system, 0.0, q, [0.3, 0.4], inputs)
+
+
 N, O = jk.inertial()
 
 

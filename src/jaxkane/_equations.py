@@ -27,6 +27,9 @@ InputValues = Mapping[str, Component] | None
 
 def _arrays(system: System, t: Component, q: Any, u: Any, inputs: InputValues = None):
     """The arguments of a public function as arrays of one type, checked."""
+    if not isinstance(system, System):
+        hint = f" Make one: {system.__name__}(...)." if isinstance(system, type) else ""
+        raise TypeError(f"The first argument is an instance of a System, got {system!r}.{hint}")
     name = type(system).__name__
     refuse_incomplete(system, q, u)
     left_out = [c for c in system.coordinates if c not in q] if isinstance(q, Mapping) else []

@@ -24,6 +24,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from ._components import add, add3, component, cross, dot, is_exact, is_zero, matvec, mul, scale3
@@ -327,6 +328,8 @@ def as_row(values: Any, names: Sequence[str], label: str) -> Row:
 def as_array(values: Any, names: Sequence[str], label: str) -> Array:
     """Numbers, in their order or by name, as a float array of shape (len(names),). Those not named are zero."""
     array = by_names(values, names, label) if isinstance(values, Mapping) else _numbers(values, names, label)
+    if jnp.issubdtype(array.dtype, jnp.complexfloating):
+        raise TypeError(f"{label} must be {len(names)} real numbers ({', '.join(names)}), got {values!r}.")
     if not jnp.issubdtype(array.dtype, jnp.inexact):
         array = array.astype(float)
     if array.shape != (len(names),):
@@ -388,6 +391,12 @@ class Inputs(dict[str, Component]):
 
 def checked_inputs(system: System, inputs: Mapping[str, Component] | None) -> dict[str, Component]:
     """All inputs of a system by name; those left out are exactly zero."""
+    own = type(system).__name__
+    if not isinstance(inputs, (Mapping, type(None))):
+        raise TypeError(f"{own}: the inputs are numbers by name, {{name: number}}, got {inputs!r}.")
     inputs = dict(inputs or {})
-    refuse_unknown(inputs, system.inputs, f"{type(system).__name__} has no input named", "it has")
+    refuse_unknown(inputs, system.inputs, f"{own} has no input named", "it has")
+    for name, value in inputs.items():
+        if isinstance(value, str) or np.shape(value) != ():
+            raise TypeError(f"{own}: the input {name!r} must be one number, got {value!r}.")
     return {name: component(inputs.get(name, 0.0)) for name in system.inputs}
