@@ -19,6 +19,8 @@ from ._audit import Audit as Audit
 from ._audit import audit as audit
 from ._configure import Configuration as Configuration
 from ._configure import configure as configure
+from ._crossings import falling as falling
+from ._crossings import rising as rising
 from ._drift import best_dependent_speeds as best_dependent_speeds
 from ._equations import accelerations as accelerations
 from ._equations import constraint_jacobian as constraint_jacobian

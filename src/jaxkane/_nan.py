@@ -6,6 +6,7 @@ search. A factor NaN instead would be read in reverse mode even by who does not 
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -25,6 +26,15 @@ def nan_where(missing: Bool[Array, " *leading"], values: Any, origin: Any) -> An
     The derivative of what is missing is NaN along every direction in which `origin` moves, and zero where it does not.
     In reverse mode, what is missing and not read adds exactly zero.
     """
+    return _masked(False, missing, values, origin)
+
+
+def nan_derivative_where(rough: Bool[Array, " *leading"], values: Any, origin: Any) -> Any:
+    """`values` as they are, with derivatives of any order that are NaN where they are `rough`. As `nan_where`."""
+    return _masked(True, rough, values, origin)
+
+
+def _masked(shown: bool, missing: Array, values: Any, origin: Any) -> Any:
     moved = [jnp.ravel(x) for x in jax.tree.leaves(origin) if eqx.is_inexact_array(x)]
 
     def one(x: Array) -> Array:
@@ -33,21 +43,21 @@ def nan_where(missing: Bool[Array, " *leading"], values: Any, origin: Any) -> An
         parts = [part.astype(real) for y in moved for part in ((y.real, y.imag) if jnp.iscomplexobj(y) else (y,))]
         point = jnp.concatenate(parts) if parts else jnp.zeros(0, real)
         if jnp.iscomplexobj(x):
-            return jax.lax.complex(_nan_where(there, x.real, point), _nan_where(there, x.imag, point))
-        return _nan_where(there, x, point)
+            return jax.lax.complex(_mask(shown, there, x.real, point), _mask(shown, there, x.imag, point))
+        return _mask(shown, there, x, point)
 
     return jax.tree.map(one, values)
 
 
-@jax.custom_jvp
-def _nan_where(missing: Array, x: Array, point: Array) -> Array:
-    return jnp.where(missing, jnp.nan, x)
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _mask(shown: bool, missing: Array, x: Array, point: Array) -> Array:
+    return x if shown else jnp.where(missing, jnp.nan, x)
 
 
-@_nan_where.defjvp
-def _(primals: Any, tangents: Any) -> Any:
+@_mask.defjvp
+def _(shown: bool, primals: Any, tangents: Any) -> Any:
     (missing, x, point), (_, x_dot, point_dot) = primals, tangents
-    return _nan_where(missing, x, point), jnp.where(missing, _spread(point_dot, point, x.shape), x_dot)
+    return _mask(shown, missing, x, point), jnp.where(missing, _spread(point_dot, point, x.shape), x_dot)
 
 
 def _spread(point_dot: Array, point: Array, shape: tuple[int, ...]) -> Array:

@@ -45,7 +45,9 @@ class Trajectory(eqx.Module):
 
     - `t` (n_t,) [s]; `q` (n_t, n_q); `u` (n_t, n_u) independent speeds; `u_dep` (n_t, k) dependent speeds.
     - `inputs`: values (n_t,) of every input by name.
-    - `status`: a `Status` code; `reason` says it in words. `t_end` [s]: where the simulation ended.
+    - `status`: a `Status` code; `reason` says it in words.
+    - `t_end` [s] and `end`, the state there: where the simulation ended. They have derivatives where it ended at the
+        last time or by an event, whose time moves with what it follows from; otherwise their derivatives are NaN.
     - `stats`: numbers of steps taken, accepted and rejected. `adjoint`: how it is differentiated.
     - `units`: pairs of a name and its unit, as the system declares them.
     """
@@ -62,6 +64,7 @@ class Trajectory(eqx.Module):
     events: tuple[str, ...] = eqx.field(static=True)
     adjoint: str = eqx.field(static=True)
     units: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
+    end: State | None = None
 
     def __getitem__(self, name: str) -> Float[Array, "*batch n_t"]:
         groups = zip(self.names, (self.q, self.u, self.u_dep), strict=True)

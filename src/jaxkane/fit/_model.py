@@ -18,8 +18,9 @@ from jaxtyping import Array, Float
 
 from .._assembly import assemble
 from .._reads import compiled
+from .._ride import solve
+from .._settings import Settings
 from .._signals import Samples
-from .._simulate import Settings, solve
 from .._system import State, System
 from .._trajectory import Trajectory
 from ._blocks import Blocks

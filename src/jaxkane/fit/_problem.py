@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._check import check_system
-from .._simulate import settings_for
+from .._settings import settings_for
 from .._system import System
 from .._trajectory import Trajectory
 from ._blocks import Blocks

@@ -11,7 +11,7 @@ import numpy as np
 
 from .._digest import digest
 from .._native import is_on
-from .._simulate import Settings
+from .._settings import Settings
 from .._system import State, System
 from ._fingerprint import versions
 from ._table import Table

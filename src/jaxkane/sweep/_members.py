@@ -14,8 +14,8 @@ import numpy as np
 from .._assembly import assemble
 from .._check import check_system, is_concrete
 from .._lookup import not_there
+from .._settings import as_state, checked_state
 from .._signals import Samples, as_signals
-from .._simulate import as_state, checked_state
 from .._system import State, System, parameter_info
 from .._types import Inputs
 from ._table import Table

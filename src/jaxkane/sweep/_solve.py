@@ -19,7 +19,8 @@ from jax.sharding import PartitionSpec as P
 
 from .._check import with_possible_bodies
 from .._reads import compiled
-from .._simulate import Settings, solve
+from .._ride import solve
+from .._settings import Settings
 from .._system import State
 from .._trajectory import Trajectory
 from ._members import start_of, system_and_signals

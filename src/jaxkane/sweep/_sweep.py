@@ -14,7 +14,7 @@ import numpy as np
 from tqdm import tqdm
 
 from .._check import is_concrete
-from .._simulate import as_state, checked_times, settings_for
+from .._settings import as_state, checked_times, settings_for
 from .._system import State, System
 from .._trajectory import Status, Trajectory
 from .._types import Inputs

@@ -1,0 +1,293 @@
+"""The instant at which a motion ends: exact times, directions, derivatives, batches, and what does not end it."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.special import ellipk
+
+import jaxkane as jk
+from jaxkane._crossings import first_crossing
+
+TS = jnp.linspace(0.0, 2.0, 11)
+
+
+class Particle(jk.System):
+    """Falls along h; `drive` is one more force."""
+
+    mass: jk.Scalar = jk.parameter(1.0)
+    gravity: jk.Scalar = jk.parameter(9.81)
+    ends: str = eqx.field(static=True, default="ground")
+    coordinates, speeds, inputs = ("h",), ("v",), ("drive",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(self.mass, 0.0, O.moving(q["h"] * N.y, u["v"] * N.y), N)])
+
+    def loads(self, t, q, u, motion, inputs):
+        body = motion.bodies[0]
+        return [*jk.weight(motion, -self.gravity * motion.N.y), jk.Force(inputs["drive"] * motion.N.y, body.center)]
+
+    def events(self, t, q, u):
+        return {
+            "ground": {"ground": jk.falling(q["h"])},
+            "either": {"ground": q["h"]},
+            "roof": {"a_late": jk.falling(q["h"]), "b_early": jk.falling(q["h"] - 0.1), "c_top": jk.falling(u["v"])},
+        }[self.ends]
+
+
+def dropped(h, v=0.0, system=None, **options):
+    start = jk.State(jnp.stack([jnp.asarray(h)]), jnp.stack([jnp.asarray(v)]))
+    return jk.simulate(system or Particle(), start, TS, **options)
+
+
+def exact(h, v, g):
+    """t_end, height and velocity there."""
+    root = jnp.sqrt(v**2 + 2 * g * h)
+    return jnp.stack([(v + root) / g, 0.0 * h, -root])
+
+
+@pytest.mark.parametrize("options", [{}, {"step": 0.07}], ids=["adaptive", "fixed"])
+def test_a_dropped_particle(options):
+    atol = 1e-9
+    ride = dropped(1.0, **options)
+    t_end = np.sqrt(2.0 / 9.81)
+    assert ride.reason == "ground"
+    np.testing.assert_allclose(ride.t_end, t_end, atol=atol)
+    np.testing.assert_allclose([ride.end.q[0], ride.end.u[0]], [0.0, -9.81 * t_end], atol=atol)
+    reached = np.asarray(TS) <= t_end
+    np.testing.assert_allclose(ride["h"][reached], (1.0 - 4.905 * TS**2)[reached], atol=atol)
+    assert np.isnan(ride.q[~reached]).all()
+    assert np.isnan(ride["drive"][~reached]).all()
+
+
+def test_derivatives_of_the_end():
+    """Forward, reverse and second ones against the formula."""
+    rtol, at = 1e-6, (jnp.array(1.0), jnp.array(0.3), jnp.array(9.81))
+
+    def end(h, v, g, adjoint):
+        ride = dropped(h, v, Particle(gravity=g), adjoint=adjoint)
+        return jnp.stack([ride.t_end, ride.end.q[0], ride.end.u[0]])
+
+    slope = jax.jacfwd(exact, argnums=(0, 1, 2))(*at)
+    for mode, adjoint in ((jax.jacfwd, "forward"), (jax.jacrev, "reverse")):
+        found = jax.jit(mode(lambda *x: end(*x, adjoint), argnums=(0, 1, 2)))(*at)  # noqa: B023
+        np.testing.assert_allclose(np.array(found), np.array(slope), rtol=rtol, atol=1e-12)
+    second = jax.jit(jax.jacfwd(jax.jacfwd(lambda v: end(at[0], v, at[2], "forward"))))(at[1])
+    np.testing.assert_allclose(second, jax.jacfwd(jax.jacfwd(lambda v: exact(at[0], v, at[2])))(at[1]), atol=1e-9)
+
+
+class Pendulum(jk.System):
+    length: jk.Scalar = jk.parameter(1.3)
+    way: int = eqx.field(static=True, default=0)
+    coordinates, speeds = ("angle",), ("rate",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        rod = N.rotate(3, q[0], u[0])
+        return jk.Motion([jk.Body(1.0, 0.0, O.fixed(-self.length * rod.y), rod)])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+
+    def events(self, t, q, u):
+        return {"vertical": {0: q["angle"], 1: jk.rising(q["angle"]), -1: jk.falling(q["angle"])}[self.way]}
+
+
+@pytest.mark.parametrize(("way", "quarters"), [(0, 1), (-1, 1), (1, 3)])
+def test_a_pendulum_through_the_vertical(way, quarters):
+    """A quarter of the period is sqrt(l / g) K(sin(a / 2)); its derivative by the length, that over 2 l."""
+
+    def t_end(length):
+        start = jk.State(jnp.array([0.9]), jnp.zeros(1))
+        return jk.simulate(Pendulum(length, way), start, 2 * TS, rtol=1e-12, atol=1e-12, adjoint="forward").t_end
+
+    expected = quarters * np.sqrt(1.3 / 9.81) * ellipk(np.sin(0.45) ** 2)
+    found, slope = jax.jit(lambda x: jax.jvp(t_end, (x,), (1.0,)))(1.3)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    np.testing.assert_allclose(slope, expected / 2.6, rtol=1e-6)
+
+
+def test_a_start_on_zero():
+    """Thrown up from the ground it comes back; resting on it, or thrown down, it has passed it at once."""
+    ride = dropped(0.0, 3.0)
+    assert ride.reason == "ground"
+    np.testing.assert_allclose(ride.t_end, 6.0 / 9.81, atol=1e-9)
+    either = dropped(0.0, 3.0, Particle(ends="either"))
+    np.testing.assert_allclose(either.t_end, 6.0 / 9.81, atol=1e-9)
+    for v in (0.0, -1.0):
+        at_once = dropped(0.0, v)
+        assert at_once.reason == "ground"
+        assert float(at_once.t_end) == 0.0
+        assert np.isfinite(at_once.q[0]).all()
+        assert np.isnan(at_once.q[1:]).all()
+
+
+@pytest.mark.parametrize("options", [{}, {"step": 0.5}], ids=["adaptive", "fixed"])
+def test_down_and_up_again_within_a_step(options):
+    """Both ends of the first step are above: h = 0.08 - t + 5.19 t^2 / 2 is zero at 0.0987 and 0.29 s."""
+    start = jk.State(jnp.array([0.08]), jnp.array([-1.0]))
+    for ends in ("ground", "either"):
+        ride = jk.simulate(Particle(ends=ends), start, TS, {"drive": 15.0}, **options)
+        assert ride.reason == "ground"
+        np.testing.assert_allclose(ride.t_end, (1 - np.sqrt(1 - 2 * 5.19 * 0.08)) / 5.19, atol=1e-9)
+
+
+def test_the_earlier_of_several_events_in_one_step():
+    ride = dropped(1.0, 1.0, Particle(ends="roof"), step=2.0)
+    assert ride.reason == "c top"
+    np.testing.assert_allclose(ride.t_end, 1.0 / 9.81, atol=1e-9)
+    ride = dropped(1.0, -0.1, Particle(ends="roof"), step=2.0)
+    assert ride.reason == "b early"
+    np.testing.assert_allclose(ride.t_end, exact(0.9, -0.1, 9.81)[0], atol=1e-9)
+
+
+def test_an_event_at_a_sample_and_at_the_last_time():
+    for t in (float(TS[4]), float(TS[-1])):
+        ride = dropped(0.5 * 9.81 * t**2)
+        assert ride.reason == "ground"
+        np.testing.assert_allclose(ride.t_end, t, atol=1e-9)
+        n = int(np.searchsorted(np.asarray(TS), t - 1e-9)) + 1
+        assert np.isfinite(ride.q[:n]).all()
+        assert np.isnan(ride.q[n:]).all()
+
+
+def test_members_of_a_batch_end_at_their_own_times():
+    """One completes, one is invalid, one is dropped; read where they were reached, derivatives by what all share are
+    clean, and NaN where what is missing is read."""
+    heights = jnp.array([1.0, 50.0, jnp.nan, 0.3])
+
+    def rides(g, adjoint):
+        one = lambda h: dropped(h, 0.0, Particle(gravity=g), adjoint=adjoint)  # noqa: E731
+        return jax.vmap(one)(heights)
+
+    ride = jax.jit(lambda g: rides(g, "reverse"))(9.81)
+    assert ride.reason == ["ground", "completed", "invalid", "ground"]
+    np.testing.assert_allclose(ride.t_end[:2], [np.sqrt(2 / 9.81), 2.0], atol=1e-9)
+    np.testing.assert_allclose(ride.t_end[3], np.sqrt(0.6 / 9.81), atol=1e-9)
+    for mode, adjoint in ((jax.jacfwd, "forward"), (jax.jacrev, "reverse")):
+
+        def read(g):
+            ride = rides(g, adjoint)  # noqa: B023
+            return jnp.stack([ride["h"][1, -1] + ride["h"][0, 2] + ride.t_end[3], ride["h"][0, -1], ride["v"][2, 0]])
+
+        slopes = jax.jit(mode(read))(9.81)
+        np.testing.assert_allclose(slopes[0], -2.0 - 0.08 - 0.5 * np.sqrt(0.6) * 9.81**-1.5, rtol=1e-6)
+        assert np.isnan(slopes[1:]).all()
+
+
+def test_other_ends_have_no_derivative():
+    """`max_steps` is no smooth end: its time has a derivative that is NaN, and so has what was not reached."""
+
+    def few(v, adjoint):
+        ride = dropped(100.0, v, max_steps=3, adjoint=adjoint)
+        return jnp.stack([ride.t_end, ride["h"][-1], ride["h"][0]])
+
+    assert dropped(100.0, max_steps=3).reason == "max steps"
+    for mode, adjoint in ((jax.jacfwd, "forward"), (jax.jacrev, "reverse")):
+        slopes = jax.jit(mode(lambda v: few(v, adjoint)))(0.1)  # noqa: B023
+        assert np.isnan(slopes[:2]).all()
+        assert slopes[2] == 0.0
+
+
+def test_an_event_that_reads_no_speed_costs_no_accelerations():
+    """A ride without events does as much as ever; one with them looks at coordinates and their rates alone."""
+    from jaxkane._events import events_of
+
+    start = jk.State(jnp.ones(1), jnp.ones(1))
+    assert not events_of(Particle(), TS[0], start).read_speeds
+    assert events_of(Particle(ends="roof"), TS[0], start).read_speeds
+
+
+def test_the_first_crossing_of_cubics():
+    """Against the roots of random cubics, among them those that start on zero."""
+    rng = np.random.default_rng(0)
+    p, direction = rng.normal(size=(300, 4)), rng.integers(-1, 2, size=300)
+    p[::7, 3] = 0.0
+    ends = (p[:, 3], p[:, 2], p.sum(1), 3 * p[:, 0] + 2 * p[:, 1] + p[:, 2], direction.astype(float))
+    found = np.asarray(jax.jit(first_crossing)(*map(jnp.asarray, ends)))
+    for coefficients, way, x in zip(p, direction, found):
+        roots = np.roots(coefficients)
+        roots = np.sort(roots[np.abs(roots.imag) < 1e-9].real)
+        slopes = np.polyval(np.polyder(coefficients), roots)
+        crossings = [r for r, s in zip(roots, slopes) if 1e-9 < r <= 1 and way * s >= 0]
+        if way and coefficients[3] == 0 and way * coefficients[2] > 0:
+            crossings = [0.0]
+        np.testing.assert_allclose(x, crossings[0] if crossings else np.inf, atol=0.02)
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_derivatives_by_times_of_samples(mode):
+    """Two signals, one of whose kinks stand at one time; the times of the ride itself; against central differences."""
+    kinks = jnp.array([0.1, 0.35, 0.8, 1.1, 1.7])
+    others, values = jnp.array([0.05, 0.35, 0.6, 1.2, 1.9]), jnp.array([1.0, -2.0, 3.0, -1.0, 2.0])
+    ts = jnp.linspace(0.02, 2.0, 5)
+
+    def height(x):
+        """x: the delay of a signal; of all times of the ride."""
+        one, other = jk.Samples(kinks + x[0], 5 * values), jk.Samples(others, -3 * values)
+        drive = Both(one, other)
+        ride = jk.simulate(
+            Particle(), jk.State(jnp.array([9.0]), jnp.zeros(1)), ts + x[1], {"drive": drive}, rtol=1e-11, atol=1e-11,
+            adjoint="forward" if mode is jax.jacfwd else "reverse",
+        )  # fmt: skip
+        return ride["h"][-1] + ride["v"][2]
+
+    f, h = jax.jit(height), 1e-5
+    numeric = [(f(e) - f(-e)) / (2 * h) for e in h * jnp.eye(2)]
+    np.testing.assert_allclose(jax.jit(mode(height))(jnp.zeros(2)), numeric, rtol=1e-6)
+
+
+class Both(eqx.Module):
+    """The sum of two signals."""
+
+    one: jk.Samples
+    other: jk.Samples
+
+    def __call__(self, t, state):
+        return self.one(t) + self.other(t)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"step": jnp.nan}, "`step` must be positive"),
+        ({"step": -0.1}, "`step` must be positive"),
+        ({"rtol": 0.0}, "`rtol` must be positive"),
+        ({"atol": float("nan")}, "`atol` must be positive"),
+        ({"stabilize": -1.0}, "`stabilize` must be a rate"),
+        ({"max_steps": 0}, "`max_steps` must be a whole number"),
+        ({"max_steps": 2.5}, "`max_steps` must be a whole number"),
+    ],
+)
+def test_options_that_contradict_themselves(options, message):
+    with pytest.raises(ValueError, match=message):
+        dropped(1.0, **options)
+
+
+def test_samples_that_are_none():
+    times = np.array([0.0, 1.0, 2.0])
+    for ts, values, error in (
+        (times[::-1], times, ValueError),
+        (times, times[:2], ValueError),
+        (times[:1], times[:1], ValueError),
+        (times, np.array([0.0, np.nan, 1.0]), ValueError),
+        (np.array([0.0, np.nan, 1.0]), times, ValueError),
+        (np.ma.masked_array(times, [0, 1, 0]), times, ValueError),
+        (times, times + 1j, TypeError),
+        (times, ["a", "b", "c"], TypeError),
+    ):
+        with pytest.raises(error, match="Samples"):
+            jk.Samples(ts, values)
+    for value, error in ((np.nan, ValueError), ("a", TypeError), (1j, TypeError), (np.ones(11, complex), TypeError)):
+        with pytest.raises(error, match="drive"):
+            jk.simulate(Particle(), jk.State(jnp.ones(1), jnp.ones(1)), TS, {"drive": value})
+
+
+def test_times_that_tracing_hides_are_invalid():
+    start = jk.State(jnp.ones(1), jnp.ones(1))
+    for ts in (TS.at[3].set(jnp.nan), TS[::-1]):
+        ride = jax.jit(lambda ts: jk.simulate(Particle(), start, ts))(ts)
+        assert ride.reason == "invalid"
+        assert np.isnan(ride.q).all()
