@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -63,13 +64,17 @@ def first_crossing(
     of_first = lambda x: jnp.take_along_axis(x, i, axis=0)[0]  # noqa: E731
     left, right = of_first(places[:-1]), of_first(places[1:])
 
-    # Newton's method inside the bracket; the step that follows is measured anew, so a few digits are enough.
-    x = left + (right - left) * _ratio(of_first(before), of_first(before) - of_first(after))
-    for _ in range(6):
+    # Newton's method inside the bracket; the step that follows is measured anew, so a few digits are enough. A loop: XLA
+    # fuses unrolled steps into one, in which each does all those before it again, and compiles that for seconds.
+    def nearer(_, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        x, left, right = carry
         value = way[0] * p(x)
         left, right = jnp.where(value <= 0, x, left), jnp.where(value > 0, x, right)
         newton = x - _ratio(p(x), p_dot(x))
-        x = jnp.where((newton >= left) & (newton <= right), newton, 0.5 * (left + right))
+        return jnp.where((newton >= left) & (newton <= right), newton, 0.5 * (left + right)), left, right
+
+    start = left + (right - left) * _ratio(of_first(before), of_first(before) - of_first(after))
+    x = jax.lax.fori_loop(0, 6, nearer, (start, left, right))[0]
     return jnp.where(jnp.any(passes, axis=0), x, jnp.inf)
 
 
