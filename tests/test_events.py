@@ -177,6 +177,96 @@ def test_members_of_a_batch_end_at_their_own_times():
         assert np.isnan(slopes[1:]).all()
 
 
+class Suction(Particle):
+    """A force that exists down to a centimetre under the ground only."""
+
+    def loads(self, t, q, u, motion, inputs):
+        force = jnp.sqrt(q["h"] + 0.01) * motion.N.y
+        return [*super().loads(t, q, u, motion, inputs), jk.Force(force, motion.bodies[0])]
+
+
+def test_trial_steps_that_are_not_finite():
+    """Steps that ended under the ground are thrown away, and leave no NaN in a derivative in reverse mode."""
+
+    def read(v, adjoint):
+        ride = dropped(1.0, v, Suction(), adjoint=adjoint, rtol=1e-10, atol=1e-10)
+        return ride["h"][1] + ride.t_end
+
+    v, h = -0.2, 1e-5
+    ride = dropped(1.0, v, Suction())
+    assert ride.reason == "ground"
+    assert ride.stats["rejected"] > 5
+    value = jax.jit(lambda v: read(v, "reverse"))
+    numeric = (value(v + h) - value(v - h)) / (2 * h)
+    for mode, adjoint in ((jax.jacfwd, "forward"), (jax.jacrev, "reverse")):
+        np.testing.assert_allclose(jax.jit(mode(lambda v: read(v, adjoint)))(v), numeric, rtol=1e-5)  # noqa: B023
+
+
+class Bead(jk.System):
+    """On a circle of 1 m, without weight: x = sin(w t). Its vertical speed depends on the horizontal one, for
+    a quarter of a turn; there it no longer does. An event ends it before."""
+
+    level: jk.Scalar = jk.parameter(0.3)
+    ends: bool = eqx.field(static=True, default=True)
+    coordinates, speeds, dependent_speeds, inputs = ("x", "y"), ("vx",), ("vy",), ("push",)
+    dependent_coordinates = ("y",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        place, velocity = q["x"] * N.x + q["y"] * N.y, u["vx"] * N.x + u["vy"] * N.y
+        body = jk.Body(1.0, 0.0, O.moving(place, velocity), N)
+        return jk.Motion([body], [q["x"] * u["vx"] + q["y"] * u["vy"]])
+
+    def configuration_constraints(self, t, q):
+        return [q["x"] ** 2 + q["y"] ** 2 - 1.0]
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force(inputs["push"] * motion.N.x, motion.bodies[0])
+
+    def events(self, t, q, u):
+        return {"low": jk.falling(q["y"] - self.level)} if self.ends else {}
+
+
+class Brake(eqx.Module):
+    gain: jk.Scalar
+
+    def __call__(self, t, state):
+        return self.gain * state["vy"]
+
+
+TOP = jnp.array([0.0, 1.0])
+
+
+def test_what_follows_from_a_motion_that_ends_early():
+    """Dependent speeds, a controller's input and projected coordinates, where they were reached; NaN where not."""
+
+    def read(x, adjoint):
+        level, speed, gain = x
+        options = {"project": True, "adjoint": adjoint, "rtol": 1e-10, "atol": 1e-10}
+        ride = jk.simulate(Bead(level), jk.State(TOP, speed[None]), TS, {"push": Brake(gain)}, **options)
+        reached = ride["vy"][3] + 2.0 * ride["push"][4] + 3.0 * ride["y"][4]
+        return jnp.stack([reached, ride.t_end + ride.end.u[0], ride["vy"][-1], ride["push"][-1], ride["y"][-1]])
+
+    x, h = jnp.array([0.3, 1.0, 0.2]), 1e-5
+    value = jax.jit(lambda x: read(x, "forward"))
+    numeric = np.stack([(value(x + e) - value(x - e)) / (2 * h) for e in h * jnp.eye(3)], axis=-1)
+    assert np.isfinite(numeric[:2]).all()
+    for mode, adjoint in ((jax.jacfwd, "forward"), (jax.jacrev, "reverse")):
+        found = jax.jit(mode(lambda x: read(x, adjoint)))(x)  # noqa: B023
+        np.testing.assert_allclose(found[:2], numeric[:2], rtol=1e-5, atol=1e-8)
+        assert np.isnan(found[2:]).all()
+
+
+def test_speeds_that_become_singular():
+    """The bead's horizontal speed vanishes at a quarter of a turn: the motion ends before."""
+    ride = jk.simulate(Bead(ends=False), jk.State(TOP, jnp.ones(1)), TS)
+    assert ride.status == jk.Status.SINGULAR_SPEEDS
+    assert np.pi / 2 - 0.01 < float(ride.t_end) <= np.pi / 2
+    reached = np.asarray(TS) < np.pi / 2
+    np.testing.assert_allclose(ride["vy"][reached], -np.sin(TS)[reached], atol=1e-5)
+    assert np.isnan(ride["vy"][~reached]).all()
+
+
 def test_other_ends_have_no_derivative():
     """`max_steps` is no smooth end: its time has a derivative that is NaN, and so has what was not reached."""
 

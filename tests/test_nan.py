@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxkane._nan import nan_where
+from jaxkane._nan import nan_derivative_where, nan_where
 
 P = {"a": jnp.array(0.7), "b": jnp.array([0.2, -0.4]), "n": 3}
 MISSING = jnp.array([False, False, True, True])
@@ -103,3 +103,24 @@ def test_complex_and_single_precision():
 def test_without_an_origin_and_without_a_row():
     assert np.isnan(nan_where(jnp.array(True), jnp.array(1.0), None))
     assert nan_where(jnp.zeros(0, bool), jnp.zeros((0, 3)), P).shape == (0, 3)
+
+
+@pytest.mark.parametrize("mask", [nan_where, nan_derivative_where])
+@pytest.mark.parametrize("batched", ["missing", "origin"])
+def test_a_batch_in_a_loop_of_values_that_all_members_share(mask, batched):
+    """The value is one for all, its derivative is each member's."""
+
+    def one(x):
+        missing = x > 1.5 if batched == "missing" else jnp.array(True)
+        return jnp.sum(mask(missing, jnp.ones((2, 3)), x))
+
+    x = jnp.array([[1.0, 2.0]])
+    f = jax.jit(lambda x: jax.lax.map(jax.vmap(one), x))
+    slopes = jax.jvp(f, (x,), (jnp.ones_like(x),))[1]
+    np.testing.assert_array_equal(np.isnan(slopes), [[batched == "origin", True]])
+
+
+def test_values_without_entries_in_a_batch_in_a_loop():
+    f = jax.jit(lambda x: jax.lax.map(jax.vmap(lambda x: nan_where(x > jnp.ones(4), jnp.zeros((4, 0)), x)), x))
+    x = jnp.array([[1.0, 2.0]])
+    assert jax.jvp(f, (x,), (x,))[1].shape == (1, 2, 4, 0)

@@ -64,8 +64,8 @@ def first_crossing(
     of_first = lambda x: jnp.take_along_axis(x, i, axis=0)[0]  # noqa: E731
     left, right = of_first(places[:-1]), of_first(places[1:])
 
-    # Newton's method inside the bracket; the step that follows is measured anew, so a few digits are enough. A loop: XLA
-    # fuses unrolled steps into one, in which each does all those before it again, and compiles that for seconds.
+    # Newton's method inside the bracket; the step that follows is measured anew, so a few digits are enough. A loop,
+    # since XLA fuses unrolled steps into one, in which each does all those before it again, and compiles for seconds.
     def nearer(_, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         x, left, right = carry
         value = way[0] * p(x)

@@ -7,6 +7,7 @@ search. A factor NaN instead would be read in reverse mode even by who does not 
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -34,10 +35,40 @@ def nan_derivative_where(rough: Bool[Array, " *leading"], values: Any, origin: A
     return _masked(True, rough, values, origin)
 
 
+def derivative_free_where_not_finite(f: Callable[..., Any], *arguments: Any) -> Any:
+    """`f(*arguments)`, with the derivative zero where any of its values is not finite.
+
+    For trial values that will be thrown away: nobody reads them, but in reverse mode 0 * NaN would spoil the
+    derivative of what `f` reads. Closed-over arrays count as arguments.
+    """
+    f = eqx.filter_closure_convert(f, *arguments)
+    moving, other = eqx.partition((f, arguments), eqx.is_inexact_array)
+    fixed, rest = eqx.partition(other, eqx.is_array)
+
+    def value(moving: Any, fixed: Any) -> Any:
+        f, arguments = eqx.combine(moving, fixed, rest)
+        return f(*arguments)
+
+    @jax.custom_jvp
+    def gated(moving: Any, fixed: Any) -> Any:
+        return value(moving, fixed)
+
+    @gated.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        (moving, fixed), (moving_dot, _) = primals, tangents
+        y, slope = jax.linearize(lambda moving: value(moving, fixed), moving)
+        finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(leaf)) for leaf in jax.tree.leaves(y)]))
+        return y, slope(jax.tree.map(lambda x_dot: jnp.where(finite, x_dot, jnp.zeros_like(x_dot)), moving_dot))
+
+    return gated(moving, fixed)
+
+
 def _masked(shown: bool, missing: Array, values: Any, origin: Any) -> Any:
     moved = [jnp.ravel(x) for x in jax.tree.leaves(origin) if eqx.is_inexact_array(x)]
 
     def one(x: Array) -> Array:
+        if x.size == 0:
+            return x
         real = jnp.finfo(x.dtype).dtype
         there = jnp.broadcast_to(jnp.reshape(missing, (*missing.shape, *(1,) * (x.ndim - missing.ndim))), x.shape)
         parts = [part.astype(real) for y in moved for part in ((y.real, y.imag) if jnp.iscomplexobj(y) else (y,))]
@@ -51,7 +82,9 @@ def _masked(shown: bool, missing: Array, values: Any, origin: Any) -> Any:
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _mask(shown: bool, missing: Array, x: Array, point: Array) -> Array:
-    return x if shown else jnp.where(missing, jnp.nan, x)
+    # What is batched in the derivative must be so in the value, or JAX takes the one for the other inside of a loop.
+    missing = missing | (jnp.any(jnp.isnan(point)) & False)
+    return jnp.where(missing, x if shown else jnp.full_like(x, jnp.nan), x)
 
 
 @_mask.defjvp

@@ -17,7 +17,7 @@ from ._events import Events, at_zero, determinant_of_dependent_speeds, events_of
 from ._kane import Instant, checked_inputs
 from ._kinks import ToKinks
 from ._lookup import not_there
-from ._nan import nan_derivative_where, nan_where
+from ._nan import derivative_free_where_not_finite, nan_derivative_where, nan_where
 from ._rates import state_rates
 from ._reads import compiled
 from ._settings import Settings
@@ -69,13 +69,18 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
             q_dot = q_dot + settings.stabilize * correction(system, t, q)
         return tuple(jnp.where(valid, rate, jnp.zeros_like(rate)) for rate in (q_dot, u_dot))
 
+    def trial_rates(t, y, args):
+        # A step that is rejected since its rates are not finite must not spoil a derivative in reverse mode.
+        return derivative_free_where_not_finite(vector_field, t, y, args)
+
+    forward = isinstance(settings.adjoint, diffrax.ForwardMode)
     events = events_of(system, ts[0], state)
     stops = bool(events.names or system.dependent_speeds)
     step, controller, reach = _steps(ts, signals, settings)
     if stops:
         controller = _to_stops(controller, vector_field, events, system, ts, reach)
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(vector_field),
+        diffrax.ODETerm(vector_field if forward else trial_rates),
         settings.solver,
         ts[0],
         ts[-1],

@@ -470,8 +470,12 @@ class System(eqx.Module):
         """Residuals that are zero in every possible configuration."""
         return ()
 
-    def events(self, t: Component, q: Any, u: Any) -> Mapping[str, Component]:
-        """Signed, smooth quantities by name; a simulation stops, with that name as its status, where one vanishes."""
+    def events(self, t: Component, q: Any, u: Any) -> Mapping[str, Any]:
+        """Signed, smooth quantities by name; a simulation ends, with that name as its status, when one passes zero.
+
+        `jaxkane.rising` or `jaxkane.falling` of a quantity counts in that direction only. A motion that starts on zero
+        ends at once only if it leaves in its named direction.
+        """
         return {}
 
 
