@@ -115,3 +115,10 @@ def test_what_is_left_out_and_violates_a_constraint_is_refused():
     at = jax.jit(lambda x: jk.accelerations(Undeclared(), 0.0, {"y": x}, {"x_dot": 0.5}))
     np.testing.assert_allclose(at(1.0), 0.0, atol=1e-15)
     assert np.isnan(at(0.9)).all()
+
+
+def test_a_state_of_traced_numbers_in_a_list():
+    """As plain numbers in a list are taken; d q / d x = (1, 0), and a type of its own is kept."""
+    q = lambda x: jk.State([x, 1], [0.0, 0.0]).q  # noqa: E731
+    np.testing.assert_array_equal(jax.jit(jax.jacfwd(q))(0.3), [1.0, 0.0])
+    assert jax.eval_shape(q, np.float32(0.3)).dtype == np.float32

@@ -64,7 +64,11 @@ def _to_float(value: Any) -> Any:
     try:
         array = np.asarray(value) if not isinstance(value, jax.Array) else value
     except (TypeError, ValueError):
-        return value
+        numbers = jax.tree.leaves(value) if isinstance(value, (list, tuple)) else []
+        traced = [x for x in numbers if isinstance(x, Tracer)]
+        if not traced or any(isinstance(x, str) for x in numbers):
+            return value
+        return jnp.asarray(value, dtype=jnp.result_type(float, *traced))
     if array.dtype.kind in "iuf":
         return jnp.asarray(array, dtype=float)
     return value
