@@ -33,7 +33,7 @@ def system(k):
             A = N.rotate(1 + k % 3, q["a"], u["x"])
             B = A.rotate(1 + (k + 1) % 3, q["b"], u["y"])
             P = O.fixed((1.0 + k) * A.x + A.y)
-            return jk.Motion([jk.Body(self.mass, (1.0, 2.0, 3.0 + k), P, A),
+            return jk.Motion([jk.Body(self.mass, (2.0, 2.0, 1.0 + 0.5 * k), P, A),
                               jk.Body(self.mass, (1.0, 1.0, 1.0), P.fixed(B.x + 2 * B.y), B)])
         def loads(self, t, q, u, motion, inputs):
             return jk.weight(motion, -9.81 * motion.N.y)
