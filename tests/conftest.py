@@ -9,6 +9,7 @@ How to run them:
 """
 
 import contextlib
+import gc
 import os
 import shutil
 import tempfile
@@ -45,6 +46,15 @@ def pytest_configure(config):
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     jax.config.update("jax_numpy_rank_promotion", "raise")
     touched.watch(config)
+    # A trace makes a million small objects, most of which live on: to look through all of them again and again took a
+    # tenth of the tests' time.
+    gc.set_threshold(100_000, 50, 50)
+
+
+def pytest_collection_finish():
+    """What has been imported stays."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(autouse=True, scope="module")

@@ -119,12 +119,17 @@ def test_a_batch_is_what_its_members_are(n):
     np.testing.assert_allclose(eigvals(A[0, 0]), single[0])
 
 
-@pytest.mark.slow
-def test_a_batch_of_bicycles_against_the_literature(kernels):
-    """Meijaard et al. (2007), Table 2, among three hundred others; and beside the double root, as LAPACK's."""
-    atol = 1e-11
+@pytest.fixture(scope="module")
+def bicycles():
+    """The benchmark bicycle at 301 speeds, and at 21 beside its double root."""
     speeds = jnp.concatenate([jnp.linspace(0.0, 10.0, 301), DOUBLE_ROOT + jnp.linspace(-1e-6, 1e-6, 21)])
-    A = jax.jit(jax.vmap(lambda v: linearize(BIKE, straight_ahead(BIKE, v), states=LATERAL).A))(speeds)
+    return jax.jit(jax.vmap(lambda v: linearize(BIKE, straight_ahead(BIKE, v), states=LATERAL).A))(speeds)
+
+
+@pytest.mark.slow
+def test_a_batch_of_bicycles_against_the_literature(bicycles, kernels):
+    """Meijaard et al. (2007), Table 2, among three hundred others; and beside the double root, as LAPACK's."""
+    atol, A = 1e-11, bicycles
     found = np.asarray(jax.jit(jax.vmap(eigvals))(A))
     for row in PUBLISHED["table2"]:
         for real, imaginary in row["eig_published"]:

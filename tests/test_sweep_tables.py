@@ -102,10 +102,10 @@ def test_sweeps_have_derivatives():
 
     def ends(length):
         state = jk.State(np.ones(2), np.zeros(2))
-        return jk.sweep.sweep(DoublePendulum(1.0, length), state, TS, adjoint="forward").u[:, -1]
+        return jk.sweep.sweep(DoublePendulum(1.0, length), state, TS, adjoint="forward", step=0.05).u[:, -1]
 
     length, step = jnp.array([1.0, 2.0]), 1e-5
-    _, exact = jax.jvp(ends, (length,), (jnp.ones(2),))
+    exact = jax.jit(lambda x: jax.jvp(ends, (x,), (jnp.ones(2),))[1])(length)
     np.testing.assert_allclose(exact, (ends(length + step) - ends(length - step)) / (2 * step), rtol=rtol)
 
 
