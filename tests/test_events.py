@@ -5,6 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.special import ellipk
 
 import jaxkane as jk
@@ -381,3 +383,35 @@ def test_times_that_tracing_hides_are_invalid():
         ride = jax.jit(lambda ts: jk.simulate(Particle(), start, ts))(ts)
         assert ride.reason == "invalid"
         assert np.isnan(ride.q).all()
+
+
+def _of_a_batch(h, v, g, adjoint):
+    """t_end, the end's speed and the height at the first two times, of three members; the last cannot be."""
+    rides = jax.vmap(lambda h, v, g: dropped(h, v, Particle(gravity=g), adjoint=adjoint))(h, v, g)
+    return jnp.stack([rides.t_end, rides.end.u[:, 0], rides["h"][:, 0], rides["h"][:, 1]], axis=1)
+
+
+def _formulas(h, v, g):
+    t_end, _, v_end = exact(h, v, g)
+    return jnp.stack([t_end, v_end, h, h + v * TS[1] - 0.5 * g * TS[1] ** 2])
+
+
+_SLOPES = {
+    "forward": jax.jit(jax.jacfwd(lambda x: _of_a_batch(*x, "forward"))),
+    "reverse": jax.jit(jax.jacrev(lambda x: _of_a_batch(*x, "reverse"))),
+    "formula": jax.jit(jax.vmap(jax.jacfwd(lambda x: _formulas(*x)), in_axes=1)),
+}
+_number = lambda low, high: st.floats(low, high, allow_nan=False)  # noqa: E731
+
+
+@settings(max_examples=25, deadline=None, derandomize=True)
+@given(_number(0.5, 1.5), _number(-1.0, 2.0), _number(5.0, 15.0), st.sampled_from(["forward", "reverse"]))
+def test_derivatives_of_any_fall(h, v, g, mode):
+    """Of a ride that ends early, of one beside it, and with one in the batch whose start is no number."""
+    rtol = 1e-6
+    x = jnp.array([[h, 1.1 * h, jnp.nan], [v, v + 0.1, 0.0], [g, g + 1.0, 9.81]])
+    found, right = _SLOPES[mode](x), _SLOPES["formula"](x)  # (3,4,3,3) (3,4,3)
+    for k in (0, 1):
+        np.testing.assert_allclose(found[k, :, :, k], right[k], rtol=rtol, atol=rtol)
+        assert not np.any(np.delete(found[k], k, axis=-1)), "of other members' numbers"
+    assert np.isnan(found[2, 1:, 0, 2]).all(), "what is missing has no derivative"
