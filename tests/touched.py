@@ -1,6 +1,6 @@
 """Whether the tests that are not marked `slow` call every module of the library.
 
-With the lowest versions CI runs those alone. `pytest` on Python 3.12 or later looks at it, at no cost, and fails where
+`pytest` runs those alone, and so does CI with the lowest versions. On Python 3.12 or later `pytest` looks at it, at no cost, and fails where
 a module is called by slow tests only, or by none: mark other tests, or add a cheap one.
 """
 
@@ -70,6 +70,6 @@ class Touched:
 def watch(config):
     """Register the above where all tests are run, and Python can tell."""
     everything = [Path(argument).resolve() for argument in config.args] == [Path(__file__).parent]
-    chosen = config.option.markexpr or config.option.keyword or config.option.collectonly
+    chosen = config.option.markexpr not in ("", "not slow") or config.option.keyword or config.option.collectonly
     if sys.version_info >= (3, 12) and everything and not chosen:
         config.pluginmanager.register(Touched(config), "touched")
