@@ -24,12 +24,14 @@ class Quantities(NamedTuple):
 
 class Stopping(NamedTuple):
     """The state of a controller that stops: that of its inner controller; the quantities at the step's start; which one
-    ended the motion, -1 for none and n for the bound; and the end of a step that was taken back, else -infinity."""
+    ended the motion, -1 for none and n for the bound; the end of a step that was taken back, else -infinity; and the
+    end of the first step over the bound, else infinity."""
 
     inner: Any
     start: Quantities
     which: Array
     until: Array
+    last: Array
 
 
 class ToStops(diffrax.AbstractStepSizeController[Any, Any]):
@@ -39,7 +41,8 @@ class ToStops(diffrax.AbstractStepSizeController[Any, Any]):
     the step is taken back, and made anew to just beyond that time; so long, until the step that ends there is one that
     is right by the inner controller's measure. Two crossings within one step are seen where the cubic sees them.
 
-    A step over the bound is halved; where it is as short as `shortest`, the motion ends before it.
+    A step over the bound is halved; where it is as short as `shortest`, the motion ends before it. It also ends where
+    the first step over the bound did, if shorter ones do not pass it: so near to it, what is found is by chance.
 
     `watch`: (t, y, args) -> `Quantities`; `direction` (n,): see `first_crossing`; `resolution` [s]: how far behind a
     crossing the last step may end; `rounding` [s]: what is no time.
@@ -61,7 +64,7 @@ class ToStops(diffrax.AbstractStepSizeController[Any, Any]):
         # What would have vanished within a rounding error of the start is on zero there.
         on_zero = jnp.abs(start.values) <= jnp.abs(start.rates) * self.rounding
         start = start._replace(values=jnp.where(on_zero, jnp.zeros_like(start.values), start.values))
-        return end, Stopping(inner, start, jnp.array(-1), jnp.full_like(t0, -jnp.inf))
+        return end, Stopping(inner, start, jnp.array(-1), jnp.full_like(t0, -jnp.inf), jnp.full_like(t0, jnp.inf))
 
     def adapt_step_size(self, t0: Any, t1: Any, y0, y1_candidate, args, y_error, error_order, controller_state):  # type: ignore[override]
         state: Stopping = controller_state
@@ -77,9 +80,10 @@ class ToStops(diffrax.AbstractStepSizeController[Any, Any]):
         which, x = self._first(state.start, now, h)
         crossed = keep & (x <= 1)
         over = keep & (state.start.bound * now.bound < 0)
-        at_bound = over & (h <= self.shortest)
+        at_bound = (over & (h <= self.shortest)) | (keep & ~over & (t1 >= state.last))
         at_start = crossed & (x == 0) & ~over
-        there = crossed & ((1 - x) * h <= self.resolution) & ~over & ~at_start
+        there = crossed & ((1 - x) * h <= self.resolution) & ~over & ~at_start & ~at_bound
+        at_start &= ~at_bound
         again = (crossed | over) & ~there & ~at_start & ~at_bound
         beyond = jnp.where(over, 0.5 * h, jnp.minimum(x, 1.0) * h + 0.5 * self.resolution)
 
@@ -89,6 +93,7 @@ class ToStops(diffrax.AbstractStepSizeController[Any, Any]):
             start=_where(keep & ~taken_back, now, state.start),
             which=jnp.where(there | at_start, which, jnp.where(at_bound, len(self.direction), state.which)),
             until=jnp.where(again & ~over, jnp.maximum(state.until, t1), state.until),
+            last=jnp.where(over, jnp.minimum(state.last, jax.lax.stop_gradient(t1)), state.last),
         )
         result = diffrax.RESULTS.where(again, diffrax.RESULTS.successful, result)
         result = diffrax.RESULTS.where(there | at_start | at_bound, diffrax.RESULTS.event_occurred, result)
