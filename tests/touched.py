@@ -1,6 +1,6 @@
 """Whether the tests that are not marked `slow` call every module of the library.
 
-`pytest` runs those alone, and so does CI with the lowest versions. On Python 3.12 or later `pytest` looks at it, at no cost,
+`pytest` runs those alone, and so does CI with the lowest versions. On Python 3.12 or later it looks at it, at no cost,
 and fails where a module is called by slow tests only, or by none: mark other tests, or add a cheap one.
 """
 
