@@ -1,7 +1,7 @@
 """Whether the tests that are not marked `slow` call every module of the library.
 
 `pytest` runs those alone, and so does CI with the lowest versions. On Python 3.12 or later it looks at it, at no cost,
-and fails where a module is called by slow tests only, or by none: mark other tests, or add a cheap one.
+and names each module that slow tests alone call, or none: mark other tests, or add a cheap one.
 """
 
 import ast
@@ -58,13 +58,11 @@ class Touched:
             self.config.workeroutput["touched"] = sorted(self.files)
         elif session.exitstatus == pytest.ExitCode.OK:
             self.missing = sorted(set(modules_with_functions()) - self.files)
-            if self.missing:
-                session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
     def pytest_terminal_summary(self, terminalreporter):
         for path in self.missing:
             name = Path(path).relative_to(SOURCE)
-            terminalreporter.write_line(f"FAILED: no test that is not marked slow calls {name}", red=True)
+            terminalreporter.write_line(f"no test that is not marked slow calls {name}", yellow=True)
 
 
 def watch(config):
