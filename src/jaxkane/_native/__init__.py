@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import functools
+from typing import Any
 
 import jax
 import numpy as np
@@ -33,11 +34,13 @@ class Scalars:
 
     def __init__(self, program: ClosedJaxpr):
         self.graph, inputs = Graph(), []
-        for i, aval in enumerate(program.in_avals):
+        taken: list[Any] = [*program.in_avals]  # `AbstractValue`s without a shape, to the types of JAX 0.12
+        given: list[Any] = [*program.out_avals]
+        for i, aval in enumerate(taken):
             elements = [self.graph.add("input", (i, e, aval.size), str(aval.dtype)) for e in range(aval.size)]
             inputs.append(np.array(elements, np.int64).reshape(aval.shape))
         self.outputs = unrolled(program.jaxpr, program.consts, inputs, self.graph)
-        self.bytes_of = [a.size * a.dtype.itemsize for a in (*program.in_avals, *program.out_avals)]
+        self.bytes_of = [a.size * a.dtype.itemsize for a in (*taken, *given)]
         self.functions = {
             symbol(node._replace(operation=FMOD) if node.operation == "rem" else node)
             for node in self.graph.nodes
