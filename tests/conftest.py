@@ -20,7 +20,7 @@ import pytest
 import touched
 
 import jaxkane as jk
-from jaxkane import _native
+from jaxkane._scalars import native as native_kernels
 
 CACHE = "JAXKANE_TEST_CACHE"
 
@@ -67,12 +67,12 @@ def _programs_are_forgotten():
 
 @contextlib.contextmanager
 def _switched(native):
-    if native and _native.why_not():
-        pytest.skip(f"no native kernels: {_native.why_not()}")
-    was = _native.is_on()
-    _native.use(native)
+    if native and native_kernels.why_not():
+        pytest.skip(f"no native kernels: {native_kernels.why_not()}")
+    was = native_kernels.is_on()
+    native_kernels.use(native)
     yield
-    _native.use(was)
+    native_kernels.use(was)
 
 
 @pytest.fixture(scope="module", params=["native", "XLA"])

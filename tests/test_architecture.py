@@ -1,11 +1,14 @@
 """The house: imports point down only, the public names are those agreed on, and importing changes nothing."""
 
 import ast
+import graphlib
 import os
 import re
 import subprocess
 import sys
 from pathlib import Path
+
+import pytest
 
 import jaxkane as jk
 import jaxkane.catalog
@@ -15,72 +18,75 @@ import jaxkane.sweep
 
 SOURCE = Path(jk.__file__).parent
 
-# Each module may import from the lines above it, and within the same package.
-FLOORS = [
-    ["_jax_internals"],
-    ["_lookup", "_digest", "_whole_file"],
-    ["_types", "_components", "_linear", "_nan", "_native", "_reads", "_fuse", "_kinks"],
-    ["_crossings"],
-    ["_stops"],
-    ["rotations", "_vectors"],
-    ["_system", "_trajectory"],
-    ["loads", "_units"],
-    ["catalog"],
-    ["_kane"],
-    ["_description"],
-    ["_check"],
-    ["_drift"],
-    ["_rates"],
-    ["_diagnose"],
-    ["_equations", "_assembly", "_signals"],
-    ["_events", "_settings"],
-    ["_ride"],
-    ["_simulate"],
-    ["_along"],
-    ["_reactions"],
-    ["sweep", "_audit", "_configure"],
-    ["plot"],
-    ["fit"],
-    ["stability"],
-    ["_animate"],
-]
-WITHIN_A_FLOOR = {
-    "_trajectory": {"_system"},
-    "_vectors": {"rotations"},
-    "_components": {"_types"},
-    "_linear": {"_types", "_components"},
-    "_fuse": {"_native", "_reads"},
-}
+# Rooms: each may import from those above it, and within itself. What the rooms do not say, is read in their own files:
+# no file imports another that imports it, directly or by way of others.
+FLOORS = ["_common", "_scalars", "rotations", "_description", "loads", "catalog", "_method", "_simulation"]
+FLOORS += ["sweep", "plot", "fit", "stability", "_animate"]
+FLOORS_OF_FIT = ["_data", "_problem", "_optimize", "_result", "_analysis", "_report", "_fit", "bicycle"]
 
 
-def unit_of(path):
-    relative = path.relative_to(SOURCE)
-    return relative.parts[0].removesuffix(".py")
+def room_of(path, base=SOURCE):
+    return path.relative_to(base).parts[0].removesuffix(".py")
 
 
 def imports_of(path):
-    """Names of the units of this package that a file imports."""
+    """The files of this package that a file imports, also inside functions; not those for type checkers alone."""
     package = ("jaxkane", *path.relative_to(SOURCE).parent.parts)
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom):
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    for_types = {
+        node
+        for block in ast.walk(tree)
+        if isinstance(block, ast.If) and "TYPE_CHECKING" in ast.unparse(block.test)
+        for node in ast.walk(block)
+    }
+    for node in ast.walk(tree):
+        names = []
+        if isinstance(node, ast.ImportFrom) and node not in for_types:
             base = package[: len(package) - node.level + 1] if node.level else ()
             full = (*base, *(node.module.split(".") if node.module else ()))
-            if full[:1] == ("jaxkane",):
-                yield from (alias.name for alias in node.names) if len(full) == 1 else (full[1],)
+            names = [(*full, alias.name) for alias in node.names]
         elif isinstance(node, ast.Import):
-            yield from (a.name.split(".")[1] for a in node.names if a.name.startswith("jaxkane."))
+            names = [tuple(alias.name.split(".")) for alias in node.names]
+        for name in names:
+            if name[0] == "jaxkane":
+                found = [file_of(name), file_of(name[:-1])]
+                yield next(file for file in found if file)
 
 
-def test_imports_point_down():
-    floor = {unit: i for i, units in enumerate(FLOORS) for unit in units}
-    for path in SOURCE.rglob("*.py"):
-        unit = unit_of(path)
-        if unit == "__init__":
+def file_of(name):
+    place = SOURCE.joinpath(*name[1:])
+    return next((file for file in (place.with_suffix(".py"), place / "__init__.py") if file.exists()), None)
+
+
+FILES = sorted(path for path in SOURCE.rglob("*.py") if path != SOURCE / "__init__.py")
+
+
+@pytest.mark.parametrize(
+    ("base", "floors"), [(SOURCE, FLOORS), (SOURCE / "fit", FLOORS_OF_FIT)], ids=["jaxkane", "fit"]
+)
+def test_imports_point_down(base, floors):
+    for path in FILES:
+        if not path.is_relative_to(base) or path == base / "__init__.py":
             continue
-        assert unit in floor, f"{unit} has no floor yet: give it one in this test"
+        room = room_of(path, base)
+        assert room in floors, f"{room} has no floor yet: give it one in this test"
         for imported in imports_of(path):
-            fine = imported == unit or floor[imported] < floor[unit] or imported in WITHIN_A_FLOOR.get(unit, ())
-            assert fine, f"{path.relative_to(SOURCE)} imports {imported}, which does not stand below it"
+            if imported.is_relative_to(base) and imported != base / "__init__.py":
+                below = room_of(imported, base)
+                fine = below == room or floors.index(below) < floors.index(room)
+                assert fine, f"{path.relative_to(base)} imports {below}, which does not stand below it"
+
+
+def test_no_files_import_each_other_in_a_circle():
+    graphlib.TopologicalSorter({path: set(imports_of(path)) - {path} for path in FILES}).prepare()
+
+
+def test_what_stands_in_the_house_itself():
+    """The public names, the public modules that are one file, and rooms that say what they are."""
+    assert {path.name for path in SOURCE.glob("*.py")} == {"__init__.py", "loads.py", "rotations.py"}
+    rooms = [path for path in SOURCE.rglob("*") if path.is_dir() and any(path.glob("*.py"))]
+    for path in rooms:
+        assert ast.get_docstring(ast.parse((path / "__init__.py").read_text(encoding="utf-8"))), path
 
 
 # What JAX and equinox do not promise: the one file that uses it says what happens where it is gone.
@@ -88,16 +94,23 @@ NOT_PROMISED = r"jax\.(extend|interpreters|experimental|_src)|equinox\._|jaxlib\
 
 
 def test_one_file_uses_what_is_not_promised():
-    users = {unit_of(path) for path in SOURCE.rglob("*.py") if re.search(NOT_PROMISED, path.read_text())}
-    assert users == {"_jax_internals"}
-    others = [path for path in SOURCE.rglob("*.py") if path.stem != "_jax_internals"]
+    the_file = SOURCE / "_scalars" / "jax_internals.py"
+    assert [path for path in SOURCE.rglob("*.py") if re.search(NOT_PROMISED, path.read_text())] == [the_file]
+    others = [path for path in SOURCE.rglob("*.py") if path != the_file]
     of_core = {line for path in others for line in re.findall(r".*jax\.core.*", path.read_text())}
     assert of_core <= {"from jax.core import Tracer"}  # the rest of jax.core comes and goes
 
 
 def test_few_files_see_the_integrator():
-    users = {unit_of(path) for path in SOURCE.rglob("*.py") if "import diffrax" in path.read_text()}
-    assert users <= {"_simulate", "_ride", "_settings", "_kinks", "_stops", "fit"}
+    users = {path for path in SOURCE.rglob("*.py") if "import diffrax" in path.read_text()}
+    assert {room_of(path) for path in users} == {"_simulation", "fit"}
+    assert {path.stem for path in users if room_of(path) == "_simulation"} <= {
+        "simulate",
+        "ride",
+        "settings",
+        "kinks",
+        "stops",
+    }
 
 
 def test_public_names():
@@ -124,7 +137,7 @@ def test_every_public_function_says_what_it_does():
     for module in (jk, jk.fit, jk.sweep, jk.stability, jk.catalog, jk.rotations):
         for name, thing in vars(module).items():
             ours = getattr(thing, "__module__", "").startswith("jaxkane")
-            if ours and not name.startswith("_") and thing.__module__ != "jaxkane._components":
+            if ours and not name.startswith("_") and thing.__module__ != "jaxkane._scalars.components":
                 assert thing.__doc__, f"{module.__name__}.{name} has no docstring"
 
 

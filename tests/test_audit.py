@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._audit import _cumulative_integral
+from jaxkane._simulation.audit import _cumulative_integral
 from jaxkane.catalog import CATALOG
 
 RTOL = 1e-8

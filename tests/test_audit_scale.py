@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane import _audit, _linear, _rates
-from jaxkane._fuse import _Program
+from jaxkane._method import rates
+from jaxkane._scalars import linear
+from jaxkane._scalars.fuse import _Program
+from jaxkane._simulation import audit
 
 TILTS = ((0.3, 0.5, 0.81), (0.7, -0.2, 0.4), (-0.4, 0.6, 0.5))
 
@@ -65,9 +67,9 @@ def test_the_audit_costs_what_the_accelerations_cost(held):
     counts = {}
     for n in (4, 6, 8):
         system = TiltedChain(n=n, held=held)
-        counts[n], is_plain = operations(_audit._measured, system, jnp.ones(n - held))
+        counts[n], is_plain = operations(audit._measured, system, jnp.ones(n - held))
         assert is_plain
-    assert counts[6] < operations(_rates._state_rates, TiltedChain(n=6, held=held))[0]
+    assert counts[6] < operations(rates._state_rates, TiltedChain(n=6, held=held))[0]
     # Linear but for the weights and the columns of the constraint, which pass all frames: less than quadratic
     assert counts[8] - counts[6] < 1.6 * (counts[6] - counts[4])
 
@@ -79,7 +81,7 @@ def test_long_and_short_chains_are_audited_alike(monkeypatch):
     ride = jk.simulate(system, jk.State(q, u), jnp.linspace(0.0, 0.05, 6))
     found = []
     for most in (12, 0):
-        monkeypatch.setattr(_linear, "_UNROLL_UP_TO", most)
+        monkeypatch.setattr(linear, "_UNROLL_UP_TO", most)
         jax.clear_caches()
         audit = jk.audit(system, ride)
         at = (system, 0.0, q, u)

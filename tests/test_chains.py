@@ -7,8 +7,9 @@ import pytest
 from benchmarks.chain import Chain
 
 import jaxkane as jk
-from jaxkane import _linear, _rates
-from jaxkane._fuse import _Program
+from jaxkane._method import rates
+from jaxkane._scalars import linear
+from jaxkane._scalars.fuse import _Program
 
 
 class DampedChain(Chain):
@@ -46,7 +47,7 @@ def test_both_forms_agree(name, monkeypatch):
     moved = jax.tree.map(lambda x: 0.3 * jnp.ones_like(x), args)
     found = []
     for most in (12, 0):
-        monkeypatch.setattr(_linear, "_UNROLL_UP_TO", most)
+        monkeypatch.setattr(linear, "_UNROLL_UP_TO", most)
         rates = lambda *args: (jk.equations_of_motion(*args), jk.accelerations(*args))  # noqa: E731
         found.append((jax.jit(rates)(*args), jax.jit(lambda *args: jax.jvp(jk.accelerations, args, moved)[1])(*args)))
     close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11 * np.abs(a).max())  # noqa: E731
@@ -55,7 +56,7 @@ def test_both_forms_agree(name, monkeypatch):
 
 def test_a_chain_of_twenty_keeps_its_energy():
     chain, _, q, u, _ = at(Chain(n=20), 20)
-    assert not _linear.is_written_out(20)
+    assert not linear.is_written_out(20)
     state = jk.State(0.3 * q, 0.5 * u)
     ride = jk.simulate(chain, state, jnp.linspace(0.0, 0.5, 6), rtol=1e-9, atol=1e-9)
     assert ride.ok
@@ -74,7 +75,7 @@ def test_a_chain_of_twenty_keeps_its_energy():
 def test_the_work_grows_with_the_number_of_links():
     def operations(n):
         leaves, treedef = jax.tree.flatten((*at(Chain(n=n), n), jnp.ones(n)))
-        column = lambda *x: _rates._mass_times.__wrapped__(*jax.tree.unflatten(treedef, x))  # noqa: E731
+        column = lambda *x: rates._mass_times.__wrapped__(*jax.tree.unflatten(treedef, x))  # noqa: E731
         traced = jax.make_jaxpr(column)(*leaves)
         return len(traced.jaxpr.eqns), len(_Program(traced).program.jaxpr.eqns)
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._check import _is_possible
+from jaxkane._method.checks import _is_possible
 from jaxkane.catalog import DoublePendulum, WhippleBicycle
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxkane as jk
-from jaxkane._kane import Instant
+from jaxkane._method.kane import Instant
 from jaxkane.catalog import CATALOG
 
 

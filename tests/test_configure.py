@@ -6,10 +6,10 @@ import sys
 
 import pytest
 
-from jaxkane import _native
-from jaxkane._configure import _split_cpu, _store_programs
+from jaxkane._scalars import native
+from jaxkane._scalars.configure import _split_cpu, _store_programs
 
-KERNELS = f"no native kernels ({_native.why_not()})" if _native.why_not() else "native kernels"
+KERNELS = f"no native kernels ({native.why_not()})" if native.why_not() else "native kernels"
 HEAD = "import jaxkane as jk, numpy as np, jax\n"
 RIDE = """
 hits, misses = [], []

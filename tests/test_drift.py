@@ -8,7 +8,7 @@ from test_other_systems import FourBarLinkage
 
 import jaxkane as jk
 from jaxkane import best_dependent_speeds
-from jaxkane._drift import relative_condition
+from jaxkane._method.drift import relative_condition
 
 HELD = 1e-9
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.special import ellipk
 
 import jaxkane as jk
-from jaxkane._crossings import first_crossing
+from jaxkane._simulation.crossings import first_crossing
 
 TS = jnp.linspace(0.0, 2.0, 11)
 
@@ -285,7 +285,7 @@ def test_other_ends_have_no_derivative():
 
 def test_an_event_that_reads_no_speed_costs_no_accelerations():
     """A ride without events does as much as ever; one with them looks at coordinates and their rates alone."""
-    from jaxkane._events import events_of
+    from jaxkane._simulation.events import events_of
 
     start = jk.State(jnp.ones(1), jnp.ones(1))
     assert not events_of(Particle(), TS[0], start).read_speeds

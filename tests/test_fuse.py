@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxkane import _fuse
-from jaxkane._fuse import fused, without_repetition
-from jaxkane._linear import determinant, solve
+from jaxkane._scalars import fuse
+from jaxkane._scalars.fuse import fused, without_repetition
+from jaxkane._scalars.linear import determinant, solve
 
 
 def plain(a, b, x):
@@ -65,8 +65,8 @@ def test_the_same_as_plain_jax(name, compiled, kernels):
 
 @pytest.mark.parametrize("name", ["jit", "reverse", "batch", "batch of gradients", "gradient of a loop"])
 def test_a_long_program_in_pieces(name, by_xla, monkeypatch):
-    monkeypatch.setattr(_fuse, "_WHOLE_UP_TO", 4)
-    monkeypatch.setattr(_fuse, "_PIECE", 3)
+    monkeypatch.setattr(fuse, "_WHOLE_UP_TO", 4)
+    monkeypatch.setattr(fuse, "_PIECE", 3)
 
     def chosen(a, b, x):
         left = x[0] < a  # what is not a float goes from piece to piece too
@@ -105,7 +105,7 @@ def test_it_is_traced_once():
 CRASHES = """
 import jax, jax.numpy as jnp
 jax.config.update("jax_enable_x64", True)
-from jaxkane._fuse import fused
+from jaxkane._scalars.fuse import fused
 program = fused(lambda a, b, t, x: (jnp.sin(x[0]) * a + t + jnp.cos(x[1]), 0.0 * b))
 x = jnp.ones(3)
 def loop(f, n=5):
@@ -132,8 +132,8 @@ def test_the_process_stays_alive():
 
 def test_a_batch_without_jit_is_compiled_once(monkeypatch):
     f = fused(lambda x, a: jnp.sin(a * x))
-    lowered, lower = [], _fuse._Program.target
-    monkeypatch.setattr(_fuse._Program, "target", lambda self, *batch: lowered.append(batch) or lower(self, *batch))
+    lowered, lower = [], fuse._Program.target
+    monkeypatch.setattr(fuse._Program, "target", lambda self, *batch: lowered.append(batch) or lower(self, *batch))
     x = jnp.linspace(0.0, 1.0, 5)
     for a in (1.0, 2.0, 3.0):
         np.testing.assert_allclose(jax.vmap(f, (0, None))(x, a), np.sin(a * x), rtol=1e-14)
@@ -214,7 +214,7 @@ SLOW = {
 
 @pytest.mark.parametrize("name", SLOW)
 def test_what_cannot_be_one_function_is_told_once_by_name(name, monkeypatch):
-    monkeypatch.setattr(_fuse, "_told", set())
+    monkeypatch.setattr(fuse, "_told", set())
     f = fused(SLOW[name])
     ball, x = Ball(jnp.array(1.5)), jnp.array(0.4)
     with pytest.warns(UserWarning, match=rf"Ball: its description uses .*`{name}`.* cannot be part of one") as told:
@@ -236,7 +236,7 @@ def test_lapack_of_the_method_itself_is_not_told():
 
 @pytest.mark.usefixtures("native")
 def test_what_kernels_cannot_do_is_told_once_by_name(monkeypatch):
-    monkeypatch.setattr(_fuse, "_told", set())
+    monkeypatch.setattr(fuse, "_told", set())
     f = fused(lambda ball, x: ball.a * jnp.round(x))
     with pytest.warns(UserWarning, match="Ball: its description uses round of float64, which native") as told:
         found = [f(Ball(jnp.array(1.5)), x) for x in (0.4, 1.7, jnp.array(2.5))]

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxkane import _jax_internals as internals
-from jaxkane._fuse import fused
+from jaxkane._scalars import jax_internals as internals
+from jaxkane._scalars.fuse import fused
 
 USED = {
     "jax.extend.core": "ClosedJaxpr Jaxpr Literal Primitive jaxpr_as_fun",
@@ -31,7 +31,7 @@ USED = {
 def test_it_is_there(module):
     found = importlib.import_module(module)
     missing = [name for name in USED[module].split() if not hasattr(found, name)]
-    assert not missing, f"{module} lacks {', '.join(missing)}: see jaxkane/_jax_internals.py for what is lost"
+    assert not missing, f"{module} lacks {', '.join(missing)}: see jaxkane/_scalars/jax_internals.py for what is lost"
 
 
 def test_what_they_do(by_xla):
@@ -59,8 +59,8 @@ import jax.extend.core, jax.experimental.compilation_cache.compilation_cache as 
 del jax.extend.core.jaxpr_as_fun, cache.reset_cache, errors.EQX_ON_ERROR
 import warnings
 import jaxkane as jk
-from jaxkane import _jax_internals
-assert "jaxpr_as_fun" in _jax_internals.FUSES
+from jaxkane._scalars import jax_internals
+assert "jaxpr_as_fun" in jax_internals.FUSES
 class Rod(jk.System):
     length: jk.Scalar = jk.parameter(0.5)
     coordinates, speeds = ("angle",), ("rate",)
@@ -75,8 +75,8 @@ f = lambda angle: jk.accelerations(Rod(), 0.0, jnp.stack([angle]), jnp.zeros(1))
 angles = jnp.array([0.3, 1.1])
 np.testing.assert_allclose(jax.vmap(f)(angles), -29.43 * np.sin(angles), rtol=1e-12)
 np.testing.assert_allclose(jax.jit(jax.grad(f))(0.3), -29.43 * np.cos(0.3), rtol=1e-12)
-_jax_internals.look_for_cache_again()
-assert not _jax_internals.checks_give_nan()
+jax_internals.look_for_cache_again()
+assert not jax_internals.checks_give_nan()
 print("right")
 """
 

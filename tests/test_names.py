@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._lookup import hint
+from jaxkane._common.lookup import hint
 
 PENDULUM = jk.catalog.DoublePendulum()
 TS = jnp.array([0.0, 0.1])

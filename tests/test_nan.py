@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxkane._nan import nan_derivative_where, nan_where
+from jaxkane._scalars.nan import nan_derivative_where, nan_where
 
 P = {"a": jnp.array(0.7), "b": jnp.array([0.2, -0.4]), "n": 3}
 MISSING = jnp.array([False, False, True, True])

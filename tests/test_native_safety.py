@@ -13,16 +13,17 @@ import jaxlib
 import numpy as np
 import pytest
 
-from jaxkane import _native
-from jaxkane._fuse import fused
-from jaxkane._native import _available, _handler, _machine, _objects, _probe
+from jaxkane._scalars import native
+from jaxkane._scalars.fuse import fused
+from jaxkane._scalars.native import available, handler, objects, probe
+from jaxkane._scalars.native.machine import Machine
 
 pytestmark = pytest.mark.usefixtures("native")
 
 # Eight systems, each compiled by a thread of its own, all at once, and each compared with XLA's afterwards.
 THREADS = """
 import threading, numpy as np, jax, jaxkane as jk
-from jaxkane import _native
+from jaxkane._scalars import native
 jax.config.update("jax_enable_x64", True)
 def system(k):
     class Arm(jk.System):
@@ -47,9 +48,9 @@ def work(k):
 threads = [threading.Thread(target=work, args=(k,)) for k in range(len(systems))]
 [t.start() for t in threads]
 [t.join() for t in threads]
-assert _native.is_on()
+assert native.is_on()
 again = [np.asarray(jk.accelerations(s, 0.0, q, u)) for s in systems]
-_native.use(False)
+native.use(False)
 for k in range(0, len(systems), 2):
     by_xla = np.asarray(jk.accelerations(systems[k], 0.0, q, u))
     for numbers in (found[k], found[k + 1], again[k], again[k + 1]):
@@ -69,8 +70,8 @@ CUBE = SQUARE.replace("ret double %y", "%z = fmul double %y, %x\nret double %z")
 
 def value(text, folder):
     """f(3), compiled or read by a machine that has compiled nothing yet."""
-    machine = _machine.Machine()
-    found = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(machine.compile(text, _objects.Objects(folder))[0])(3.0)
+    machine = Machine()
+    found = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(machine.compile(text, objects.Objects(folder))[0])(3.0)
     return found, machine  # whose code must live while it is called
 
 
@@ -124,7 +125,7 @@ def test_a_folder_that_goes_and_many_who_write(tmp_path):
         file.unlink()
     folder.rmdir()
     assert value(CUBE, folder)[0] == 27.0
-    store, code, read = _objects.Objects(folder), bytes(range(256)) * 4096, []
+    store, code, read = objects.Objects(folder), bytes(range(256)) * 4096, []
 
     def write_and_read():
         for _ in range(5):
@@ -176,9 +177,9 @@ def test_places_are_those_of_the_header_of_jaxlib():
     assert re.search(r"#define XLA_FFI_API_MAJOR 0\b", text)
     for lists, items in ((arguments, "args"), ("XLA_FFI_Rets", "rets")):
         places = at(lists, "size"), at(lists, items), stated(lists)
-        assert places == (_handler.LAYOUT.list_count, _handler.LAYOUT.list_items, _handler.LAYOUT.list_size), lists
+        assert places == (handler.LAYOUT.list_count, handler.LAYOUT.list_items, handler.LAYOUT.list_size), lists
     version = at("XLA_FFI_Metadata", "api_version")
-    expected = _handler.Layout(
+    expected = handler.Layout(
         frame_size=stated(frame),
         frame_extension=at(frame, "extension_start"),
         frame_api=at(frame, "api"),
@@ -199,68 +200,68 @@ def test_places_are_those_of_the_header_of_jaxlib():
         error_message=at("XLA_FFI_Error_Create_Args", "message"),
         error_code=at("XLA_FFI_Error_Create_Args", "errc"),
     )
-    assert expected == _handler.LAYOUT
+    assert expected == handler.LAYOUT
 
 
 @pytest.fixture
 def unproven(tmp_path, monkeypatch):
     """A process that has tried nothing yet, and folders without verdicts."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(_probe, "cache_folder", lambda: None)
-    monkeypatch.setattr(_available, "_told", set())
-    _available._verdict.cache_clear()
+    monkeypatch.setattr(probe, "cache_folder", lambda: None)
+    monkeypatch.setattr(available, "_told", set())
+    available._verdict.cache_clear()
     yield tmp_path
     monkeypatch.undo()
-    _available._verdict.cache_clear()
+    available._verdict.cache_clear()
 
 
 # Places that make a wild pointer of the buffers' list, and a size that the handler finds wrong.
 @pytest.mark.parametrize(("place", "number", "how"), [("list_items", 24, "signal"), ("list_size", 48, "another way")])
 def test_a_moved_structure_leaves_the_work_to_xla(place, number, how, unproven, monkeypatch):
-    monkeypatch.setattr(_handler, "LAYOUT", _handler.LAYOUT._replace(**{place: number}))
+    monkeypatch.setattr(handler, "LAYOUT", handler.LAYOUT._replace(**{place: number}))
     f = fused(lambda x: jnp.sin(x) * number)
     with pytest.warns(UserWarning, match=f"no native kernels, XLA does their work: a first kernel.*{how}") as told:
         found = jax.jit(f)(0.5), *jax.jit(jax.vmap(f))(jnp.ones(3))
     np.testing.assert_allclose(found, np.sin([0.5, 1.0, 1.0, 1.0]) * number)
     assert len(told) == 1
-    assert not _native.is_on()
-    assert "first kernel" in (_native.why_not() or "")
+    assert not native.is_on()
+    assert "first kernel" in (native.why_not() or "")
     # The next process reads it, and tries for itself again a day later.
-    _available._verdict.cache_clear()
+    available._verdict.cache_clear()
     monkeypatch.setattr(subprocess, "run", None)
-    assert not _native.is_on()
-    monkeypatch.setattr(_probe, "_A_DAY", -1.0)
-    _available._verdict.cache_clear()
+    assert not native.is_on()
+    monkeypatch.setattr(probe, "_A_DAY", -1.0)
+    available._verdict.cache_clear()
     with pytest.raises(TypeError):
-        _native.is_on()
+        native.is_on()
 
 
 def test_a_handler_that_finds_a_moved_structure_makes_an_error(monkeypatch):
-    assert _native.is_on()
-    monkeypatch.setattr(_handler, "LAYOUT", _handler.LAYOUT._replace(frame_size=4096))
+    assert native.is_on()
+    monkeypatch.setattr(handler, "LAYOUT", handler.LAYOUT._replace(frame_size=4096))
     with pytest.raises(jax.errors.JaxRuntimeError, match=r"calls native kernels in another way .*native=False"):
         jax.block_until_ready(jax.jit(fused(lambda x: jnp.cos(x) * 1.25))(0.5))
 
 
 def test_the_probe_is_not_run_again_nor_where_kernels_are_off(unproven, monkeypatch):
-    assert _native.is_on()
+    assert native.is_on()
     (verdict,) = (unproven / "jaxkane").glob("kernels-*.json")
     monkeypatch.setattr(subprocess, "run", None)  # whoever calls it fails
-    _available._verdict.cache_clear()
-    assert _native.is_on()
+    available._verdict.cache_clear()
+    assert native.is_on()
     verdict.write_text("{")
-    _available._verdict.cache_clear()
+    available._verdict.cache_clear()
     with pytest.raises(TypeError):
-        _native.is_on()
-    monkeypatch.setattr(_available, "_wanted", False)
-    assert not _native.is_on()
+        native.is_on()
+    monkeypatch.setattr(available, "_wanted", False)
+    assert not native.is_on()
 
 
 def test_without_a_place_for_the_verdict(unproven, monkeypatch):
     (unproven / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(unproven / "file"))
-    monkeypatch.setattr(_probe, "_tried", lambda machine: (None, True))
-    assert _native.is_on()
+    monkeypatch.setattr(probe, "_tried", lambda machine: (None, True))
+    assert native.is_on()
 
 
 class Text:
@@ -274,19 +275,19 @@ class Text:
 
 
 def test_an_error_of_llvm_leaves_the_work_to_xla(monkeypatch):
-    monkeypatch.setattr(_available, "_told", set())
+    monkeypatch.setattr(available, "_told", set())
     f = fused(lambda x: jnp.sin(x) * 1.75)
     with monkeypatch.context() as broken:
-        broken.setattr(_native, "Writer", Text)
+        broken.setattr(native, "Writer", Text)
         with pytest.warns(UserWarning, match="XLA does their work: LLVM fails at A function") as told:
             found = [*jax.jit(jax.vmap(f))(jnp.ones(1)), *jax.jit(jax.vmap(f))(jnp.ones(3))]
         np.testing.assert_allclose(found, np.sin(np.ones(4)) * 1.75)
         assert len(told) == 1
-    assert _native.is_on()
+    assert native.is_on()
 
 
 def test_a_function_that_is_missing_leaves_the_work_to_xla(monkeypatch):
     """LLVM would end the process."""
-    monkeypatch.setattr(_machine.Machine, "has", lambda self, function: function != "fmod")
+    monkeypatch.setattr(Machine, "has", lambda self, function: function != "fmod")
     with pytest.warns(UserWarning, match=r"uses fmod \(not in the mathematical library here\)"):
         np.testing.assert_allclose(jax.jit(fused(lambda x: jax.lax.rem(x, 0.7)))(2.0), 2.0 % 0.7)

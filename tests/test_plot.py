@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._units import unit_of
+from jaxkane._description.units import unit_of
 from jaxkane.plot._stability import stable_ranges
 
 

@@ -8,7 +8,7 @@ from test_other_systems import FIGURES, FourBarLinkage, RollingDiscDependent
 
 import jaxkane as jk
 from jaxkane import constraint_forces, constraint_multipliers
-from jaxkane._kane import Instant
+from jaxkane._method.kane import Instant
 from jaxkane.catalog import CATALOG
 
 RTOL = 1e-12

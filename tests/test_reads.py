@@ -21,9 +21,9 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._fuse import fused
-from jaxkane._reads import version_of
-from jaxkane.fit._problem import cost
+from jaxkane._scalars.fuse import fused
+from jaxkane._scalars.reads import version_of
+from jaxkane.fit._problem.problem import cost
 
 RTOL = 1e-12
 TS = np.linspace(0.0, 0.2, 3)
@@ -395,7 +395,7 @@ def test_threads_agree():
 def test_a_look_walks_through_nothing(monkeypatch):
     system = Drop()
     version = version_of(system)
-    monkeypatch.setattr("jaxkane._reads._Walk", None)  # it would be called to look anew
+    monkeypatch.setattr("jaxkane._scalars.reads._Walk", None)  # it would be called to look anew
     assert version_of(system) == version
 
 

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._system import Values
+from jaxkane._description.values import Values
 
 
 class Beads(jk.System):

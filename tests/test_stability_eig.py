@@ -155,9 +155,9 @@ THREADS = """
 import sys, threading
 import jax, jax.numpy as jnp, numpy as np
 jax.config.update("jax_enable_x64", True)
-from jaxkane import _native
+from jaxkane._scalars import native
 from jaxkane.stability._eig import eig, eigvals
-_native.use(sys.argv[1] == "native")
+native.use(sys.argv[1] == "native")
 
 @jax.jit
 def both(A):

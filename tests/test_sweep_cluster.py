@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._check import check_system, configuration_residual
-from jaxkane._digest import digest
+from jaxkane._common.digest import digest
+from jaxkane._method.checks import check_system, configuration_residual
 
 distributed = pytest.importorskip("distributed")
 

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._digest import digest
-from jaxkane._whole_file import write_whole
+from jaxkane._common.digest import digest
+from jaxkane._common.whole_file import write_whole
 from jaxkane.sweep._files import Folder
 
 TS = np.linspace(0.0, 0.2, 3)
@@ -105,7 +105,7 @@ def test_numbers_that_inputs_and_reduce_read_belong_to_the_sweep(tmp_path):
 def test_a_digest_outlives_the_process_and_tells_programs_apart():
     code = """
 import jax, jax.numpy as jnp, numpy as np, dataclasses, jaxkane as jk
-from jaxkane._digest import digest
+from jaxkane._common.digest import digest
 jax.config.update("jax_enable_x64", True)
 
 class Bead(jk.System):  # on a ring, pushed
@@ -129,7 +129,7 @@ from jaxkane.sweep._fingerprint import traced
 from jaxkane.sweep._members import members_of
 from jaxkane.sweep._solve import Job
 from jaxkane.sweep._table import as_table
-from jaxkane._simulate import settings_for, checked_times
+from jaxkane._simulation.settings import settings_for, checked_times
 ts = checked_times(np.linspace(0.0, 1.0, 3), float)
 def found(k):
     start, push = jk.State(np.array([0.0, 1.0]), np.ones(1)), {"push": lambda t, s: k * s["x"]}

@@ -16,10 +16,10 @@ from collections.abc import Callable
 
 import jax.numpy as jnp
 
-from ._components import component, is_zero
-from ._system import Body, Force, Torque
-from ._types import Component
-from ._vectors import Frame, Point, Vector
+from ._description.bodies import Body, Force, Torque
+from ._description.vectors import Frame, Point, Vector
+from ._scalars.components import component, is_zero
+from ._scalars.types import Component
 
 Law = Component | Callable[[Component], Component]
 

@@ -13,8 +13,8 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from ._components import add, cross, dot, is_exact, matvec, mul, sub
-from ._types import Component, Triple
+from ._scalars.components import add, cross, dot, is_exact, matvec, mul, sub
+from ._scalars.types import Component, Triple
 
 Matrix = tuple[Triple, Triple, Triple]
 

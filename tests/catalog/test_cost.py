@@ -5,10 +5,10 @@ import jax.numpy as jnp
 import pytest
 
 import jaxkane as jk
-from jaxkane import _fuse
-from jaxkane._fuse import _Program
-from jaxkane._native import Scalars
-from jaxkane._rates import _state_rates
+from jaxkane._method.rates import _state_rates
+from jaxkane._scalars import fuse
+from jaxkane._scalars.fuse import _Program
+from jaxkane._scalars.native import Scalars
 from jaxkane.catalog import CATALOG
 
 # Equations of the jaxpr of (q_dot, u_dot), each common one once: measured, with five per cent to spare.
@@ -71,8 +71,8 @@ def test_every_public_function_is_one_program_of_scalars(name, monkeypatch):
     """Traced, and not compiled: what cannot be part of one function is told of, and is an error here."""
     entry, programs = CATALOG[name], []
     system, q, u = entry.example(), jnp.array(entry.q), jnp.array(entry.u)
-    prepared = _fuse._Program.__init__
-    monkeypatch.setattr(_fuse._Program, "__init__", lambda self, *args: prepared(self, *args) or programs.append(self))
+    prepared = fuse._Program.__init__
+    monkeypatch.setattr(fuse._Program, "__init__", lambda self, *args: prepared(self, *args) or programs.append(self))
     jk.forget()
     names = f"{OF_STATES} {OF_CONSTRAINTS if system.dependent_speeds else ''}".split()
     for f in (getattr(jk, name) for name in names):

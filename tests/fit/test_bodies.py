@@ -8,7 +8,7 @@ import pytest
 import jaxkane as jk
 from jaxkane.catalog import RigidBody, WhippleBicycle
 from jaxkane.fit import Free, Inertia, PossibleBody, Problem, Trial, frame_inertia, least_squares
-from jaxkane.fit._parameters import parameters_of
+from jaxkane.fit._problem.parameters import parameters_of
 
 BICYCLE = WhippleBicycle.benchmark()
 MOMENTS = ("I11", "I22", "I33")

@@ -7,7 +7,7 @@ import pytest
 from systems import Track
 
 from jaxkane.fit import Problem, Trial, design, identifiability, least_squares
-from jaxkane.fit._design import _covariance, goal_of
+from jaxkane.fit._analysis.design import _covariance, goal_of
 
 t = np.arange(0.0, 4.0, 0.1)
 SIGMA = {"x": 0.01}

@@ -7,9 +7,9 @@ import optax
 import pytest
 from systems import Track
 
-import jaxkane.fit._problem as posing
-from jaxkane.fit import Problem, Trial, bfgs, gradient_descent, least_squares, multi_start, profile, read_trials
-from jaxkane.fit._problem import cost, linearize
+import jaxkane.fit._problem.problem as posing
+from jaxkane.fit import Problem, Trial, gradient_descent, least_squares, multi_start, profile, read_trials
+from jaxkane.fit._problem.problem import cost, linearize
 from jaxkane.sweep import grid
 
 t = np.linspace(0.0, 1.0, 11)
@@ -100,12 +100,12 @@ def test_a_checkpoint_that_cannot_be_read_is_named(how, problem, tmp_path):
 
 @pytest.mark.slow
 def test_bfgs_keeps_the_best_when_it_is_interrupted(problem, monkeypatch):
-    from jaxkane.fit import _bfgs
+    from jaxkane.fit._optimize import bfgs
 
     whole = bfgs(problem)
     assert whole.status == "converged"
     assert bfgs(problem, steps=2).status == "steps"
-    step, calls = _bfgs._step, []
+    step, calls = bfgs._step, []
 
     def interrupted(*args):
         calls.append(1)
@@ -113,7 +113,7 @@ def test_bfgs_keeps_the_best_when_it_is_interrupted(problem, monkeypatch):
             raise KeyboardInterrupt
         return step(*args)
 
-    monkeypatch.setattr(_bfgs, "_step", interrupted)
+    monkeypatch.setattr(bfgs, "_step", interrupted)
     best = bfgs(problem)
     assert best.status == "interrupted"
     assert whole.cost <= best.cost < best.history[0]
@@ -135,12 +135,12 @@ def test_many_starts_end_with_ctrl_c(problem):
 
 
 def test_studies_of_fits_end_with_ctrl_c(problem, monkeypatch):
-    from jaxkane.fit import _uncertainty
+    from jaxkane.fit._result import uncertainty
 
     fit = least_squares(problem)
     stopped = lambda *args, **options: least_squares(*args, **{**options, "callback": after(0)})  # noqa: E731
-    monkeypatch.setattr("jaxkane.fit._least_squares.least_squares", stopped)
-    monkeypatch.setattr(_uncertainty, "least_squares", stopped, raising=False)
+    monkeypatch.setattr("jaxkane.fit._optimize.least_squares.least_squares", stopped)
+    monkeypatch.setattr(uncertainty, "least_squares", stopped, raising=False)
     with pytest.raises(KeyboardInterrupt):
         profile(fit, "gain")
 

@@ -10,8 +10,8 @@ import pytest
 import jaxkane as jk
 from jaxkane.catalog import DoublePendulum
 from jaxkane.fit import Free, Gain, Problem, Trial, fit, gradient_descent, identifiability, least_squares
-from jaxkane.fit._blocks import Blocks, eliminate
-from jaxkane.fit._problem import linearize
+from jaxkane.fit._problem.blocks import Blocks, eliminate
+from jaxkane.fit._problem.problem import linearize
 
 TRUTH = DoublePendulum(mass=1.2, length=0.7)
 GUESS = DoublePendulum(mass=1.0, length=0.8)
@@ -132,7 +132,7 @@ def test_plain_coordinates_go_down(problem):
 
 
 def test_an_interrupted_fit_keeps_the_best(problem, monkeypatch):
-    import jaxkane.fit._gradient_descent as module
+    import jaxkane.fit._optimize.gradient_descent as module
 
     calls = []
 

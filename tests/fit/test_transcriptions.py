@@ -8,8 +8,8 @@ from systems import Cart
 
 import jaxkane as jk
 from jaxkane.fit import Delay, Free, Gain, Problem, Trial, bfgs, gauss_newton, gradient_descent, least_squares
-from jaxkane.fit._blocks import Blocks, eliminate
-from jaxkane.fit._steps import settle
+from jaxkane.fit._optimize.steps import settle
+from jaxkane.fit._problem.blocks import Blocks, eliminate
 
 TRUTH = Cart(mass=1.3, stiffness=5.0, damping=0.4)
 GUESS = Cart(mass=1.0, stiffness=4.0, damping=0.2)
@@ -133,7 +133,7 @@ def test_delays_gains_rates_and_gaps(result):
 
 
 def test_other_data_and_guesses_compile_nothing(result, runs, problem):
-    import jaxkane.fit._model as model
+    import jaxkane.fit._problem.model as model
 
     before = model.blocks_of.compiled._cached._cache_size()
     again = [Trial(r.t, r.measured, r.inputs, sigma=0.02, name="again") for r in runs]

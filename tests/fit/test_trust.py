@@ -9,7 +9,7 @@ import pytest
 from systems import Cart
 from test_transcriptions import GUESS, TRUTH, record
 
-import jaxkane.fit._suspicions as suspicions
+import jaxkane.fit._analysis.suspicions as suspicions
 from jaxkane.fit import (
     Fit,
     Free,
@@ -22,9 +22,9 @@ from jaxkane.fit import (
     multi_start,
     profile,
 )
-from jaxkane.fit._residual_tests import residual_test
-from jaxkane.fit._steps import settle
-from jaxkane.fit._suspicions import contrary_rates, doubled_trials, empty_columns
+from jaxkane.fit._analysis.suspicions import contrary_rates, doubled_trials, empty_columns
+from jaxkane.fit._optimize.steps import settle
+from jaxkane.fit._result.residual_tests import residual_test
 
 NAMES = ("mass", "stiffness", "damping")
 T = np.arange(0.0, 4.0, 0.1)

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from .._system import System
-from .._trajectory import Trajectory
+from .._description.system import System
+from .._simulation.trajectory import Trajectory
 from ._figures import bodies_and_points, figure_of
 from ._gif import write_gif
 from ._record import Record, record

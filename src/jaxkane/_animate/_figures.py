@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .._system import Motion
+from .._description.bodies import Motion
 from ..catalog import WhippleBicycle
 from ._record import Record
 from ._scene import Builder

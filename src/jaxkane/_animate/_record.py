@@ -10,11 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._fuse import fused
-from .._linear import stack
-from .._reads import version_of
-from .._system import Force, System, flatten_loads
-from .._trajectory import Trajectory
+from .._description.bodies import Force, flatten_loads
+from .._description.system import System
+from .._scalars.fuse import fused
+from .._scalars.linear import stack
+from .._scalars.reads import version_of
+from .._simulation.trajectory import Trajectory
 from ._sketch import Element, Figure, Sketch, rotation
 
 

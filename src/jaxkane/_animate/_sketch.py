@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._linear import stack
-from .._system import Body, Motion, System
-from .._vectors import Frame, Point, Vector
+from .._description.bodies import Body, Motion
+from .._description.system import System
+from .._description.vectors import Frame, Point, Vector
+from .._scalars.linear import stack
 
 # On a light page and on a dark one. What is no name of these is taken for a colour of the browser's.
 COLORS = {

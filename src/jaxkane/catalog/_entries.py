@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 
-from .._system import System
+from .._description.system import System
 from .aircraft import Aircraft, AircraftEulerParameters
 from .bar_with_piston import BarWithPiston
 from .bicycle import WhippleBicycle

@@ -7,9 +7,11 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 
 from .. import rotations
-from .._system import Body, Force, Motion, System, Torque, parameter
-from .._types import Component, Scalar
-from .._vectors import Frame, Point, inertial
+from .._description.bodies import Body, Force, Motion, Torque
+from .._description.parameters import parameter
+from .._description.system import System
+from .._description.vectors import Frame, Point, inertial
+from .._scalars.types import Component, Scalar
 
 
 class _Aircraft(System):

@@ -8,9 +8,11 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from .._system import Body, Motion, Point, System, Torque, parameter, parameter_info, weight
-from .._types import Scalar
-from .._vectors import inertial
+from .._description.bodies import Body, Motion, Torque, weight
+from .._description.parameters import parameter, parameter_info
+from .._description.system import System
+from .._description.vectors import Point, inertial
+from .._scalars.types import Scalar
 from ._bicycle_file import read_bicycle_file
 
 # Meijaard et al. (2007), Table 1: the benchmark bicycle.

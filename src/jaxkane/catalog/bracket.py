@@ -5,9 +5,11 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from .. import rotations
-from .._system import Body, Force, Motion, System, parameter, weight
-from .._types import Scalar
-from .._vectors import inertial
+from .._description.bodies import Body, Force, Motion, weight
+from .._description.parameters import parameter
+from .._description.system import System
+from .._description.vectors import inertial
+from .._scalars.types import Scalar
 
 
 class Bracket(System):

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from .._system import Body, Motion, System, Torque, parameter, weight
-from .._types import Scalar
-from .._vectors import inertial
+from .._description.bodies import Body, Motion, Torque, weight
+from .._description.parameters import parameter
+from .._description.system import System
+from .._description.vectors import inertial
+from .._scalars.types import Scalar
 
 
 class DoublePendulum(System):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from .. import rotations
-from .._system import Body, Force, Motion, System, Torque, parameter
-from .._types import Scalar
-from .._vectors import Point, inertial
+from .._description.bodies import Body, Force, Motion, Torque
+from .._description.parameters import parameter
+from .._description.system import System
+from .._description.vectors import Point, inertial
+from .._scalars.types import Scalar
 
 
 class RigidBody(System):

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from .._system import Body, Motion, System, Torque, parameter
-from .._types import Scalar
-from .._vectors import inertial
+from .._description.bodies import Body, Motion, Torque
+from .._description.parameters import parameter
+from .._description.system import System
+from .._description.vectors import inertial
+from .._scalars.types import Scalar
 
 
 def _shaft_and_bar(mass, length, q, q_dot):

@@ -10,16 +10,16 @@ import diffrax
 import numpy as np
 from jaxtyping import Array
 
-from .._system import System
-from .._trajectory import Trajectory
-from ._bfgs import bfgs
-from ._gradient_descent import gradient_descent
-from ._least_squares import gauss_newton, least_squares
-from ._names import Names
-from ._parameters import Prior
-from ._problem import Problem
-from ._result import Fit
-from ._trial import Trial
+from .._description.system import System
+from .._simulation.trajectory import Trajectory
+from ._data.trial import Trial
+from ._optimize.bfgs import bfgs
+from ._optimize.gradient_descent import gradient_descent
+from ._optimize.least_squares import gauss_newton, least_squares
+from ._problem.names import Names
+from ._problem.parameters import Prior
+from ._problem.problem import Problem
+from ._result.result import Fit
 
 METHODS = {
     "gradient_descent": gradient_descent,

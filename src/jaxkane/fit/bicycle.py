@@ -11,10 +11,10 @@ import numpy as np
 
 from ..catalog import WhippleBicycle
 from ..catalog._bicycle_file import read_bicycle_file
+from ._data.trial import Trial
 from ._fit import fit
-from ._parameters import Delay, Free, Gain, Inertia, Prior, parameters_of
-from ._result import Fit
-from ._trial import Trial
+from ._problem.parameters import Delay, Free, Gain, Inertia, Prior, parameters_of
+from ._result.result import Fit
 
 WHEEL = "rear_wheel_rate"
 SIGMA = {"roll": 0.01, "steer": 0.02, "roll_rate": 0.1, "steer_rate": 0.2}

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .._audit import Audit
+from .._simulation.audit import Audit
 from ._axes import panels
 
 

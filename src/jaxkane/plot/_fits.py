@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from .._lookup import hint, refuse_unknown
-from .._units import in_degrees, refuse_no_angle, unit_of, units_of
+from .._common.lookup import hint, refuse_unknown
+from .._description.units import in_degrees, refuse_no_angle, unit_of, units_of
 from ._axes import SOFT, finish, panels
 
 _TRIALS = 3

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._lookup import refuse_unknown
+from .._common.lookup import refuse_unknown
 from ._axes import SOFT
 
 

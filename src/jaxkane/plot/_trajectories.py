@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from .._trajectory import Status, Trajectory
-from .._units import in_degrees, refuse_no_angle, unit_of
+from .._description.units import in_degrees, refuse_no_angle, unit_of
+from .._simulation.trajectory import Status, Trajectory
 from ._axes import SOFT, finish, panels
 
 _MARKED = 200  # more members of a batch than this are drawn without a mark where they ended

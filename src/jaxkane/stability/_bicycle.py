@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._equations import equations_of_motion
-from .._system import State
-from .._types import Component
+from .._description.system import State
+from .._method.equations import equations_of_motion
+from .._scalars.types import Component
 from ..catalog import WhippleBicycle
 from ._solve import jacobian
 

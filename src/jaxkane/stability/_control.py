@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg
 import scipy.signal
 
-from .._lookup import hint
+from .._common.lookup import hint
 from ._linearize import LinearModel
 
 

@@ -12,11 +12,11 @@ import numpy as np
 import optimistix as optx
 from jaxtyping import Array, Float, Int
 
-from .._check import is_concrete
-from .._lookup import not_there
-from .._nan import nan_where
-from .._reads import compiled
-from .._system import System
+from .._common.lookup import not_there
+from .._description.system import System
+from .._method.checks import is_concrete
+from .._scalars.nan import nan_where
+from .._scalars.reads import compiled
 from ._eig import eig
 from ._eigenvalues import Eigenvalues, MotionAt, eigenvalues, family_of, matrix
 

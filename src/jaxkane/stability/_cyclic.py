@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._check import configuration_residual, is_concrete
-from .._jax_internals import concretely
-from .._rates import state_rates
-from .._reads import on_forget, version_of
-from .._system import System
+from .._description.system import System
+from .._method.checks import configuration_residual, is_concrete
+from .._method.rates import state_rates
+from .._scalars.jax_internals import concretely
+from .._scalars.reads import on_forget, version_of
 
 _FOUND: dict[tuple, tuple[str, ...]] = {}
 _TRIALS = 3  # at which the rates are finite

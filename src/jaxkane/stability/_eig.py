@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
-from .. import _native as native
-from .._nan import _spread
+from .._scalars import native
+from .._scalars.nan import _spread
 from ._qr import CHUNK, SIZES, qr_eigenvalues
 
 MOST_CONDITION = 1e6

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 from scipy.optimize import linear_sum_assignment
 
-from .._check import is_concrete
-from .._lookup import not_there
-from .._reads import compiled
-from .._system import State, System
+from .._common.lookup import not_there
+from .._description.system import State, System
+from .._method.checks import is_concrete
+from .._scalars.reads import compiled
 from ..catalog import WhippleBicycle
 from ._bicycle import LATERAL, MODES, mode_order, straight_ahead
 from ._eig import MOST_CONDITION, Eig, eig

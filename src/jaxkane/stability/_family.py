@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._lookup import by_name, hint
-from .._reads import compiled
-from .._system import System
+from .._common.lookup import by_name, hint
+from .._description.system import System
+from .._scalars.reads import compiled
 from ._solve import jacobian
 from ._steady import Problem, SteadyMotion, as_motion
 

@@ -11,17 +11,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._check import check_system, configuration_residual, is_concrete
-from .._equations import dependent_speeds
-from .._fuse import fused
-from .._kane import as_array, checked_inputs, refuse_incomplete
-from .._linear import as_vector, solve, stack
-from .._lookup import hint, refuse_unknown
-from .._nan import nan_where
-from .._rates import state_rates
-from .._reads import compiled
-from .._system import State, System, Values
-from .._types import Component
+from .._common.lookup import hint, refuse_unknown
+from .._description.system import State, System
+from .._description.values import Values
+from .._method.checks import check_system, configuration_residual, is_concrete
+from .._method.equations import dependent_speeds
+from .._method.kane import as_array, checked_inputs, refuse_incomplete
+from .._method.rates import state_rates
+from .._scalars.fuse import fused
+from .._scalars.linear import as_vector, solve, stack
+from .._scalars.nan import nan_where
+from .._scalars.reads import compiled
+from .._scalars.types import Component
 from ._cyclic import cyclic_coordinates
 from ._eig import Eig, eig, eigvals
 from ._solve import jacobian

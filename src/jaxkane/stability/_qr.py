@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
-from .._fuse import fused
+from .._scalars.fuse import fused
 
 SIZES = range(2, 7)  # of matrices; larger ones are better off with LAPACK
 CHUNK = 256  # matrices at once: one that is slow holds up few others

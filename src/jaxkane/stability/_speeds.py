@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from .._system import System, Values
+from .._description.system import System
+from .._description.values import Values
 
 
 class _Respeeded(System):

@@ -10,15 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._check import check_system, configuration_residual, is_concrete
-from .._equations import dependent_speeds
-from .._kane import as_array, checked_inputs
-from .._lookup import by_name, hint
-from .._nan import nan_where
-from .._rates import state_rates
-from .._reads import compiled
-from .._system import State, System
-from .._types import Component
+from .._common.lookup import by_name, hint
+from .._description.system import State, System
+from .._method.checks import check_system, configuration_residual, is_concrete
+from .._method.equations import dependent_speeds
+from .._method.kane import as_array, checked_inputs
+from .._method.rates import state_rates
+from .._scalars.nan import nan_where
+from .._scalars.reads import compiled
+from .._scalars.types import Component
 from ._cyclic import cyclic_coordinates
 from ._solve import jacobian, root
 

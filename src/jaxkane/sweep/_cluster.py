@@ -15,8 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .. import _native
-from .._reads import on_forget, version_of
+from .._scalars import native as kernels
+from .._scalars.reads import on_forget, version_of
 from ._fingerprint import traced, versions
 from ._solve import Job, Part
 
@@ -45,7 +45,7 @@ def on_cluster(
     common = cloudpickle.dumps((sent, like))
     program = _program(jax.tree.map(_as_jax, sent), like)
     flags = {name: getattr(jax.config, name) for name in _FLAGS}
-    kernels = _native.is_on()
+    with_kernels = kernels.is_on()
     left, tasks = iter(starts), {}
     finished = as_completed()
 
@@ -56,7 +56,7 @@ def on_cluster(
             if start is None:
                 return
             own = cloudpickle.dumps(members_at(start))
-            task = client.submit(solve_elsewhere, common, own, size, flags, kernels, program, pure=False)
+            task = client.submit(solve_elsewhere, common, own, size, flags, with_kernels, program, pure=False)
             tasks[task.key] = start
             finished.add(task)
 
@@ -84,10 +84,10 @@ def solve_elsewhere(
     for name, value in flags.items():
         if getattr(jax.config, name) != value:
             jax.config.update(name, value)
-    _native.use(native)
-    if native and not _native.is_on():
+    kernels.use(native)
+    if native and not kernels.is_on():
         raise RuntimeError(
-            f"This worker has no native kernels, and would round differently: {_native.why_not()}. Or call "
+            f"This worker has no native kernels, and would round differently: {kernels.why_not()}. Or call "
             "jaxkane.configure(native=False) where the sweep is started."
         )
     job, _ = _received(common)

@@ -16,8 +16,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._digest import differences, digest
-from .._whole_file import SCRATCH, write_whole
+from .._common.digest import differences, digest
+from .._common.whole_file import SCRATCH, write_whole
 
 MANIFEST = "sweep.json"
 

@@ -9,7 +9,7 @@ from typing import Any
 import equinox as eqx
 import jax
 
-from .._digest import digest
+from .._common.digest import digest
 from ._solve import Job, Part
 
 

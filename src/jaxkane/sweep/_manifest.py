@@ -9,10 +9,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._digest import digest
-from .._native import is_on
-from .._settings import Settings
-from .._system import State, System
+from .._common.digest import digest
+from .._description.system import State, System
+from .._scalars.native import is_on
+from .._simulation.settings import Settings
 from ._fingerprint import versions
 from ._table import Table
 

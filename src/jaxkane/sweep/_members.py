@@ -11,13 +11,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._assembly import assemble
-from .._check import check_system, is_concrete
-from .._lookup import not_there
-from .._settings import as_state, checked_state
-from .._signals import Samples, as_signals
-from .._system import State, System, parameter_info
-from .._types import Inputs
+from .._common.lookup import not_there
+from .._description.parameters import parameter_info
+from .._description.system import State, System
+from .._method.assembly import assemble
+from .._method.checks import check_system, is_concrete
+from .._scalars.types import Inputs
+from .._simulation.settings import as_state, checked_state
+from .._simulation.signals import Samples, as_signals
 from ._table import Table
 
 Tree = Any

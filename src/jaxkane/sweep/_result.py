@@ -10,8 +10,8 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from .._lookup import not_there
-from .._trajectory import Status, Trajectory, reason
+from .._common.lookup import not_there
+from .._simulation.trajectory import Status, Trajectory, reason
 from ._solve import Part
 from ._table import Table
 

@@ -17,12 +17,12 @@ import numpy as np
 from jax.sharding import AxisType, Mesh
 from jax.sharding import PartitionSpec as P
 
-from .._check import with_possible_bodies
-from .._reads import compiled
-from .._ride import solve
-from .._settings import Settings
-from .._system import State
-from .._trajectory import Trajectory
+from .._description.system import State
+from .._method.checks import with_possible_bodies
+from .._scalars.reads import compiled
+from .._simulation.ride import solve
+from .._simulation.settings import Settings
+from .._simulation.trajectory import Trajectory
 from ._members import start_of, system_and_signals
 
 GROUP = 32

@@ -13,11 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from .._check import is_concrete
-from .._settings import as_state, checked_times, settings_for
-from .._system import State, System
-from .._trajectory import Status, Trajectory
-from .._types import Inputs
+from .._description.system import State, System
+from .._method.checks import is_concrete
+from .._scalars.types import Inputs
+from .._simulation.settings import as_state, checked_times, settings_for
+from .._simulation.trajectory import Status, Trajectory
 from ._cluster import on_cluster
 from ._files import Folder
 from ._fingerprint import traced

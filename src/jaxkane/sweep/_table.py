@@ -8,7 +8,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from .._lookup import not_there
+from .._common.lookup import not_there
 
 
 class Table(eqx.Module):

@@ -1,0 +1,1 @@
+"""Names, digests and files. Knows nothing of JAX and nothing of mechanics."""

@@ -1,0 +1,1 @@
+"""How a mechanism is described: vectors, frames, points, bodies, loads, the system. Differentiates nothing."""

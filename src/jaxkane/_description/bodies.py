@@ -1,0 +1,270 @@
+"""Bodies, forces, torques, and the motion that holds them. Describes; never differentiates or solves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from .._common.lookup import not_there
+from .._scalars.components import add, component, dot, is_zero, mul, sub
+from .._scalars.types import Component, Triple
+from .vectors import Frame, Point, Vector
+
+UNNAMED = "body"  # the name of bodies that were not given one
+
+
+class Body:
+    """A rigid body: mass, central inertia, mass centre and frame.
+
+    **Arguments:**
+
+    - `mass` [kg].
+    - `inertia` [kg m^2] about the mass centre, resolved in `frame`: three principal moments, or a (3, 3) matrix
+        whose off-diagonal entries are matrix entries (minus the integrals of xy). 0.0 for a particle.
+    - `center`: the mass centre, a Point.
+    - `frame`: a Frame in which the inertia does not change. A particle needs none, anything else does.
+    - `angular_velocity`: a Vector, by default the frame's. An axisymmetric body (a wheel, a rotor) may stand in a
+        frame that does not spin with it, with its own angular velocity: the textbook's Examples 5 and 7.
+    - `name`: for error messages, forces, pictures and `motion["name"]`.
+    - `about`: a Point that is fixed in `frame`, about which `inertia` is given instead: it is taken to the mass centre
+        by the parallel axis theorem, I - m (r.r 1 - r r).
+
+    **Raises:** `ValueError` for an inertia of another shape, and for one without a frame to turn with; `TypeError` for
+    what is no point, frame or vector.
+    """
+
+    __slots__ = ("about", "angular_velocity", "center", "frame", "inertia", "is_particle", "mass", "name")
+
+    def __init__(
+        self,
+        mass: Component,
+        inertia: Any,
+        center: Point,
+        frame: Frame | None = None,
+        angular_velocity: Vector | None = None,
+        name: str = UNNAMED,
+        about: Point | None = None,
+    ):
+        if not isinstance(center, Point):
+            raise TypeError(
+                f"Body(mass, inertia, center, ...): the mass centre of {name!r} is a Point, got {center!r}."
+            )
+        if not isinstance(frame, (Frame, type(None))):
+            raise TypeError(f"Body(mass, inertia, center, frame): the frame of {name!r} is a Frame, got {frame!r}.")
+        if not isinstance(angular_velocity, (Vector, type(None))):
+            raise TypeError(f"Body: the angular velocity of {name!r} is a Vector, got {angular_velocity!r}.")
+        if not isinstance(about, (Point, type(None))):
+            raise TypeError(f"Body(..., about=P): the inertia of {name!r} is about a Point, got {about!r}.")
+        self.mass = component(mass)
+        self.inertia = _inertia(inertia, name)
+        self.is_particle = frame is None and angular_velocity is None
+        has_inertia = about is not None or not all(is_zero(x) for row in self.inertia for x in row)
+        if self.is_particle and has_inertia:
+            raise ValueError(
+                f"Body(mass, inertia, center): {name!r} has an inertia, but no frame to turn with. Give its frame, "
+                "Body(mass, inertia, center, frame); for a particle write 0.0 for the inertia."
+            )
+        self.center = center
+        self.frame = center.velocity.frame.root if frame is None else frame
+        self.angular_velocity = self.frame.angular_velocity if angular_velocity is None else angular_velocity
+        self.name = name
+        self.about = about
+        if about is not None:
+            self.inertia = _central(self.inertia, self.mass, center.position_from(about).components_in(self.frame))
+
+    def __repr__(self) -> str:
+        return f"Body({self.name})"
+
+
+def _inertia(given: Any, name: str) -> tuple[Triple, Triple, Triple]:
+    inertia: Any = (0.0, 0.0, 0.0) if isinstance(given, (int, float)) and given == 0 else given
+    has_length = not hasattr(inertia, "shape") and isinstance(inertia, Sequence)
+    shape = (len(inertia), *_inner(inertia)) if has_length else np.shape(inertia)
+    if shape == (3,):
+        a, b, c = (component(x) for x in inertia)
+        return ((a, 0.0, 0.0), (0.0, b, 0.0), (0.0, 0.0, c))
+    if shape == (3, 3):
+        return tuple(tuple(component(x) for x in row) for row in inertia)  # type: ignore[return-value]
+    raise ValueError(
+        f"{name}: the inertia is three principal moments or a (3, 3) matrix about the mass centre, got shape {shape}."
+    )
+
+
+def _central(I: tuple[Triple, Triple, Triple], m: Component, r: Triple) -> tuple[Triple, Triple, Triple]:
+    """The inertia about the mass centre, which is at `r` from the point about which it is I: I - m (r.r 1 - r r)."""
+    squares = [mul(x, x) for x in r]
+    rows = []
+    for i in range(3):
+        across = add(squares[(i + 1) % 3], squares[(i + 2) % 3])
+        moved = [across if i == j else mul(-1.0, mul(r[i], r[j])) for j in range(3)]
+        rows.append(tuple(sub(I[i][j], mul(m, moved[j])) for j in range(3)))
+    return tuple(rows)  # type: ignore[return-value]
+
+
+def _inner(rows: Sequence[Any]) -> tuple[int, ...]:
+    inner = {len(row) for row in rows if isinstance(row, (tuple, list)) or np.ndim(row) == 1}
+    return tuple(inner)
+
+
+class Force:
+    """A force [N] that acts at a point: a Point, or the mass centre of a Body."""
+
+    __slots__ = ("point", "vector")
+
+    def __init__(self, vector: Vector, point: Point | Body):
+        self.vector = _checked(vector, "Force")
+        self.point = point.center if isinstance(point, Body) else point
+        if not isinstance(self.point, Point):
+            raise TypeError(f"Force(vector, point): the second argument is a Point or a Body, got {point!r}.")
+
+    @property
+    def velocity(self) -> Vector:
+        """The velocity whose partial velocities the force is multiplied by."""
+        return self.point.velocity
+
+
+class Torque:
+    """A torque [N m] that acts on a body or on a frame; its reaction, if one is meant, on another.
+
+    Torque(T * C.z, fork, reaction_on=frame)
+
+    **Raises:** `ValueError` for a particle, which has no frame that could turn.
+    """
+
+    __slots__ = ("vector", "velocity")
+
+    def __init__(self, vector: Vector, on: Frame | Body, reaction_on: Frame | Body | None = None):
+        self.vector = _checked(vector, "Torque")
+        for part in (on, reaction_on):
+            if not isinstance(part, (Frame, Body, type(None))):
+                raise TypeError(f"Torque(vector, on): acts on a Body or a Frame, got {part!r}.")
+            if isinstance(part, Body) and part.is_particle:
+                raise ValueError(
+                    f"Torque(vector, on): {part.name!r} is a particle, which a torque does not move. Let it act on the "
+                    "frame that turns, or give the body that frame: Body(mass, inertia, center, frame)."
+                )
+        self.velocity = on.angular_velocity
+        if reaction_on is not None:
+            self.velocity = on.angular_velocity - reaction_on.angular_velocity
+
+
+def _checked(vector: Any, what: str) -> Vector:
+    if not isinstance(vector, Vector):
+        raise TypeError(f"{what}(vector, ...): the first argument is a Vector such as 3.0 * N.x, got {vector!r}.")
+    return vector
+
+
+Load = Force | Torque
+
+
+def weight(motion: Motion, gravity: Vector) -> tuple[Force, ...]:
+    """The weight of every body of a motion; `gravity` [m/s^2] is a Vector such as `9.81 * N.z`."""
+    return tuple(Force(body.mass * gravity, body.center) for body in motion.bodies)
+
+
+def flatten_loads(loads: Any, method: str = "`loads`") -> tuple[Load, ...]:
+    """Loads out of nested tuples and lists."""
+    if isinstance(loads, (Force, Torque)):
+        return (loads,)
+    if isinstance(loads, Iterable) and not isinstance(loads, (str, Mapping)):
+        return tuple(load for item in loads for load in flatten_loads(item, method))
+    hint = " Does it end without a `return`?" if loads is None else ""
+    raise TypeError(f"{method} returns Forces and Torques, got {loads!r}.{hint}")
+
+
+def flatten_residuals(given: Any, what: str) -> tuple[Component, ...]:
+    """Residuals out of numbers, arrays, Vectors (three components each) and nested tuples and lists of these."""
+    if isinstance(given, Vector):
+        return given.components
+    if isinstance(given, (jax.Array, np.ndarray)) and given.ndim:
+        return tuple(component(x) for x in given.reshape(-1))
+    if isinstance(given, Iterable) and not isinstance(given, (str, Mapping, jax.Array, np.ndarray)):
+        return tuple(x for item in given for x in flatten_residuals(item, what))
+    try:
+        return (component(given),)
+    except TypeError:
+        hint = " Does the method end without a `return`?" if given is None else ""
+        raise TypeError(f"{what} are numbers and Vectors in a list, got {given!r}.{hint}") from None
+
+
+class Motion:
+    """What `System.motion` returns: bodies, velocity residuals, and the frames and points that others ask for.
+
+    **Arguments:**
+
+    - `bodies`: every Body.
+    - `constraints`: velocity residuals [m/s or rad/s] that are zero in the motion and affine in the speeds; a Vector
+        counts as its three components.
+    - `points`, `frames`: those that `loads`, pictures or a user need, by name: `motion["P"]`.
+
+    **Raises:** `ValueError` where one name stands for two of these; `TypeError` for what is no body, point or frame.
+    """
+
+    __slots__ = ("N", "_named", "bodies", "constraints", "frames", "points", "vanishing")
+
+    def __init__(
+        self,
+        bodies: Iterable[Body],
+        constraints: Iterable[Component | Vector] = (),
+        *,
+        points: Mapping[str, Point] | None = None,
+        frames: Mapping[str, Frame] | None = None,
+    ):
+        self.bodies: tuple[Body, ...] = (bodies,) if isinstance(bodies, Body) else tuple(bodies)
+        if not self.bodies:
+            raise ValueError("A Motion needs at least one Body.")
+        given = (constraints,) if isinstance(constraints, (Vector, float, int, jax.Array)) else tuple(constraints)
+        self.vanishing = given  # the residuals as they were given
+        self.constraints = flatten_residuals(given, "Motion(bodies, constraints): the velocity residuals")
+        self.points = dict(points or {})
+        self.frames = dict(frames or {})
+        self._named = self._by_name()
+        self.N: Frame = self.bodies[0].center.velocity.frame.root
+        for name, part in (*self.points.items(), *self.frames.items()):
+            part.name = name
+
+    def _by_name(self) -> dict[str, Body | Point | Frame]:
+        named: dict[str, Any] = {}
+        kinds = (
+            (Body, [(getattr(body, "name", None), body) for body in self.bodies]),
+            (Point, self.points.items()),
+            (Frame, self.frames.items()),
+        )
+        for kind, parts in kinds:
+            for name, part in parts:
+                if not isinstance(part, kind):
+                    raise TypeError(f"Motion: this is no {kind.__name__}, but stands among these: {part!r}.")
+                if not isinstance(name, str):
+                    raise TypeError(f"Motion: the name of {part!r} must be a string, got {name!r}.")
+                if name in named and not (name == UNNAMED and kind is Body):
+                    raise ValueError(
+                        f"Motion: two parts have the name {name!r}, {_told(named[name])} and {_told(part)}: "
+                        f"motion[{name!r}] could be either. Give them different names."
+                    )
+                named[name] = part
+        return named
+
+    def __getitem__(self, name: str) -> Any:
+        if name not in self._named:
+            raise not_there(name, self._named, "this motion, among its bodies, points and frames")
+        if name == UNNAMED and sum(body.name == UNNAMED for body in self.bodies) > 1:
+            raise KeyError("Several bodies of this motion have no name of their own: Body(..., name=...).")
+        return self._named[name]
+
+
+def _told(part: Body | Point | Frame) -> str:
+    return f"a {type(part).__name__.lower()}"
+
+
+def kinetic_energy_of(motion: Motion) -> Component:
+    """1/2 sum of m v.v + omega . I . omega over the bodies [J]."""
+    total: Component = 0.0
+    for body in motion.bodies:
+        v = body.center.velocity.components
+        w = body.angular_velocity.components_in(body.frame)
+        H = tuple(dot(row, w) for row in body.inertia)
+        total = total + 0.5 * (body.mass * dot(v, v) + dot(w, H))
+    return total

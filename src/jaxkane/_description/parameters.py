@@ -1,0 +1,103 @@
+"""Physical parameters: float arrays from birth, in SI units and radians. Knows no mechanics."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+if TYPE_CHECKING:
+    from .system import System
+
+
+def parameter(
+    default: Any = dataclasses.MISSING, *, positive: bool = False, shape: tuple[int, ...] | None = None
+) -> Any:
+    """A physical parameter of a `System`: a float array from birth, in SI units and radians.
+
+        mass: Scalar = jk.parameter(positive=True)  # [kg]
+        moments: Array = jk.parameter([0.1, 0.2, 0.2], positive=True)  # [kg m^2]
+
+    **Arguments:**
+
+    - `default`: a number, or an array or nested lists of numbers; without one the parameter must be given.
+    - `positive`: refuse zero and negative values, and let a fit move it on a logarithmic scale.
+    - `shape`: of the array, by default that of `default`, or `()` for a number. A value with leading axes more is a
+        batch.
+    """
+    if default is dataclasses.MISSING:
+        return eqx.field(converter=to_float, metadata={"jaxkane": ParameterInfo(positive, shape or ())})
+    # A copy, as NumPy: a list that is changed later must not change the default, and JAX must not start yet.
+    default = default if isinstance(default, jax.Array) or np.ndim(default) == 0 else np.array(default)
+    metadata = {"jaxkane": ParameterInfo(positive, np.shape(default) if shape is None else shape)}
+    return eqx.field(converter=to_float, metadata=metadata, default_factory=lambda: default)
+
+
+@dataclasses.dataclass(frozen=True)
+class ParameterInfo:
+    """What `parameter` was told: whether the value must be positive, and the shape of one value."""
+
+    positive: bool
+    shape: tuple[int, ...]
+
+
+def parameter_info(system: System | type[System]) -> dict[str, ParameterInfo]:
+    """Name and `ParameterInfo` of every parameter of a system, in the order of their declaration."""
+    fields = dataclasses.fields(system)  # type: ignore[arg-type]
+    return {f.name: f.metadata["jaxkane"] for f in fields if "jaxkane" in f.metadata}
+
+
+def to_float(value: Any) -> Any:
+    # What is no number is left alone here: `System.__check_init__` refuses it by its name.
+    if isinstance(value, (jax.Array, np.ndarray)) and jnp.issubdtype(value.dtype, jnp.inexact):
+        return jnp.asarray(value)
+    try:
+        array = np.asarray(value) if not isinstance(value, jax.Array) else value
+    except (TypeError, ValueError):
+        numbers = jax.tree.leaves(value) if isinstance(value, (list, tuple)) else []
+        traced = [x for x in numbers if isinstance(x, Tracer)]
+        if not traced or any(isinstance(x, str) for x in numbers):
+            return value
+        return jnp.asarray(value, dtype=jnp.result_type(float, *traced))
+    if array.dtype.kind in "iuf":
+        return jnp.asarray(array, dtype=float)
+    return value
+
+
+def check_fields(system: System) -> None:
+    """Refuse numbers that a description counts with, names and switches as fields that JAX would trace."""
+    for path, value in jax.tree_util.tree_leaves_with_path(system):
+        name = path[0].name
+        if isinstance(value, (bool, int, str)) and name not in parameter_info(system):
+            whole = getattr(system, name)
+            kind = type(whole).__name__
+            raise TypeError(
+                f"{type(system).__name__}.{name} = {whole!r} would be traced as an array, and a description could not "
+                f"count with it. What belongs to the description, as a number of links: `{name}: {kind} = "
+                f"equinox.field(static=True)`. A physical parameter: `{name}: jk.Scalar = jk.parameter()`."
+            )
+
+
+def check_parameter(label: str, value: Any, info: ParameterInfo) -> None:
+    """Refuse what is no finite float; a batch is left to the status of its members."""
+    if isinstance(value, Tracer):
+        return
+    if not (isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jnp.floating)):
+        raise TypeError(f"{label} must be a real number or a float array, got {value!r}.")
+    n = value.ndim - len(info.shape)
+    if n < 0 or value.shape[n:] != info.shape:
+        raise ValueError(
+            f"{label} must have the shape {info.shape}, or leading axes more for a batch; got {value.shape}."
+        )
+    if n > 0:
+        return
+    array = np.asarray(value)
+    if not np.all(np.isfinite(array)):
+        raise ValueError(f"{label} = {array} is not finite.")
+    if info.positive and not np.all(array > 0):
+        raise ValueError(f"{label} = {array} must be positive.")

@@ -1,0 +1,1 @@
+"""Kane's equations: the method, its public functions, assembly, checks. Knows no mechanism and no integrator."""

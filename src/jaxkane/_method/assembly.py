@@ -1,0 +1,252 @@
+"""Consistent coordinates and speeds. Knows constraints and Newton's method; knows no mechanism."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax.core import Tracer
+
+from .._common.lookup import refuse_unknown
+from .._description.system import State, System
+from .._scalars.nan import nan_where
+from .._scalars.reads import compiled
+from .._scalars.types import Component
+from .checks import check_system, configuration_residual, is_concrete
+from .kane import Instant, as_array
+
+
+def assemble(
+    system: System,
+    q: Any,
+    u: Any = None,
+    t: Component = 0.0,
+    *,
+    free: Sequence[str] | None = None,
+) -> State:
+    """A state that satisfies the constraints: coordinates found by Newton's method, speeds checked.
+
+        h(t, q) = 0
+
+    **Arguments:**
+
+    - `q` (n_q,), or a dict by name. What is held, and a first guess of what is moved. Coordinates left out of a dict
+        start at zero; of four Euler parameters the last starts at one, so that those left out are no rotation.
+    - `u` (n_u,), or a dict by name in which speeds left out are zero: the independent speeds. Dependent speeds may be
+        given too, and are then compared with what the residuals say.
+    - `t`: time [s].
+    - `free`: names of the coordinates that are moved. By default `system.dependent_coordinates`; of a system that
+        names none, those left out of the dict `q`, or all of an array. Where more are moved than there are constraints,
+        the nearest along the constraints' gradients is taken. All others are held.
+
+    **Returns:** a `State`, differentiable (twice, both modes) in everything by the implicit function theorem.
+
+    **Raises:** `ValueError` where no such configuration is found, or given dependent speeds contradict the residuals.
+    Under a trace the coordinates, and all their derivatives, become NaN instead.
+    """
+    name = type(system).__name__
+    plan = _plan(system, q, free)
+    q0 = as_array(plan.guess | dict(q) if isinstance(q, Mapping) else q, system.coordinates, f"{name}: q")
+    given: dict[str, Any] = {}
+    if isinstance(u, Mapping):
+        given = {speed: u[speed] for speed in system.dependent_speeds if speed in u}
+        u = {speed: value for speed, value in u.items() if speed not in given}
+    u0 = as_array({} if u is None else u, system.speeds, f"{name}: u").astype(q0.dtype)
+    if is_concrete(q0, u0) and not np.all(np.isfinite(np.concatenate([q0, u0]))):
+        names = (*system.coordinates, *system.speeds)
+        bad = [n for n, x in zip(names, np.concatenate([q0, u0]), strict=True) if not np.isfinite(x)]
+        raise ValueError(f"{name}: {', '.join(bad)} is not finite.")
+    q0 = _solve_configuration(system, q0, t, plan)
+    if is_concrete(system, q0, u0, t):
+        check_system(system, t, q0)
+        if given:
+            u_dep = dict(zip(system.dependent_speeds, Instant(system, t, q0, u0).u_dep, strict=True))
+            _check_dependent_speeds(name, given, u_dep)
+    return State(q0, u0)
+
+
+class _Plan(NamedTuple):
+    """Which coordinates are moved, which are `named`, and where some that were not named start.
+
+    `lenient`: a constraint that does not read what is moved is no equation: it only has to be met.
+    """
+
+    moved: tuple[str, ...]
+    named: tuple[str, ...]
+    guess: dict[str, float]
+    lenient: bool
+
+
+def _plan(system: System, q: Any, free: Sequence[str] | None) -> _Plan:
+    names = system.coordinates
+    named = tuple(q) if isinstance(q, Mapping) else tuple(names)
+    quaternions = _euler_parameters(system) if isinstance(q, Mapping) else []
+    guess = {names[four[3]]: 1.0 for four in quaternions if names[four[3]] not in named}
+    if free is not None:
+        free = (free,) if isinstance(free, str) else tuple(free)
+        refuse_unknown(free, names, f"{type(system).__name__} has no coordinate", "it has")
+        return _Plan(tuple(c for c in names if c in free), named, guess, lenient=True)
+    if system.dependent_coordinates:
+        return _Plan(tuple(system.dependent_coordinates), named, guess, lenient=False)
+    if not isinstance(q, Mapping):
+        return _Plan(tuple(names), named, guess, lenient=False)
+    # Beside a scalar that is named, the axis of a rotation cannot be found: it is zero, or named too.
+    still = {names[i] for four in quaternions if names[four[3]] in named for i in four}
+    return _Plan(tuple(c for c in names if c not in named and c not in still), named, guess, lenient=True)
+
+
+_EULER_PARAMETERS: dict[Any, list[tuple[int, ...]]] = {}
+
+
+def _euler_parameters(system: System) -> list[tuple[int, ...]]:
+    """Places of every four coordinates, one after the other, of which a constraint says that their norm is one."""
+    structure = jax.tree.structure(system)
+    if structure in _EULER_PARAMETERS:
+        return _EULER_PARAMETERS[structure]
+    probe = np.random.default_rng(0).uniform(0.2, 0.9, len(system.coordinates))
+    try:
+        # Exact numbers: what does not depend on parameters is known even under a trace.
+        residuals = system.configuration_constraints(0.0, probe.tolist())
+    except (AttributeError, TypeError):
+        residuals = ()  # a description that can be read with arrays only
+    values = [abs(float(h)) for h in residuals if not isinstance(h, Tracer)]
+    found = []
+    for i in range(len(probe) - 3):
+        square = float(np.sum(probe[i : i + 4] ** 2))
+        if any(abs(h - x) < 1e-5 for h in values for x in (abs(square - 1.0), abs(square**0.5 - 1.0))):
+            found.append((i, i + 1, i + 2, i + 3))
+    if len(values) == len(residuals):
+        _EULER_PARAMETERS[structure] = found
+    return found
+
+
+def _solve_configuration(system: System, q0, t, plan: _Plan):
+    t = jnp.asarray(t, dtype=q0.dtype)
+    n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q0).shape[0]
+    if n_h == 0:
+        return q0
+    if len(plan.moved) < n_h and not plan.lenient:
+        raise ValueError(
+            f"{type(system).__name__}: {n_h} configuration constraints cannot be met by moving {len(plan.moved)} "
+            f"coordinates ({', '.join(plan.moved)})."
+        )
+    places = tuple(system.coordinates.index(c) for c in plan.moved)
+    found = _newton(system, q0, t, places, plan.lenient)
+    if is_concrete(system, found.q, t) and not bool(found.good):
+        raise ValueError(_why_not(system, q0, plan, found))
+    return nan_where(~found.good, found.q, (system, q0, t))
+
+
+def _met(residuals):
+    """Which constraints are met."""
+    return jnp.abs(residuals) <= float(jnp.finfo(residuals.dtype).eps) ** 0.6
+
+
+def _flat(slopes):
+    """Which slopes are no more than rounding."""
+    return jnp.abs(slopes) <= float(jnp.finfo(slopes.dtype).eps) ** 0.9
+
+
+def _slopes(system: System, t, q, places: np.ndarray):
+    """How the constraints change with what is moved (h, moved)."""
+    return jax.jacfwd(lambda dq: configuration_residual(system, t, q.at[places].add(dq)))(
+        jnp.zeros(len(places), q.dtype)
+    )
+
+
+class _Found(NamedTuple):
+    q: Any
+    good: Any  # the constraints are met, and determine what was moved
+    remainder: Any  # largest residual
+    slope: Any  # smallest singular value of the residuals' derivatives along what was moved
+    steps: Any
+
+
+@compiled
+def _newton(system: System, q0, t, where: tuple[int, ...], lenient: bool) -> _Found:
+    places = np.array(where, int)
+    # What is not finite must not enter the linear solver, which would raise for all members of a batch.
+    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((system, q0))]))
+    system, q0 = jax.tree.map(lambda x: jnp.where(finite, x, jnp.ones_like(x)), (system, q0))
+    start, settled = _start(system, q0, t, places)
+    settled = settled & lenient
+    n_h = len(settled)
+    if len(places) == n_h and not lenient:
+        directions = jnp.eye(n_h, dtype=q0.dtype)
+    else:  # (h, moved): along the constraints' gradients only
+        directions = _slopes(system, t, start, places)
+
+    def residual(amount, args):
+        system, t, start, directions = args
+        h = configuration_residual(system, t, start.at[places].add(amount @ directions))
+        return jnp.where(settled, amount, h)
+
+    eps = float(jnp.finfo(q0.dtype).eps)
+    newton = optx.Newton(rtol=8 * eps, atol=8 * eps)
+    args = (system, t, start, directions)
+    solution = optx.root_find(residual, newton, jnp.zeros(n_h, q0.dtype), args, max_steps=64, throw=False)
+    q = start.at[places].add(solution.value @ directions)
+    h = configuration_residual(system, t, q)
+    derivatives = jax.jacfwd(residual)(jax.lax.stop_gradient(solution.value), jax.lax.stop_gradient(args))
+    slope = jnp.linalg.svd(derivatives, compute_uv=False)[-1]
+    good = finite & jnp.all(_met(h)) & (slope > eps**0.6)
+    return _Found(q, good, jnp.max(jnp.abs(h)), slope, solution.stats["num_steps"])
+
+
+def _start(system: System, q0, t, places: np.ndarray):
+    """The first guess (n_q,), and which constraints (h,) are met already and read nothing of what is moved.
+
+    Where the slopes of the constraints depend on each other and the residuals contradict that, as for two rods in
+    line, Newton's method knows no direction: then it starts beside the guess, in what these constraints read.
+    """
+    q, system = jax.lax.stop_gradient((q0, system))
+    elsewhere = q + np.random.default_rng(0).uniform(0.3, 0.7, q.shape).astype(q.dtype)  # no special place
+    here, there = jax.lax.map(lambda q: _slopes(system, t, q, places), jnp.stack([q, elsewhere]))
+    h, reads = configuration_residual(system, t, q), ~_flat(there)  # (h,) (h,moved)
+    U, s, _ = jnp.linalg.svd(here, full_matrices=True)
+    unmoved = _flat(jnp.concatenate([s, jnp.zeros(len(h), s.dtype)])[: len(h)])
+    left = U @ jnp.where(unmoved, U.T @ h, 0.0)  # of the residuals, what no direction takes away
+    beside = jnp.any(reads & ~_met(left)[:, None], axis=0)
+    return q0.at[places].add(jnp.where(beside, 1.0, 0.0).astype(q0.dtype)), _met(h) & ~jnp.any(reads, axis=1)
+
+
+def _why_not(system: System, q0, plan: _Plan, found: _Found) -> str:
+    name = type(system).__name__
+    moved = ", ".join(plan.moved)
+    held = ", ".join(
+        f"{c} = {float(x):.4g}"
+        for c, x in zip(system.coordinates, q0, strict=True)
+        if c not in plan.moved and (x != 0 or (plan.lenient and c in plan.named))
+    )
+    held = held or "the others zero"
+    more = ""
+    if plan.lenient:
+        more = " What is named is held: leave out what may be moved, or say so with free=(...)."
+    if not moved:
+        return (
+            f"{name}: {held} does not satisfy the configuration constraints (the largest residual is "
+            f"{float(found.remainder):.3g}), and nothing is left to be moved.{more}"
+        )
+    if float(found.remainder) < 1e-3 and not float(found.slope) > 1e-6:
+        return (
+            f"{name}: the configuration constraints do not determine {moved} with {held}: they do not change with it "
+            f"(a singular configuration, or constraints that repeat each other). Change what is held.{more}"
+        )
+    return (
+        f"{name}: no {moved} satisfies the configuration constraints with {held}: after {int(found.steps)} Newton "
+        f"steps the residual is {float(found.remainder):.3g}. Start from another guess, or change what is held.{more}"
+    )
+
+
+def _check_dependent_speeds(name: str, given: Mapping[str, Any], found: Mapping[str, Any]) -> None:
+    for speed, value in given.items():
+        value, right = float(value), float(found[speed])
+        if not abs(value - right) <= 1e-6 * max(1.0, abs(right)):
+            raise ValueError(
+                f"{name}: {speed} = {value:.6g} contradicts the velocity constraints, which need {right:.6g} "
+                f"(residual {value - right:.3g}). Leave the dependent speeds out: they follow from the others."
+            )

@@ -1,0 +1,409 @@
+"""Whether a description contradicts itself, found at trial states. Knows the method; knows no mechanism.
+
+The description is read once, as one compiled function of the parameters, time, coordinates and speeds, and once more
+for its derivative along the motion. Both are then asked at states that meet the constraints, beside the one that was
+given: speeds of both signs and several sizes, and other numbers in the place of those that are traced.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from .._description.bodies import Force, Load, Motion
+from .._description.system import System
+from .._description.vectors import Frame, Point
+from .._scalars import native
+from .._scalars.components import is_exact
+from .._scalars.fuse import fused
+from .._scalars.linear import as_vector, is_written_out, stack
+from .._scalars.reads import version_of
+from .._scalars.types import Component
+from .kane import Reading
+
+_CHECKED: dict[Any, None] = {}  # structures, the oldest first
+_MOST_REMEMBERED = 1000
+_SIZES = (-1.0, 1e-2, -20.0, 1e3)  # multiples of trial speeds of order 1
+
+Found = dict[tuple[Any, ...], Any]  # (number, kind, names ...) -> numbers; the number keeps the order of the reading
+
+
+def check_description(system: System, t: Any, q: Any) -> None:
+    """Refuse a description that contradicts itself, once for each class and structure.
+
+    **Arguments:** the system, time [s] and coordinates (n_q,), any of whose numbers may be traced; coordinates may be
+    None, where none are known.
+
+    **Raises:** `ValueError` for velocities or residuals that are not affine in the speeds, frames and points that do
+    not move as their coordinates' rates say, frames that are not turned by a rotation, configuration constraints that
+    the motion violates, a body whose inertia is not constant in its frame, a name that stands for two forces.
+    `TypeError` for methods that return something else than they should, or ask for the value of what is traced.
+    """
+    structure = (version_of(system), jax.tree.structure(system), *(np.shape(x) for x in jax.tree.leaves(system)))
+    if structure in _CHECKED:
+        return
+    if q is not None and not isinstance(q, Tracer) and not np.all(np.isfinite(q)):
+        return
+    rng = np.random.default_rng(0)
+    numbers = _with_trial_numbers((system, t, q), rng)
+    are_given = q is not None and not any(isinstance(x, Tracer) for x in jax.tree.leaves((system, t, q)))
+    if _Description(*numbers, rng=rng).check(are_given):
+        _CHECKED[structure] = None
+        if len(_CHECKED) > _MOST_REMEMBERED:
+            _CHECKED.pop(next(iter(_CHECKED)), None)
+
+
+def _with_trial_numbers(tree: tuple[System, Any, Any], rng: np.random.Generator) -> tuple[System, Any, Any]:
+    """Numbers for what is traced: positive parameters, small coordinates; arrays of length 1, as axes and quaternions
+    are, and unit matrices."""
+    system, t, q = tree
+
+    def parameter(x: Any) -> Any:
+        if not isinstance(x, Tracer):
+            return x
+        if np.ndim(x) == 2 and x.shape[0] == x.shape[1]:
+            return np.eye(len(x), dtype=x.dtype)
+        value = rng.uniform(0.5, 1.5, x.shape)
+        return np.asarray(value / np.linalg.norm(value) if value.ndim else value, x.dtype)
+
+    system = jax.tree.map(parameter, system)
+    if q is None or isinstance(q, Tracer):
+        n, dtype = len(system.coordinates), jnp.result_type(float) if q is None else q.dtype
+        q = rng.uniform(0.1, 0.5, n) * rng.choice((-1.0, 1.0), n)
+        q = q.astype(dtype)
+    return system, 0.3 if isinstance(t, Tracer) else t, np.asarray(q)
+
+
+class _Description:
+    """The description of a system as functions of numbers, and what must hold between them."""
+
+    def __init__(self, system: System, t: Any, q: np.ndarray, rng: np.random.Generator):
+        self.system, self.t, self.q, self.rng = system, np.asarray(t, q.dtype), q, rng
+        self.name = type(system).__name__
+        self.speeds = (*system.speeds, *system.dependent_speeds)
+        self.inputs = {name: np.asarray(0.7, q.dtype) for name in system.inputs}
+        # It is asked a dozen times: a long chain is done before XLA would have compiled its program.
+        self._reading = _compiled if is_written_out(len(system.speeds)) or native.is_on() else _reading
+        self.tolerance = float(jnp.finfo(q.dtype).eps) ** 0.5
+
+    def check(self, are_given: bool) -> bool:
+        """Refuse what contradicts itself. **Returns:** whether there were finite numbers to judge by."""
+        if are_given:
+            self._check_rotations(self.read(self.q, self._trial_speeds()))
+        self._check_affine(self.q)
+        judged = self._check_state(self.q)
+        beside = self.q + self.rng.uniform(-0.1, 0.1, self.q.shape)
+        self.t = self.t + np.asarray(0.3, self.t.dtype)  # what is prescribed in time is often at rest where it begins
+        return self._check_state(beside.astype(self.q.dtype)) or judged
+
+    def read(self, q: np.ndarray, u: np.ndarray) -> Found:
+        return jax.device_get(self._reading(self.system, self.t, q, u.astype(q.dtype), self.inputs))
+
+    def read_along(self, q: np.ndarray, u: np.ndarray, now: Found) -> Found:
+        """How all that is read changes along the motion [1/s]."""
+        q_dot = np.concatenate([x.ravel() for x in _of_kind(now, "rate").values()])
+        at = lambda t, q: self._reading(self.system, t, q, u.astype(q.dtype), self.inputs)  # noqa: E731
+        return jax.device_get(jax.jvp(at, (self.t, q), (np.ones_like(self.t), q_dot))[1])
+
+    def _trial_speeds(self) -> np.ndarray:
+        n = len(self.speeds)
+        return self.rng.uniform(0.5, 1.5, n) * self.rng.choice((-1.0, 1.0), n)
+
+    def _differs(self, difference: Any, *sizes: Any) -> bool:
+        size = max([1.0, *(np.max(np.abs(x), initial=0.0) for x in sizes)])
+        difference = np.max(np.abs(difference), initial=0.0)
+        return bool(np.isfinite(difference) and difference > self.tolerance * size)
+
+    # -- velocities are affine in the speeds
+
+    def _check_affine(self, q: np.ndarray) -> None:
+        a, b = self._trial_speeds(), self._trial_speeds()
+        zero, at_a, at_b, at_both = (self.read(q, u) for u in (0.0 * a, a, b, a + b))
+        scaled = {s: self.read(q, s * a) for s in _SIZES}
+        for key, z in zero.items():
+            x, y, both = at_a[key], at_b[key], at_both[key]
+            bent = self._differs(both - x - y + z, both, x, y, z)
+            if bent or any(self._differs(f[key] - z - s * (x - z), f[key], s * x, z) for s, f in scaled.items()):
+                curved = [name for i, name in enumerate(self.speeds) if self._is_curved(q, key, z, i)]
+                which = f"in {_listed(curved)}" if curved else "in the speeds: it holds products of two speeds"
+                raise ValueError(
+                    f"{self.name}: {_in_words(key)} is not affine {which}. Kane's method needs velocities that are "
+                    "linear in the speeds, plus a term that may depend on time and coordinates: no squares, no abs() "
+                    "or maximum() of a speed."
+                )
+
+    def _is_curved(self, q: np.ndarray, key: tuple[Any, ...], zero: Any, i: int) -> bool:
+        direction = np.eye(len(self.speeds))[i]
+        one = self.read(q, direction)[key]
+        values = {s: self.read(q, s * direction)[key] for s in _SIZES}
+        return any(self._differs(x - zero - s * (one - zero), x, s * one, zero) for s, x in values.items())
+
+    # -- places and orientations move as the rates of the coordinates say
+
+    def _check_state(self, q: np.ndarray) -> bool:
+        q, start = self._on_constraints(q), self._trial_speeds()
+        u = self._on_residuals(q, start)
+        now = self.read(q, u)
+        judged = all(np.all(np.isfinite(x)) for x in now.values())
+        if not judged or any(_rotation_error(x) > self.tolerance for x in _of_kind(now, "frame").values()):
+            return False  # coordinates that are bound together without a constraint: nothing can be said beside them
+        rates = self.read_along(q, u, now)
+        check = {
+            "frame": self._check_frame,
+            "place": self._check_place,
+            "contact": self._check_contact,
+            "center": self._check_center,
+            "body": self._check_body,
+            "about": self._check_about,
+        }
+        for key, x in now.items():
+            if key[1] in check:
+                check[key[1]](key, x, rates[key])
+        if _of_kind(now, "constraint"):
+            self._check_constraints(rates, self.read_along(q, start, self.read(q, start)))
+        return True
+
+    def _on_constraints(self, q: np.ndarray) -> np.ndarray:
+        """The nearest coordinates that meet the configuration constraints; NaN where there are none to be found."""
+        residual = lambda q: np.asarray(configuration_residual(self.system, self.t, q), float)  # noqa: E731
+        h, step = residual(q), self.tolerance
+        for _ in range(20):
+            if not h.size or np.max(np.abs(h)) <= 0.1 * self.tolerance:
+                return q
+            moved = [residual(q + step * e.astype(q.dtype)) for e in np.eye(len(q))]
+            G = (np.array(moved) - h).T / step  # (h,n_q)
+            if not np.all(np.isfinite(G)):
+                break
+            q = q - (np.linalg.pinv(G, rcond=1e-6) @ h).astype(q.dtype)
+            h = residual(q)
+        return np.full_like(q, np.nan)
+
+    def _on_residuals(self, q: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """The nearest speeds that meet the velocity residuals; NaN where there are none."""
+        residual = lambda u: np.array([x.item() for x in _of_kind(self.read(q, u), "residual").values()])  # noqa: E731
+        c, c0 = residual(u), residual(0.0 * u)
+        if not c.size:
+            return u
+        C = np.array([residual(e) - c0 for e in np.eye(len(u))]).T  # (k,n)
+        if np.all(np.isfinite(C)) and np.all(np.isfinite(c)):
+            nearest = u - np.linalg.pinv(C, rcond=1e-9) @ c
+            if not self._differs(residual(nearest), C, c):
+                return nearest
+        return np.full_like(u, np.nan)
+
+    def _check_rotations(self, now: Found) -> None:
+        for (_, _, frame, parent), x in _of_kind(now, "frame").items():
+            error = _rotation_error(x)
+            if np.isfinite(error) and error > max(1e-6, self.tolerance):
+                square = x[:3] @ x[:3].T
+                norm = np.trace(square / 3) ** 0.25
+                stretches = np.max(np.abs(square - np.eye(3) * square[0, 0])) <= 1e-6 * square[0, 0]
+                cause = (
+                    f"its Euler parameters have the norm {norm:.6g} instead of 1"
+                    if stretches
+                    else f"[R] [R]^T differs from 1 by {error:.3g}"
+                )
+                raise ValueError(
+                    f"{self.name}: the frame {frame!r} is not turned from {parent!r} by a rotation: {cause} at the "
+                    "coordinates (or parameters) given. Give Euler parameters of unit norm, as jaxkane.assemble does "
+                    "where the constraint rotations.euler_parameter_norm is among the configuration constraints."
+                )
+
+    def _check_frame(self, key: Any, now: Any, rate: Any) -> None:
+        _, _, frame, parent = key
+        turning = rate[:3] @ now[:3].T  # -[omega x], for [R] from the parent's components to the frame's
+        by_orientation = np.array([turning[1, 2], turning[2, 0], turning[0, 1]])
+        seen = f"components in {frame!r}, relative to {parent!r}"
+        self._compare(f"the frame {frame!r} turns", "rad/s", by_orientation, now[3], seen)
+
+    def _check_place(self, key: Any, now: Any, rate: Any) -> None:
+        _, _, point, frame = key
+        self._compare(f"{point} moves", "m/s", rate[0], now[1], f"as seen in {frame!r} from the point it was made from")
+
+    def _check_contact(self, key: Any, now: Any, rate: Any) -> None:
+        if self._differs(now[1], 0.0):  # what is at rest may be a point of the ground, another one at every instant
+            self._check_place(key, now, rate)
+
+    def _check_center(self, key: Any, now: Any, rate: Any) -> None:
+        self._compare(f"{key[2]} moves", "m/s", rate[0], now[1], "components in N")
+
+    def _compare(self, what: str, unit: str, by_position: Any, stated: Any, seen: str) -> None:
+        if self._differs(by_position - stated, stated):
+            show = lambda x: "(" + ", ".join(f"{a:.4g}" for a in x) + ")"  # noqa: E731
+            raise ValueError(
+                f"{self.name}: {what} with {show(by_position)} {unit} by the rates of its coordinates, but with "
+                f"{show(stated)} {unit} by its description ({seen}, at a trial state). A rate that is given to a frame "
+                "or a point contradicts q_dot; or a point is called fixed in a frame in which it moves; or `loads` "
+                "reads self.motion(t, q, ...) with other speeds than its own. A point of a wheel that is in contact "
+                "now is `center.fixed(r, wheel_frame)`."
+            )
+
+    def _check_constraints(self, rates: Found, free: Found) -> None:
+        """`rates` along the motion, `free` along speeds that do not meet the residuals, for their size."""
+        for key, rate in _of_kind(rates, "constraint").items():
+            if self._differs(rate, free[key]):
+                raise ValueError(
+                    f"{self.name}: the configuration constraint {key[2]} (counted from 0) changes at a rate of "
+                    f"{rate.item():.4g} 1/s while all velocity residuals are zero: they, or q_dot, contradict it. "
+                    "Where there are as many residuals as dependent speeds, the constraint must follow from them; "
+                    "leave out the residual that is its rate, and that is derived."
+                )
+
+    def _check_body(self, key: Any, now: Any, rate: Any) -> None:
+        _, _, body, frame = key
+        s, I = now[0], now[1:]
+        turned = np.cross(s, I.T).T  # [s x] I
+        if self._differs((turned + turned.T) / max(np.abs(I).max(), 1e-300), s):
+            raise ValueError(
+                f"{self.name}: the body {body!r} turns in its frame {frame!r}, but its inertia is not symmetric about "
+                "that axis, so it is not constant there. Give the body a frame that turns with it."
+            )
+
+    def _check_about(self, key: Any, now: Any, rate: Any) -> None:
+        _, _, body, frame = key
+        if self._differs(now[0] - now[1], now[1]):
+            raise ValueError(
+                f"{self.name}: the inertia of the body {body!r} is given about a point that moves in its frame "
+                f"{frame!r}, so that it is not constant there. Give it about a point of the body, or about the mass "
+                "centre."
+            )
+
+
+# -- what is read
+
+
+def _reading(system: System, t: Any, q: Any, u: Any, inputs: Any) -> Found:
+    reading = Reading(system, inputs)
+    q, u, like = tuple(q[i] for i in range(len(q))), tuple(u[i] for i in range(len(u))), q
+    motion = reading.motion(t, q, u)
+    loads = reading.loads_at(t, q, u, motion)
+    twice = sorted({*motion.points, *motion.frames} & {*system.auxiliary_speeds})
+    if twice:
+        raise ValueError(
+            f"{reading.name}: {_listed(twice)} is the name of an auxiliary speed and of a point or a frame: "
+            "constraint_forces gives both a force by that name."
+        )
+    facts = [*_of_speeds(reading, t, q, u), *_of_bodies(motion), *_of_points(motion, loads), *_of_frames(motion, loads)]
+    return {(i, *key): stack(rows).astype(like.dtype) for i, (key, rows) in enumerate(facts)}
+
+
+_compiled = fused(_reading)
+
+
+Fact = tuple[tuple[str, ...], list[tuple[Component, ...]]]
+
+
+def _of_speeds(reading: Reading, t: Any, q: Any, u: Any) -> Iterator[Fact]:
+    for name, rate in zip(reading.system.coordinates, reading.rates(t, q, u), strict=True):
+        yield ("rate", name), [(rate,)]
+    for i, residual in enumerate(reading.residuals(t, q, u)):
+        yield ("residual", str(i)), [(residual,)]
+    for i, h in enumerate(reading.configuration(t, q)):
+        yield ("constraint", str(i)), [(h,)]
+
+
+def _of_bodies(motion: Motion) -> Iterator[Fact]:
+    for body in motion.bodies:
+        yield ("velocity", f"the velocity of {body.name!r}"), [body.center.velocity.components]
+        yield ("velocity", f"the angular velocity of {body.name!r}"), [body.angular_velocity.components]
+        if body.angular_velocity is not body.frame.angular_velocity:
+            spin = (body.angular_velocity - body.frame.angular_velocity).components_in(body.frame)
+            yield ("body", body.name, body.frame.name), [spin, *body.inertia]
+        if body.about is not None:
+            r = body.about.position_from(body.center)
+            carried = body.center.velocity + body.frame.angular_velocity.cross(r)
+            velocities = [x.components_in(body.frame) for x in (body.about.velocity, carried)]
+            yield ("about", body.name, body.frame.name), velocities
+        if body.center.has_position and not all(_is_sure(point) for point in _chain(body.center)):
+            place, velocity = (x.components_in(motion.N) for x in (body.center.position, body.center.velocity))
+            yield ("center", f"the mass centre of {body.name!r}"), [place, velocity]
+
+
+def _of_points(motion: Motion, loads: Iterable[Load]) -> Iterator[Fact]:
+    """Named points, what loads act on, and what these and the bodies were made from."""
+    seen: set[Point] = set()
+    centers = {body.center: f"the mass centre of {body.name!r}" for body in motion.bodies}
+    named = {point: f"the point {name!r}" for name, point in motion.points.items()}
+    acted_on = {load.point: f"the point {load.point.name!r} of a load" for load in loads if isinstance(load, Force)}
+    words = {**acted_on, **named, **centers}
+    for point in words:
+        if point not in centers:
+            yield ("velocity", f"the velocity of {words[point]}"), [point.velocity.components]
+        for link in _chain(point):
+            if link in seen or link._claim is None or (link._base is None and link in centers):
+                continue
+            seen.add(link)
+            frame, velocity = link._claim
+            rows = [link._offset.components_in(frame), velocity.components_in(frame)]  # type: ignore[union-attr]
+            if not all(is_exact(x) for x in rows[0]) or not all(is_exact(x) and x == 0.0 for x in rows[1]):
+                # A point that `loads` made from a motion without speeds is at rest too, and is no point of contact.
+                at_rest = link._base is None and frame is motion.N
+                yield ("contact" if at_rest else "place", words.get(link, f"the point {link.name!r}"), frame.name), rows
+
+
+def _of_frames(motion: Motion, loads: Iterable[Load]) -> Iterator[Fact]:
+    bodies, points = motion.bodies, [*motion.points.values()]
+    starts = [*(body.frame for body in bodies), *motion.frames.values()]
+    starts += [x.velocity.frame for x in (*(body.center for body in bodies), *points, *loads)]
+    seen: dict[Frame, None] = {}
+    for start in starts:
+        frame: Frame | None = start
+        while frame is not None and frame.parent is not None and frame not in seen:
+            seen[frame] = None
+            frame = frame.parent
+    for frame in seen:
+        rows = [*frame._to_child, frame._spin]
+        if not all(is_exact(x) for row in rows for x in row) or any(frame._spin):
+            yield ("frame", frame.name, frame.parent.name), rows  # type: ignore[union-attr]
+
+
+def _chain(point: Point | None) -> Iterator[Point]:
+    while point is not None:
+        yield point
+        point = point._base
+
+
+def _is_sure(point: Point) -> bool:
+    """Whether a point moves as its place does, if what it was made from does and its claim is right."""
+    if point._base is not None:
+        return point._claim is not None
+    known = (*point.velocity.components, *(point._offset.components if point._offset is not None else ()))
+    return all(is_exact(x) and x == 0.0 for x in known)  # the origin
+
+
+def _of_kind(found: Found, kind: str) -> Found:
+    return {key: x for key, x in found.items() if key[1] == kind}
+
+
+def _in_words(key: tuple[Any, ...]) -> str:
+    words = {
+        "rate": "the rate of the coordinate {0!r}",
+        "residual": "the velocity residual {0}",
+        "constraint": "the configuration constraint {0}",
+        "frame": "the angular velocity of the frame {0!r}",
+        "place": "the velocity of {0}",
+        "contact": "the velocity of {0}",
+        "center": "the velocity of {0}",
+        "body": "the angular velocity of {0!r} in its frame",
+        "about": "the velocity of the point about which the inertia of {0!r} is given",
+    }
+    return words.get(key[1], "{0}").format(key[2])
+
+
+def _rotation_error(frame: Any) -> float:
+    return float(np.max(np.abs(frame[:3] @ frame[:3].T - np.eye(3))))
+
+
+def _listed(words: Iterable[str]) -> str:
+    return ", ".join(words)
+
+
+@fused
+def configuration_residual(system: System, t: Any, q: Any):
+    """Residuals (h,) of the configuration constraints."""
+    return as_vector(Reading(system).configuration(t, tuple(q[i] for i in range(len(q)))), q)

@@ -1,0 +1,192 @@
+"""Checks of a description and of a state, with errors that name what is wrong. Knows the method; changes nothing.
+
+A description is checked once for each class and structure, at trial states, whether its numbers are known or traced;
+numbers are checked where they are numbers. Under a trace, and in a batch, a bad member gets a status instead.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from .._description.bodies import Body
+from .._description.parameters import parameter_info
+from .._description.system import State, System
+from .._scalars.fuse import fused
+from .._scalars.jax_internals import concretely
+from .._scalars.linear import stack
+from .._scalars.nan import nan_where
+from .check_description import check_description
+from .check_description import configuration_residual as configuration_residual
+from .kane import Reading
+
+ROUNDING, MEASURED = 2e-3, 0.05
+
+
+def is_concrete(*trees: Any) -> bool:
+    """Whether all arrays in these are numbers rather than traced."""
+    return not any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))
+
+
+def is_batch(system: System) -> bool:
+    """Whether some parameter has leading axes more than it was declared with."""
+    return any(np.ndim(getattr(system, name)) > len(info.shape) for name, info in parameter_info(system).items())
+
+
+def check_system(system: System, t: Any, q: Any, *, bodies: bool = True) -> None:
+    """Refuse a description that contradicts itself, once for each structure, and `bodies` that cannot be.
+
+    What is traced is replaced by its value where it has one (in `jax.grad` alone), else by trial numbers, as are
+    coordinates that are None; bodies are checked where all numbers are known.
+
+    **Raises:** `ValueError` as `check_description`; for a negative mass, and an inertia that no body can have, as
+    `check_bodies` says.
+    """
+    if is_batch(system):
+        return
+    system, t, q = jax.tree.map(_value, (system, t, q))
+    with concretely(), np.errstate(invalid="ignore", over="ignore"):
+        check_description(system, t, q)
+        if bodies and q is not None and is_concrete(system, t, q):
+            check_bodies(system, t, q)
+
+
+def _value(x: Any) -> Any:
+    # `stop_gradient` of a number that is being differentiated is the number; of one that is traced it is traced.
+    return jax.lax.stop_gradient(x) if isinstance(x, Tracer) else x
+
+
+@fused
+def _masses_and_inertias(system: System, t: Any, q: Any):
+    return [(jnp.asarray(body.mass), stack(body.inertia)) for body in _bodies(system, t, q)]
+
+
+def _bodies(system: System, t: Any, q: Any) -> tuple[Body, ...]:
+    still = (0.0,) * (len(system.speeds) + len(system.dependent_speeds))
+    return Reading(system).motion(t, tuple(q[i] for i in range(len(system.coordinates))), still).bodies
+
+
+def check_bodies(system: System, t: Any, q: Any) -> None:
+    """Refuse masses and inertias that no body can have.
+
+    The largest principal moment of inertia is at most the sum of the other two. By up to 0.2 % more it is taken for
+    rounding, by up to 5 % for measured and warned about, beyond that refused, unless the class has
+    `check_inertia = False`. A moment about one axis alone, (0, 0, J), is a rotor's: the other two are elsewhere.
+    """
+    for i, (mass, I) in enumerate(_masses_and_inertias(system, t, q)):
+        mass, I = float(mass), np.asarray(I, dtype=float)  # [kg], (3,3) [kg m^2]
+        fault = _fault(mass, I) or (_excess_in_words(I) if system.check_inertia else "")
+        if fault:
+            message = f"{type(system).__name__}, body {_bodies(system, t, q)[i].name!r}: {fault}"
+            if _fault(mass, I) or _excess(I) > MEASURED:
+                raise ValueError(message)
+            warnings.warn(message, UserWarning, stacklevel=4)
+
+
+def _fault(mass: float, I: np.ndarray) -> str:
+    """What is wrong with a body beyond arguing."""
+    slack = 1e-6 * max(np.abs(I).max(), 1e-300)
+    if not mass >= 0:
+        return f"the mass is {mass:.6g} kg; it must not be negative."
+    if not np.all(np.isfinite(I)):
+        return f"the inertia is not finite: {I.tolist()}."
+    if np.abs(I - I.T).max() > slack:
+        return f"the inertia matrix is not symmetric: {I.tolist()}."
+    moments = np.linalg.eigvalsh(I)
+    if moments[0] < -slack:
+        return f"the principal moments of inertia are {_listed(moments)} kg m^2; none may be negative."
+    return ""
+
+
+def _excess_in_words(I: np.ndarray) -> str:
+    if _excess(I) <= ROUNDING:
+        return ""
+    return (
+        f"no body has the principal moments of inertia {_listed(np.linalg.eigvalsh(I))} kg m^2: the largest exceeds "
+        "the sum of the other two (triangle inequality). Measured values may do so by a few per cent; beyond 5 % they "
+        "are refused. A class that is to have them all the same says `check_inertia = False`."
+    )
+
+
+def _excess(I: np.ndarray) -> float:
+    """By how much of itself the largest principal moment exceeds the sum of the other two; 0 for a rotor's."""
+    a, b, c = np.linalg.eigvalsh(I)
+    return 0.0 if b <= 1e-12 * c else float((c - a - b) / c)
+
+
+def _listed(moments: np.ndarray) -> str:
+    return ", ".join(f"{x:.6g}" for x in moments)
+
+
+def with_possible_bodies(system: System, t: Any, state: State) -> State:
+    """The state, or NaN where the system has a body that `check_bodies` refuses: for members of a batch."""
+    bodies = _masses_and_inertias(system, t, state.q)
+    possible = jnp.all(jnp.stack([_is_possible(mass, I, system.check_inertia) for mass, I in bodies]))
+    # Whether a body can be does not depend on the state; where it is NaN, it is another check's.
+    return jax.tree.map(lambda x: jnp.where(possible, x, jnp.nan), state)
+
+
+def _is_possible(mass: Any, I: Any, check_inertia: bool) -> Any:
+    mass, I = jax.lax.stop_gradient((mass, I))
+    trace = jnp.trace(I)
+    # c - a - b > 5 % of c, where c > trace / 1.95: and no c is, where trace / 1.95 - I has no eigenvalue below zero.
+    possible = (mass >= 0) & (jnp.max(jnp.abs(I - I.T)) <= 1e-6 * jnp.max(jnp.abs(I))) & _is_semidefinite(I)
+    if check_inertia:
+        rest = trace / (2.0 - MEASURED) * jnp.eye(3, dtype=I.dtype) - I
+        is_rotor = sum(_minors(I)) <= 1e-12 * trace * trace
+        possible &= _is_semidefinite(rest) | is_rotor
+    return possible
+
+
+def _is_semidefinite(A: Any) -> Any:
+    # By principal minors: LAPACK's eigenvalues of many small matrices would be slow, and wait for each other.
+    size = jnp.max(jnp.abs(A))
+    det = jnp.dot(A[0], jnp.cross(A[1], A[2]))
+    least = [(jnp.min(jnp.diag(A)), size), (jnp.min(jnp.stack(_minors(A))), size**2), (det, size**3)]
+    return jnp.all(jnp.stack([x >= -1e-6 * scale for x, scale in least]))
+
+
+def _minors(A: Any) -> list[Any]:
+    return [A[i, i] * A[j, j] - A[i, j] * A[j, i] for i, j in ((0, 1), (0, 2), (1, 2))]
+
+
+def check_state(system: System, t: Any, q: Any) -> None:
+    """Refuse coordinates that violate a configuration constraint, with the residual."""
+    if not is_concrete(system, t, q):
+        return
+    residual = configuration_residual(system, t, q)
+    if residual.size and not np.max(np.abs(residual)) <= configuration_tolerance(residual.dtype):
+        adjust = ", ".join(system.dependent_coordinates) or "the coordinates"
+        raise ValueError(
+            f"{type(system).__name__}: the coordinates violate the configuration constraints by "
+            f"{np.array2string(np.asarray(residual), precision=3)}. Find {adjust} with jaxkane.assemble(system, q, u)."
+        )
+
+
+def met_or_refused(system: System, t: Any, q: Any, left_out: Sequence[str]) -> Any:
+    """Coordinates of which some were left out and taken as zero, unless that violates a configuration constraint.
+
+    **Raises:** `ValueError` that names them; under a trace the coordinates become NaN.
+    """
+    residual = configuration_residual(system, t, q)
+    if not residual.size:
+        return q
+    met = jnp.max(jnp.abs(residual)) <= configuration_tolerance(residual.dtype)
+    if is_concrete(met) and not met:
+        raise ValueError(
+            f"{type(system).__name__}: with {', '.join(left_out)} left out of q, and taken as zero, the configuration "
+            f"constraints are violated by {np.array2string(np.asarray(residual), precision=3)}. Find the state with "
+            "jaxkane.assemble(system, q, u), and give its state.q; or name them."
+        )
+    return nan_where(~met, q, (system, t, q))
+
+
+def configuration_tolerance(dtype: Any) -> float:
+    """How far coordinates may be from the configuration constraints and still be taken as given."""
+    return 1e-6 if dtype == jnp.float64 else 1e-3

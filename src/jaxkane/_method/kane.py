@@ -1,0 +1,403 @@
+"""Kane's dynamical equations in momentum form. Knows bodies, speeds and JAX; knows no mechanism and no integrator.
+
+With p_i = m_i v_i, H_i = I_i . omega_i and d/dt in the inertial frame (Kamman, Unit 5, "Kane's Equations"):
+
+    V_ir = dv_i/du_r,  W_ir = domega_i/du_r                         partial velocities
+    c = C_ind u + C_dep u_dep + c0 = 0,  J = -C_dep^-1 C_ind        dependent speeds
+    M_rs = sum_i V_ir . m_i V_is + W_ir . I_i W_is
+    F_r  = sum F . V_r + T . W_r                                    active loads
+    F*_r = -sum_i V_ir . dp_i/dt + W_ir . dH_i/dt                   inertia, at u_dot = 0
+    M u_dot = f = F_r + F*_r
+
+Partial velocities, C and the time derivatives are read off the description by `jax.jvp`. Only the directions that
+are needed are pushed: the residuals along every speed, the bodies along the n independent columns of [1; J].
+
+A few speeds are written out so, as scalars. For many, sums over bodies for every pair of speeds would be of order
+n^2 b. Then f and the columns of M are found without partial velocities, each in order b: vectors that stand on bodies
+are projected onto all speeds at once by the transpose of the map u -> (v, omega), which `jax.vjp` gives.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .._common.lookup import not_there, refuse_unknown
+from .._description.bodies import Body, Load, Motion, flatten_loads, flatten_residuals
+from .._description.system import System
+from .._scalars.components import add, add3, component, cross, dot, is_exact, is_zero, matvec, mul, scale3
+from .._scalars.linear import Rows, solve, solve_positive
+from .._scalars.types import Component
+
+Row = tuple[Component, ...]
+
+
+def jvp(f: Callable[..., Any], primals: Sequence[Component], tangents: Sequence[Component]) -> tuple[Any, Any]:
+    """`jax.jvp` of a function of components: exact inputs and outputs stay exact, and have exact zero derivatives."""
+    moving = [i for i, dx in enumerate(tangents) if not is_zero(dx)]
+    constants: list[Component | None] = []
+    treedef = None
+
+    def arrays_only(*xs):
+        nonlocal treedef
+        arguments = list(primals)
+        for i, x in zip(moving, xs, strict=True):
+            arguments[i] = x
+        leaves, treedef = jax.tree.flatten(f(*arguments))
+        constants[:] = [x if is_exact(x) else None for x in leaves]
+        return [x for x in leaves if not is_exact(x)]
+
+    arrays = [x for x in (*primals, *tangents) if not is_exact(x)]
+    xs = [jnp.asarray(primals[i], dtype=jnp.result_type(*arrays)) for i in moving]
+    dxs = [jnp.asarray(tangents[i], dtype=x.dtype) for i, x in zip(moving, xs, strict=True)]
+    if moving:
+        values, derivatives = jax.jvp(arrays_only, xs, dxs)
+    else:
+        values = arrays_only()
+        derivatives = [0.0] * len(values)
+    values, derivatives = iter(values), iter(derivatives)
+    f_x = [next(values) if c is None else c for c in constants]
+    f_dx = [next(derivatives) if c is None else 0.0 for c in constants]
+    return jax.tree.unflatten(treedef, f_x), jax.tree.unflatten(treedef, f_dx)
+
+
+def transposed(f: Callable[..., Any], primals: Sequence[Component], cotangents: Any) -> Row:
+    """`jax.vjp` of a function of components: the derivative of `f` at `primals`, transposed, times `cotangents`.
+
+    `cotangents` stand as f's outputs do. What f returns exactly is constant, and what meets it is dropped.
+    """
+    moves: list[bool] = []
+
+    def arrays_only(*xs):
+        leaves = jax.tree.leaves(f(*xs))
+        moves[:] = [not is_exact(x) for x in leaves]
+        return [x for x in leaves if not is_exact(x)]
+
+    outputs, pull = jax.vjp(arrays_only, *primals)
+    leaves = [ct for ct, m in zip(jax.tree.leaves(cotangents), moves, strict=True) if m]
+    return pull([jnp.asarray(ct, dtype=x.dtype) for ct, x in zip(leaves, outputs, strict=True)])
+
+
+def unit(n: int, r: int) -> Row:
+    """The r-th of n directions of the speeds."""
+    return tuple(1.0 if i == r else 0.0 for i in range(n))
+
+
+class Reading:
+    """What the description of a system says, at any time, coordinates and speeds."""
+
+    def __init__(self, system: System, inputs: Mapping[str, Component] | None = None):
+        self.system = system
+        self.name = type(system).__name__
+        self.n, self.k = len(system.speeds), len(system.dependent_speeds)
+        self.inputs = Inputs(checked_inputs(system, inputs), f"the inputs of {self.name}")
+
+    def motion(self, t: Component, q: Row, u: Row) -> Motion:
+        motion = self.system.motion(t, q, u)
+        if not isinstance(motion, Motion):
+            raise TypeError(f"{self.name}.motion must return a jaxkane.Motion, got {motion!r}.")
+        return motion
+
+    def rates(self, t: Component, q: Row, u: Row) -> Row:
+        q_dot = self.system.q_dot(t, q, u)
+        return as_row(q_dot, self.system.coordinates, f"{self.name}.q_dot")
+
+    def loads_at(self, t: Component, q: Row, u: Row, motion: Motion) -> tuple[Load, ...]:
+        return flatten_loads(self.system.loads(t, q, u, motion, self.inputs), f"{self.name}.loads")
+
+    def configuration(self, t: Component, q: Row) -> Row:
+        residuals = self.system.configuration_constraints(t, q)
+        return flatten_residuals(residuals, f"{self.name}: the residuals of configuration_constraints")
+
+    def residuals(self, t: Component, q: Row, u: Row) -> Row:
+        """Velocity residuals c(t, q, u), one for each dependent speed."""
+        rolling = self.motion(t, q, u).constraints
+        if len(rolling) == self.k:
+            return rolling  # the configuration constraints, if there are any, are integrals of these
+        h, h_dot = jvp(lambda t, *q: self.configuration(t, q), (t, *q), (1.0, *self.rates(t, q, u)))
+        if len(rolling) + len(h) != self.k:
+            names = ", ".join(self.system.dependent_speeds) or "none"
+            raise ValueError(
+                f"{self.name}: {self.k} dependent speeds are named ({names}), but there are {len(rolling)} velocity "
+                f"residuals in its motion and {len(h)} configuration constraints. Name as many dependent speeds as "
+                "there are velocity residuals; or as many as both together, and the constraints' rates are added."
+            )
+        return (*rolling, *h_dot)
+
+
+class Instant(Reading):
+    """A system at one time, with its coordinates and independent speeds, and what its description says there.
+
+    `u_dep`, `q_dot` and the columns of `J` are formed at once, since everything else needs them.
+    """
+
+    def __init__(self, system: System, t: Component, q: Any, u: Any, inputs: Mapping[str, Component] | None = None):
+        super().__init__(system, inputs)
+        self.t = component(t)
+        self.q = as_row(q, system.coordinates, f"{self.name}: q")
+        self.u = as_row(u, system.speeds, f"{self.name}: u")
+        self.C_ind, self.C_dep, c0 = self._constraint_rows()
+        known = [add(x, y) for x, y in zip(matvec(self.C_ind, self.u), c0, strict=True)]
+        *columns, u_dep = solve(self.C_dep, *zip(*self.C_ind, strict=True), known) if self.k else [()] * (self.n + 1)
+        self.J = [_negative(column) for column in columns]  # n columns of (k,)
+        self.u_dep = _negative(u_dep)
+        self.u_all = (*self.u, *self.u_dep)
+        self.q_dot = self.rates(self.t, self.q, self.u_all)
+
+    def loads(self, motion: Motion, u: Row | None = None) -> tuple[Load, ...]:
+        """The loads, at the speeds of this instant or at others."""
+        return self.loads_at(self.t, self.q, self.u_all if u is None else u, motion)
+
+    def along_speeds(self, f: Callable[[Row], Any], direction: Row) -> Any:
+        """The derivative of `f(u)` along a direction of speeds, at u = 0: all of it, since f is affine in them."""
+        return jvp(lambda s: f(tuple(mul(s, x) for x in direction)), (self._zero(),), (jnp.ones_like(self._zero()),))[1]
+
+    def _zero(self) -> Array:
+        return jnp.zeros((), jnp.result_type(*([x for x in (*self.q, *self.u) if not is_exact(x)] or [float])))
+
+    def _constraint_rows(self) -> tuple[Rows, Rows, Row]:
+        # c = C_ind u + C_dep u_dep + c0
+        n, k = self.n, self.k
+        c0 = self.residuals(self.t, self.q, (0.0,) * (n + k))
+        if not k:
+            return [], [], c0
+        along = [self.along_speeds(lambda u: self.residuals(self.t, self.q, u), unit(n + k, r)) for r in range(n + k)]
+        rows = tuple(zip(*along, strict=True))
+        return [row[:n] for row in rows], [row[n:] for row in rows], c0
+
+    # What Kane's equations are made of.
+
+    def partials(self) -> list[tuple[list, list]]:
+        """For each independent speed: the partial velocities (V, W) of the bodies, and those of the loads."""
+
+        return [self.along_speeds(self.velocities, (*unit(self.n, r), *self.J[r])) for r in range(self.n)]
+
+    def velocities(self, u: Row) -> tuple[list, list]:
+        """Velocities (v, omega) of the bodies, and those that the loads act on, at speeds `u`."""
+        motion = self.motion(self.t, self.q, u)
+        bodies = [(b.center.velocity.components, b.angular_velocity.components_in(b.frame)) for b in motion.bodies]
+        # `loads` makes points of its own from the speeds that it is given. What it makes vectors of is dropped here, so
+        # that no exact zero may divide there.
+        given = tuple(jnp.asarray(x, self._zero().dtype) if is_exact(x) else x for x in u)
+        return bodies, [load.velocity.components for load in self.loads(motion, given)]
+
+    def body_velocities(self, u: Row) -> list:
+        return self.velocities(u)[0]
+
+    def momenta(self, u: Row) -> list[tuple[Row, Row]]:
+        return [_momenta(body) for body in self.motion(self.t, self.q, u).bodies]
+
+    def with_dependent(self, direction: Row) -> Row:
+        """A direction of the independent speeds, with what the dependent ones do: [1; J] of it."""
+        return (*direction, *(dot(row, direction) for row in zip(*self.J, strict=True)))
+
+    def onto_speeds(self, f: Callable[[Row], Any], cotangents: Any) -> Row:
+        """For every independent speed, the derivative of `f(u)` along it times `cotangents`; at the cost of a few f."""
+        return transposed(lambda *u: f(self.with_dependent(u)), (self._zero(),) * self.n, cotangents)
+
+    def mass_times(self, direction: Row) -> Row:
+        """M times a direction of the independent speeds: the momenta along it, onto all speeds. Order b, not n b."""
+        along = self.along_speeds(self.momenta, self.with_dependent(direction))
+        return self.onto_speeds(self.body_velocities, along)
+
+    def forcing(self) -> Row:
+        """f of M u_dot = f, without partial velocities: all vectors onto all speeds at once."""
+        motion = self.motion(self.t, self.q, self.u_all)
+        inertia = [tuple(scale3(-1.0, rate) for rate in rates) for rates in self.momentum_rates(motion)]
+        return self.onto_speeds(self.velocities, (inertia, self.force_components(motion)))
+
+    def bias(self) -> Row:
+        """u_dep_dot at u_dot = 0: the residual is differentiated, never the solution of the solve.
+
+        u_dep_dot = J u_dot - C_dep^-1 (dc/dt at frozen speeds)
+        """
+        if not self.k:
+            return ()
+        _, c_dot = jvp(lambda t, *q: self.residuals(t, q, self.u_all), (self.t, *self.q), (1.0, *self.q_dot))
+        return _negative(solve(self.C_dep, c_dot)[0])
+
+    def dependent_accelerations(self, u_dot: Row) -> Row:
+        """u_dep_dot = J u_dot + bias."""
+        if not self.k:
+            return ()
+        return tuple(add(dot(row, u_dot), b) for row, b in zip(zip(*self.J, strict=True), self.bias(), strict=True))
+
+    def momentum_rates(self, motion: Motion, u_dot: Row | None = None) -> list[tuple[Row, Row]]:
+        """dp/dt and dH/dt of every body in the inertial frame; each in the frame where it stands.
+
+        `u_dot` (n + k,) of the independent and the dependent speeds; by default u_dot = 0 and `bias`.
+        """
+
+        def momenta(t, *q):
+            return [_momenta(body) for body in self.motion(t, q, self.u_all).bodies]
+
+        now, drift = jvp(momenta, (self.t, *self.q), (1.0, *self.q_dot))
+        if u_dot is None and self.k:
+            u_dot = (*(0.0,) * self.n, *self.bias())
+        turning = None if u_dot is None else self.along_speeds(self.momenta, u_dot)
+        rates = []
+        for i, body in enumerate(motion.bodies):
+            # dx/dt in N = derivative of the components + omega x
+            rate = []
+            for j, frame in enumerate((body.center.velocity.frame, body.frame)):
+                x_dot = drift[i][j] if turning is None else add3(drift[i][j], turning[i][j])
+                rate.append(add3(x_dot, cross(frame.angular_velocity.components, now[i][j])))
+            rates.append(tuple(rate))
+        return rates
+
+    def active_forces(self, motion: Motion, partials: list) -> Row:
+        # F_r = sum F . V_r + T . W_r
+        vectors = self.force_components(motion)
+        return tuple(_sum(dot(v, x) for v, x in zip(columns, vectors, strict=True)) for _, columns in partials)
+
+    def force_components(self, motion: Motion) -> list[Row]:
+        return [load.vector.components_in(load.velocity.frame) for load in self.loads(motion)]
+
+    def inertia_forces(self, motion: Motion, partials: list) -> Row:
+        # F*_r = -sum_i V_ir . dp_i/dt + W_ir . dH_i/dt
+        rates = self.momentum_rates(motion)
+        return tuple(
+            mul(-1.0, _sum(add(dot(V, p), dot(W, H)) for (V, W), (p, H) in zip(bodies, rates, strict=True)))
+            for bodies, _ in partials
+        )
+
+    def mass_matrix(self, motion: Motion, partials: list) -> list[list[Component]]:
+        # M_rs = sum_i V_ir . m_i V_is + W_ir . I_i W_is
+        n = self.n
+        M: list[list[Component]] = [[0.0] * n for _ in range(n)]
+        for i, body in enumerate(motion.bodies):
+            for s in range(n):
+                V, W = partials[s][0][i]
+                mV, IW = scale3(body.mass, V), matvec(body.inertia, W)
+                for r in range(s + 1):
+                    V, W = partials[r][0][i]
+                    M[r][s] = add(M[r][s], add(dot(V, mV), dot(W, IW)))
+        for s in range(n):
+            for r in range(s):
+                M[s][r] = M[r][s]
+        return M
+
+    def equations(self) -> tuple[list[list[Component]], Row]:
+        """M and f of M u_dot = f."""
+        motion = self.motion(self.t, self.q, self.u_all)
+        partials = self.partials()
+        pairs = zip(self.active_forces(motion, partials), self.inertia_forces(motion, partials), strict=True)
+        return self.mass_matrix(motion, partials), tuple(add(a, b) for a, b in pairs)
+
+    def accelerations(self) -> Row:
+        return solve_positive(*self.equations())
+
+
+def _momenta(body: Body) -> tuple[Row, Row]:
+    p = scale3(body.mass, body.center.velocity.components)
+    H = matvec(body.inertia, body.angular_velocity.components_in(body.frame))
+    return p, H
+
+
+def _sum(terms) -> Component:
+    total: Component = 0.0
+    for term in terms:
+        total = add(total, term)
+    return total
+
+
+def _negative(row: Sequence[Component]) -> Row:
+    return tuple(mul(-1.0, x) for x in row)
+
+
+def as_row(values: Any, names: Sequence[str], label: str) -> Row:
+    """A sequence, or an array of shape (len(names),), as a row of components."""
+    if hasattr(values, "shape"):
+        array = as_array(values, names, label)
+        return tuple(array[i] for i in range(len(names)))
+    if not isinstance(values, Iterable) or isinstance(values, Mapping):
+        raise TypeError(f"{label} must be {len(names)} numbers in a sequence ({', '.join(names)}), got {values!r}.")
+    try:
+        row = tuple(component(x) for x in values)
+    except TypeError as error:
+        raise TypeError(f"{label} must be {len(names)} numbers ({', '.join(names)}): {error}") from None
+    if len(row) != len(names):
+        raise ValueError(f"{label} must have {len(names)} entries ({', '.join(names)}), got {len(row)}.")
+    return row
+
+
+def as_array(values: Any, names: Sequence[str], label: str) -> Array:
+    """Numbers, in their order or by name, as a float array of shape (len(names),). Those not named are zero."""
+    array = by_names(values, names, label) if isinstance(values, Mapping) else _numbers(values, names, label)
+    if jnp.issubdtype(array.dtype, jnp.complexfloating):
+        raise TypeError(f"{label} must be {len(names)} real numbers ({', '.join(names)}), got {values!r}.")
+    if not jnp.issubdtype(array.dtype, jnp.inexact):
+        array = array.astype(float)
+    if array.shape != (len(names),):
+        hint = " For a batch use jax.vmap." if array.ndim > 1 else ""
+        raise ValueError(f"{label} must have the shape ({len(names)},): {', '.join(names)}. Got {array.shape}.{hint}")
+    return array
+
+
+def _numbers(values: Any, names: Sequence[str], label: str) -> Array:
+    try:
+        return jnp.asarray(values)
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"{label} must be {len(names)} numbers ({', '.join(names)}), got {values!r}.") from None
+
+
+def by_names(values: Mapping[str, Any], names: Sequence[str], label: str) -> Array:
+    """Numbers by name as an array (*batch, len(names)); those not named are zero."""
+    refuse_unknown(values, names, f"{label} has no", "it has")
+    columns = [jnp.asarray(values.get(name, 0.0), dtype=float) for name in names]
+    return jnp.stack(jnp.broadcast_arrays(*columns), axis=-1) if columns else jnp.zeros(0)
+
+
+def refuse_incomplete(system: System, q: Any, u: Any) -> None:
+    """Refuse dicts of coordinates and speeds that leave out a dependent coordinate, or name a dependent speed.
+
+    Where nothing is solved for, a dependent coordinate left out is no zero: it is not known.
+    """
+    name = type(system).__name__
+    for label, values, names in (
+        ("q", q, system.coordinates),
+        ("u", u, (*system.speeds, *system.dependent_speeds)),
+    ):
+        if isinstance(values, Mapping):
+            refuse_unknown(values, names, f"{name}: {label} has no", "it has")
+    missing = [c for c in system.dependent_coordinates if c not in q] if isinstance(q, Mapping) else []
+    if missing:
+        raise ValueError(
+            f"{name}: {', '.join(missing)} is left out of q, and follows from the other coordinates: find the state "
+            "with jaxkane.assemble(system, q, u), and give its state.q; or name the value here."
+        )
+    given = [s for s in system.dependent_speeds if s in u] if isinstance(u, Mapping) else []
+    if given:
+        raise ValueError(
+            f"{name}: {', '.join(given)} is a dependent speed, which follows from the others: leave it out of u. "
+            "(jaxkane.assemble compares it with what the velocity residuals say.)"
+        )
+
+
+class Inputs(dict[str, Component]):
+    """Inputs by name, as `loads` reads them. One that is not there is refused with the names that are."""
+
+    def __init__(self, values: Mapping[str, Component], of: str):
+        super().__init__(values)
+        self._of = of
+
+    def __missing__(self, name: str) -> Component:
+        raise not_there(name, self, self._of)
+
+
+def checked_inputs(system: System, inputs: Mapping[str, Component] | None) -> dict[str, Component]:
+    """All inputs of a system by name; those left out are exactly zero."""
+    own = type(system).__name__
+    if not isinstance(inputs, (Mapping, type(None))):
+        raise TypeError(f"{own}: the inputs are numbers by name, {{name: number}}, got {inputs!r}.")
+    inputs = dict(inputs or {})
+    refuse_unknown(inputs, system.inputs, f"{own} has no input named", "it has")
+    for name, value in inputs.items():
+        if isinstance(value, str) or np.shape(value) != ():
+            raise TypeError(f"{own}: the input {name!r} must be one number, got {value!r}.")
+    return {name: component(inputs.get(name, 0.0)) for name in system.inputs}

@@ -1,0 +1,1 @@
+"""Programs of scalars: exact zeros, one operation of a whole program, native kernels. Knows no mechanics."""

@@ -1,0 +1,100 @@
+"""Arithmetic that knows exact zeros and ones. Knows numbers and triples of them; knows no frame.
+
+A component is a JAX scalar, or a Python float whose value is known while the program is traced. Products with an
+exact zero vanish and products with an exact one cost nothing, before XLA sees them: XLA may not drop `0 * x` itself,
+since x might be infinite.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from .types import Component, Triple
+
+ZERO3: Triple = (0.0, 0.0, 0.0)
+
+
+def component(value: Component) -> Component:
+    """`value` as a component: Python and NumPy numbers become exact floats, arrays stay what they are."""
+    if isinstance(value, float):
+        return value
+    if isinstance(value, (int, np.number)) and not isinstance(value, bool):
+        return float(value)
+    if isinstance(value, np.ndarray):
+        value = jnp.asarray(value)
+    shape = getattr(value, "shape", None)
+    if shape != ():
+        raise TypeError(f"A vector's component must be one number, got {_describe(value)}.")
+    return value
+
+
+def _describe(value) -> str:
+    shape = getattr(value, "shape", None)
+    return repr(value) if shape is None else f"an array of shape {shape}"
+
+
+def is_exact(a: Component) -> bool:
+    return isinstance(a, float)
+
+
+def is_zero(a: Component) -> bool:
+    return isinstance(a, float) and a == 0.0
+
+
+def add(a: Component, b: Component) -> Component:
+    if is_zero(a):
+        return b
+    if is_zero(b):
+        return a
+    return a + b
+
+
+def sub(a: Component, b: Component) -> Component:
+    if is_zero(b):
+        return a
+    if is_zero(a):
+        return -b
+    return a - b
+
+
+def mul(a: Component, b: Component) -> Component:
+    for x, y in ((a, b), (b, a)):
+        if isinstance(x, float):
+            if x == 0.0:
+                return 0.0
+            if x == 1.0:
+                return y
+            if x == -1.0:
+                return -y
+    return a * b
+
+
+def dot(a: Sequence[Component], b: Sequence[Component]) -> Component:
+    total: Component = 0.0
+    for x, y in zip(a, b, strict=True):
+        total = add(total, mul(x, y))
+    return total
+
+
+def cross(a: Triple, b: Triple) -> Triple:
+    (a1, a2, a3), (b1, b2, b3) = a, b
+    return (
+        sub(mul(a2, b3), mul(a3, b2)),
+        sub(mul(a3, b1), mul(a1, b3)),
+        sub(mul(a1, b2), mul(a2, b1)),
+    )
+
+
+def add3(a: Triple, b: Triple) -> Triple:
+    return (add(a[0], b[0]), add(a[1], b[1]), add(a[2], b[2]))
+
+
+def scale3(s: Component, a: Triple) -> Triple:
+    return (mul(s, a[0]), mul(s, a[1]), mul(s, a[2]))
+
+
+def matvec(matrix: Sequence[Sequence[Component]], a: Sequence[Component]) -> tuple[Component, ...]:
+    return tuple(dot(row, a) for row in matrix)

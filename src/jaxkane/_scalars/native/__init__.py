@@ -1,0 +1,83 @@
+"""Scalar programs as machine code, through LLVM. Knows jaxprs and XLA's custom calls; no mechanics.
+
+A traced program of small arrays is unrolled into a graph of scalars, every node once, and written out as one straight
+function over vectors of lanes: members of a batch, or directions of a derivative. What all lanes share is computed
+once, ahead of them. XLA calls the function as a custom call, inside `jit` and inside loops.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+from typing import Any
+
+import jax
+import numpy as np
+
+from ..jax_internals import ClosedJaxpr
+from .available import is_on, is_wanted, machine, tell, use, why_not
+from .graph import CALLS, LIBRARY, Graph, NotScalarError, symbol, unrolled
+from .handler import handler_text
+from .llvm import Writer
+from .objects import Objects, cache_folder
+
+__all__ = ["CALLS", "NotScalarError", "Scalars", "is_on", "is_wanted", "tell", "use", "why_not"]
+
+FMOD = "fmod"  # in the C library what is `rem` in JAX
+
+
+class Scalars:
+    """A program as a graph, and the targets compiled from it.
+
+    Raises `NotScalarError` where the program cannot be written so.
+    """
+
+    def __init__(self, program: ClosedJaxpr):
+        self.graph, inputs = Graph(), []
+        taken: list[Any] = [*program.in_avals]  # `AbstractValue`s without a shape, to the types of JAX 0.12
+        given: list[Any] = [*program.out_avals]
+        for i, aval in enumerate(taken):
+            elements = [self.graph.add("input", (i, e, aval.size), str(aval.dtype)) for e in range(aval.size)]
+            inputs.append(np.array(elements, np.int64).reshape(aval.shape))
+        self.outputs = unrolled(program.jaxpr, program.consts, inputs, self.graph)
+        self.bytes_of = [a.size * a.dtype.itemsize for a in (*taken, *given)]
+        self.functions = {
+            symbol(node._replace(operation=FMOD) if node.operation == "rem" else node)
+            for node in self.graph.nodes
+            if node.operation in LIBRARY or node.operation == "rem"
+        }
+        self.kernel = functools.cache(self._kernel)
+        self.target = functools.cache(self._target)
+
+    def _kernel(self, varies: tuple[bool, ...], lanes: int) -> str:
+        writer = Writer(self.graph, varies, lanes, functools.partial(machine().of_lanes, lanes=lanes))
+        return _compiled(writer.text(len(varies), self.outputs))[1]
+
+    def _target(self, sizes: tuple[int, ...], where: tuple[tuple[bool, ...], ...]) -> str:
+        """The name under which XLA calls the program for a batch of `sizes`, of whose dimensions argument i has those
+        in `where[i]`.
+
+        **Raises:** `NotScalarError` where this machine lacks a function, `RuntimeError` where LLVM fails.
+        """
+        missing = sorted(f for f in self.functions if not machine().has(f))
+        if missing:
+            raise NotScalarError(f"{', '.join(missing)} (not in the mathematical library here)")
+        if all(all(w) or not any(w) for w in where):  # one long batch
+            sizes, where = (int(np.prod(sizes)),) if sizes else (), tuple((any(w),) if sizes else () for w in where)
+        lanes = min(machine().lanes, 1 << (sizes[-1] - 1).bit_length()) if sizes else 1
+        with machine().lock:
+            kernel = self.kernel(tuple(bool(w and w[-1]) for w in where), lanes)
+            address, name = _compiled(handler_text(kernel, sizes, where, len(self.outputs), self.bytes_of))
+            _register(address, name)
+        return name
+
+
+def _compiled(text: str) -> tuple[int, str]:
+    folder = cache_folder()
+    return machine().compile(text, Objects(folder) if folder else None)
+
+
+@functools.cache
+def _register(address: int, name: str) -> None:
+    handler = ctypes.CFUNCTYPE(ctypes.c_void_p)(address)
+    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform="cpu")

@@ -1,0 +1,232 @@
+"""Programs of JAX as graphs of scalars, every node once. Knows jaxprs; knows no machine and no mechanics."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..jax_internals import Jaxpr, Literal
+
+CALLS = ("jit", "pjit")
+
+# Operations by the names of JAX's primitives, as LLVM writes them.
+FLOATS = {"float64": "double", "float32": "float"}
+TYPES = {**FLOATS, "bool": "i1"}
+BINARY = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv", "rem": "frem"}
+LOGIC = {"and": "and", "or": "or", "xor": "xor"}
+COMPARISONS = {"eq": "oeq", "ne": "une", "lt": "olt", "le": "ole", "gt": "ogt", "ge": "oge"}
+INTRINSICS = {"sqrt": "sqrt", "abs": "fabs", "floor": "floor", "max": "maximum", "min": "minimum"}
+LIBRARY = frozenset(
+    "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp exp2 expm1 log log1p pow cbrt erf".split()
+)
+_COMMUTES = frozenset("add mul max min and or xor".split())
+_SAME = frozenset("copy copy_p stop_gradient optimization_barrier".split())
+
+
+class NotScalarError(Exception):
+    """The program holds something that this file does not write."""
+
+
+class Node(NamedTuple):
+    operation: str
+    operands: tuple[Any, ...]
+    dtype: str
+
+
+def symbol(node: Node) -> str:
+    """The name of a function in the C library."""
+    return node.operation if node.dtype == "float64" else node.operation + "f"
+
+
+class Graph:
+    """Scalars, each once. Folded is what XLA folds too: x + 0, x - 0, x * 1, x * -1, x / 1. Not x * 0 and 0 / x, which
+    are NaN where x is not finite or zero, nor 0 - x, which is no -x where x is zero: the zeros of descriptions and of
+    derivatives are gone before (`_components`, and JAX), so that nothing is to be gained."""
+
+    def __init__(self) -> None:
+        self.nodes: list[Node] = []
+        self._numbers: dict[Node, int] = {}
+
+    def add(self, operation: str, operands: tuple[Any, ...], dtype: str) -> int:
+        if dtype not in TYPES:
+            raise NotScalarError(dtype)
+        node = Node(operation, tuple(sorted(operands)) if operation in _COMMUTES else operands, dtype)
+        if node not in self._numbers:
+            self._numbers[node] = len(self.nodes)
+            self.nodes.append(node)
+        return self._numbers[node]
+
+    def constant(self, value: Any, dtype: str) -> int:
+        # By its digits, since -0.0 == 0.0 and nan != nan.
+        return self.add("constant", (float(value).hex() if dtype != "bool" else bool(value),), dtype)
+
+    def value(self, number: int) -> float | bool | None:
+        node = self.nodes[number]
+        if node.operation != "constant":
+            return None
+        return float.fromhex(node.operands[0]) if node.dtype != "bool" else node.operands[0]
+
+    def apply(self, operation: str, operands: tuple[int, ...], dtype: str) -> int:
+        known = self._folded(operation, operands, dtype) if operation in BINARY else None
+        return self.add(operation, operands, dtype) if known is None else known
+
+    def _folded(self, operation: str, operands: tuple[int, ...], dtype: str) -> int | None:
+        a, b = operands
+        x, y = self.value(a), self.value(b)
+        match operation:
+            case "add":
+                return b if x == 0 else a if y == 0 else None
+            case "sub":
+                return a if y == 0 else None
+            case "mul":
+                if x in (1, -1) or y in (1, -1):
+                    other, unit = (b, x) if x in (1, -1) else (a, y)
+                    return other if unit == 1 else self.add("neg", (other,), dtype)
+            case "div":
+                return a if y == 1 else None
+        return None
+
+
+def unrolled(program: Jaxpr, consts: Sequence[Any], inputs: Sequence[np.ndarray], graph: Graph) -> list[np.ndarray]:
+    """The program's outputs as arrays of node numbers."""
+
+    def constants(x: Any) -> np.ndarray:
+        x = np.asarray(x)
+        if str(x.dtype) in TYPES:
+            return _each(lambda v: graph.constant(v, str(x.dtype)), x)
+        return x  # whole numbers: exponents, places
+
+    values: dict[Any, np.ndarray] = {}
+    values.update(zip(program.constvars, map(constants, consts), strict=True))
+    values.update(zip(program.invars, inputs, strict=True))
+    for equation in program.eqns:
+        xs = [constants(v.val) if isinstance(v, Literal) else values[v] for v in equation.invars]
+        if equation.primitive.name in CALLS:
+            inner = equation.params["jaxpr"]
+            outputs = unrolled(inner.jaxpr, inner.consts, xs, graph)
+        else:
+            found = _operation(equation, xs, graph)
+            avals: list[Any] = [v.aval for v in equation.outvars]
+            outputs = [np.broadcast_to(x, aval.shape) for x, aval in zip(found, avals, strict=True)]
+        values.update(zip(equation.outvars, outputs, strict=True))
+    return [constants(v.val) if isinstance(v, Literal) else values[v] for v in program.outvars]
+
+
+def _each(f: Callable[..., int], *xs: np.ndarray) -> np.ndarray:
+    xs = np.broadcast_arrays(*xs)
+    out = np.empty(xs[0].shape, dtype=np.int64)
+    for place in np.ndindex(out.shape):
+        out[place] = f(*(x[place] for x in xs))
+    return out
+
+
+def _operation(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.ndarray]:
+    name, params, aval = equation.primitive.name, equation.params, equation.outvars[0].aval
+    name = "add" if name == "add_any" else name
+    dtype = str(aval.dtype)
+    x_dtype = str(equation.invars[0].aval.dtype) if equation.invars else dtype
+
+    def each(operation: str, *ys: np.ndarray, dtype: str = dtype) -> np.ndarray:
+        return _each(lambda *numbers: graph.apply(operation, tuple(map(int, numbers)), dtype), *ys)
+
+    moved = _moved(name, params, xs, aval.shape)
+    if moved is not None:
+        return moved
+    if name == "convert_element_type" and dtype in TYPES and x_dtype not in TYPES:
+        return [_each(lambda v: graph.constant(v, dtype), xs[0])]  # whole numbers are constants here
+    if x_dtype not in TYPES or dtype not in TYPES:
+        raise NotScalarError(f"{name} of {x_dtype}")
+    one = _full((), 1.0, graph, dtype) if dtype in FLOATS else xs[0]
+    match name:
+        case "neg":
+            return [each(name, xs[0])]
+        case "sign":
+            zero = _full((), 0.0, graph, dtype)
+            positive, negative = each("gt", xs[0], zero, dtype="bool"), each("lt", xs[0], zero, dtype="bool")
+            return [each("select", positive, one, each("select", negative, each("neg", one), xs[0]))]
+        case "logistic":
+            return [each("div", one, each("add", one, each("exp", each("neg", xs[0]))))]
+        case "square":
+            return [each("mul", xs[0], xs[0])]
+        case "integer_pow":
+            return [_power(xs[0], params["y"], each, one)]
+        case "rsqrt":
+            return [each("div", one, each("sqrt", xs[0]))]
+        case "is_finite":
+            return [each("lt", each("abs", xs[0], dtype=x_dtype), _full((), np.inf, graph, x_dtype))]
+        case "not" if dtype == "bool":
+            return [each("xor", xs[0], _full((), True, graph, "bool"))]
+        case "select_n" if len(xs) == 3 and x_dtype == "bool":
+            return [each("select", xs[0], xs[2], xs[1])]
+        case "clamp":
+            return [each("min", each("max", xs[1], xs[0]), xs[2])]
+        case "convert_element_type" if dtype in FLOATS:
+            return [xs[0] if x_dtype == dtype else each("convert", xs[0])]
+        case "reduce_sum":
+            return [_summed(xs[0], params["axes"], each, _full((), 0.0, graph, dtype))]
+    if name in LOGIC and dtype == "bool":
+        return [each(name, *xs)]
+    if name in COMPARISONS and x_dtype in FLOATS:
+        return [each(name, *xs)]
+    of_one_type = dtype in FLOATS and all(str(v.aval.dtype) == dtype for v in equation.invars)
+    if of_one_type and (name in BINARY or name in INTRINSICS or name in LIBRARY):
+        return [each(name, *xs)]
+    raise NotScalarError(f"{name} of {x_dtype}")
+
+
+def _moved(name: str, params: Any, xs: list[np.ndarray], shape: tuple[int, ...]) -> list[np.ndarray] | None:
+    """What only carries scalars from place to place."""
+    x = xs[0] if xs else np.empty(0)
+    match name:
+        case _ if name in _SAME:
+            return xs
+        case "reshape" | "squeeze":
+            return [x.reshape(shape)]
+        case "broadcast_in_dim":
+            kept = [shape[d] if d in params["broadcast_dimensions"] else 1 for d in range(len(shape))]
+            places = dict(zip(params["broadcast_dimensions"], x.shape, strict=True))
+            return [np.broadcast_to(x.reshape([places.get(d, 1) for d in range(len(kept))]), shape)]
+        case "concatenate":
+            return [np.concatenate(xs, axis=params["dimension"])]
+        case "stack":
+            return [np.stack(xs, axis=params["axis"])]
+        case "unstack":
+            return [np.take(x, i, axis=params["axis"]) for i in range(x.shape[params["axis"]])]
+        case "split":
+            return list(np.split(x, np.cumsum(params["sizes"])[:-1], axis=params["axis"]))
+        case "transpose":
+            return [np.transpose(x, params["permutation"])]
+        case "rev":
+            return [np.flip(x, params["dimensions"])]
+        case "slice":
+            steps = params["strides"] or (1,) * x.ndim
+            return [x[tuple(map(slice, params["start_indices"], params["limit_indices"], steps))]]
+        case "pad":
+            out = np.full(shape, xs[1], dtype=x.dtype)
+            places = [low + (1 + step) * np.arange(n) for n, (low, _, step) in zip(x.shape, params["padding_config"])]
+            kept = [(0 <= at) & (at < n) for at, n in zip(places, shape)]  # a negative padding takes away
+            out[np.ix_(*(at[k] for at, k in zip(places, kept)))] = x[np.ix_(*kept)]
+            return [out]
+    return None
+
+
+def _full(shape: Sequence[int], value: Any, graph: Graph, dtype: str) -> np.ndarray:
+    return np.full(shape, graph.constant(value, dtype), dtype=np.int64)
+
+
+def _power(x: np.ndarray, y: int, each: Callable[..., np.ndarray], one: np.ndarray) -> np.ndarray:
+    found, factor, n = one, x, abs(y)
+    while n:
+        if n & 1:
+            found = each("mul", found, factor)
+        factor, n = each("mul", factor, factor) if n > 1 else factor, n >> 1
+    return found if y >= 0 else each("div", one, found)
+
+
+def _summed(x: np.ndarray, axes: Iterable[int], each: Callable[..., np.ndarray], zero: np.ndarray) -> np.ndarray:
+    for axis in sorted(axes, reverse=True):
+        x = functools.reduce(lambda a, b: each("add", a, b), np.moveaxis(x, axis, 0), zero)
+    return x

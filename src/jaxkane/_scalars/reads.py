@@ -1,0 +1,461 @@
+"""What the code of functions, classes and objects reads, and whether it has changed. Knows Python; knows no mechanics.
+
+A program keeps the numbers that its code read when it was traced: globals, attributes of modules, classes and objects,
+closures, defaults, and the code of the functions that it calls. They are part of every key under which a program is
+kept (`fuse.fused`, `compiled`), by a digest that is formed once. After that, a look at every place where something was
+found costs some microseconds.
+
+It does not see what is read through objects of libraries, C extensions, `getattr` with a name that is put together, or
+arrays above a megabyte that are changed in place: for these there is `forget`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import dataclasses
+import dis
+import enum
+import functools
+import hashlib
+import itertools
+import os
+import sys
+import sysconfig
+import threading
+import types
+import weakref
+from collections.abc import Callable, Mapping
+from operator import is_
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jax.core import Tracer
+
+_LARGEST_ARRAY = 1 << 20  # [bytes] compared number by number
+_MOST_PLACES = 20_000  # beyond these what a place holds is told by its identity
+_MOST_KEPT = 256
+_MADE_BY_PYTHON = 1 << 9  # Py_TPFLAGS_HEAPTYPE
+_MISSING: Any = type("_Missing", (), {"__repr__": lambda self: "missing"})()
+
+# Libraries are taken to stay as they are. Catalogue files are descriptions like a user's.
+_LIBRARIES = frozenset("jax jaxlib numpy scipy equinox jaxtyping diffrax optimistix lineax optax".split())
+_INSTALLED = tuple({sysconfig.get_path(name) + os.sep for name in ("stdlib", "platstdlib", "purelib", "platlib")})
+_NAMESPACES = (types.SimpleNamespace, argparse.Namespace)
+_NUMBERS = frozenset((type(None), bool, int, float, complex, str, bytes, type(...), type(NotImplemented)))
+
+
+@functools.lru_cache(maxsize=4096)
+def _is_library(module: str | None) -> bool:
+    """Whether a module is one whose code stays as it is: of Python, of JAX and its company, or installed."""
+    name = module or "builtins"
+    first = name.partition(".")[0]
+    if first == "jaxkane":
+        return not name.startswith("jaxkane.catalog")
+    if first in _LIBRARIES or first == "__main__":  # whose file may be that of a notebook's kernel
+        return first != "__main__"
+    file = getattr(sys.modules.get(name), "__file__", None)
+    if file is None:  # made in a notebook, or built into Python
+        return first in sys.stdlib_module_names
+    return file.startswith(_INSTALLED)
+
+
+def _is_of_library(kind: type) -> bool:
+    if kind.__module__ == "builtins":  # said of a class, too, that was made where there is no `__name__`
+        return not kind.__flags__ & _MADE_BY_PYTHON
+    return _is_library(kind.__module__)
+
+
+class Reads:
+    """All places that the code of `root` reads, with what was found there; `version` is a digest of it."""
+
+    def __init__(self, root: Any):
+        self.root = root
+        self.used = 0
+        self.is_passing = False  # something in it is being traced, and must not be held on to
+        self.named: list[tuple[Mapping[str, Any], str, Any]] = []
+        self.attributes: list[tuple[Any, str, Any]] = []
+        self.cells: list[tuple[types.CellType, Any]] = []
+        self.functions: list[tuple[types.FunctionType, Any, Any, Any]] = []
+        self.sequences: list[tuple[Any, tuple[Any, ...]]] = []
+        self.mappings: list[tuple[Mapping[Any, Any], tuple[Any, ...], tuple[Any, ...]]] = []
+        self.arrays: list[tuple[np.ndarray, np.ndarray]] = []
+        walk = _Walk(self)
+        walk.value(root, frozenset())
+        self.version = walk.sha.digest()
+        self.kept = walk.seen  # an identity means nothing once its object is gone
+
+    def unchanged(self) -> bool:
+        """Whether every place still holds what was found there."""
+        try:
+            for names, name, value in self.named:
+                if names.get(name, _MISSING) is not value:
+                    return False
+            for f, code, defaults, more in self.functions:
+                if f.__code__ is not code or f.__defaults__ is not defaults or f.__kwdefaults__ is not more:
+                    return False
+            for mapping, keys, values in self.mappings:
+                now = tuple(mapping.values())
+                if len(now) != len(values) or not all(map(is_, now, values)) or tuple(mapping) != keys:
+                    return False
+            return (
+                all(_inside(cell) is value for cell, value in self.cells)
+                and all(getattr(x, name, _MISSING) is value for x, name, value in self.attributes)
+                and all(len(x) == len(items) and all(map(is_, tuple(x), items)) for x, items in self.sequences)
+                and all(_same_numbers(array, copy) for array, copy in self.arrays)
+            )
+        except RuntimeError:  # a dict or a set that another thread is changing
+            return False
+
+
+def _inside(cell: types.CellType) -> Any:
+    try:
+        return cell.cell_contents
+    except ValueError:  # still empty
+        return _MISSING
+
+
+def _same_numbers(array: np.ndarray, copy: np.ndarray) -> bool:
+    return array.shape == copy.shape and array.dtype == copy.dtype and array.tobytes() == copy.tobytes()
+
+
+class _Walk:
+    """Goes from a root to everything that its code reads, noting the places and hashing what stands there."""
+
+    def __init__(self, reads: Reads):
+        self.reads = reads
+        self.sha = hashlib.blake2b(digest_size=16)
+        self.seen: dict[Any, tuple[int, Any]] = {}
+        self.depth = 0
+
+    def say(self, *words: Any) -> None:
+        for word in words:
+            data = word if isinstance(word, bytes) else str(word).encode()
+            self.sha.update(b"%d:" % len(data))
+            self.sha.update(data)
+
+    def is_new(self, key: Any, keep: Any) -> bool:
+        if key in self.seen:
+            self.say("again", self.seen[key][0])
+            return False
+        self.seen[key] = len(self.seen), keep
+        return True
+
+    def value(self, value: Any, names: frozenset[str]) -> None:
+        """`names`: those that the code has in which the value was found, as `constants.gravity` has "gravity"."""
+        kind = type(value)
+        if kind in _NUMBERS:
+            self.say(kind.__name__, value if kind is bytes else repr(value))
+        elif isinstance(value, types.ModuleType):
+            self.module(value, names)
+        elif self.is_new(id(value), value):
+            if self.depth > 100 or len(self.seen) > _MOST_PLACES:
+                return self.opaque(value)
+            self.depth += 1
+            self.composite(value, names)
+            self.depth -= 1
+
+    def composite(self, value: Any, names: frozenset[str]) -> None:
+        if isinstance(value, types.FunctionType):
+            self.function(value)
+        elif isinstance(value, type):
+            self.a_class(value)
+        elif isinstance(value, (types.MethodType, staticmethod, classmethod)):
+            self.parts("method", (value.__func__, getattr(value, "__self__", None)), names)
+        elif isinstance(value, property):
+            self.parts("property", (value.fget, value.fset), names)
+        elif isinstance(value, (functools.partial, functools.partialmethod)):
+            self.parts("partial", (value.func, value.args, value.keywords), names)
+        elif isinstance(value, functools.cached_property):
+            self.parts("property", (value.func,), names)
+        elif isinstance(value, Tracer):
+            self.reads.is_passing = True
+            self.opaque(value)
+        elif isinstance(value, np.ndarray):
+            self.array(value)
+        elif isinstance(value, np.generic):
+            self.say("number", value.dtype.str, value.tobytes())
+        elif isinstance(value, (list, tuple, set, frozenset, collections.deque)):
+            self.say(type(value).__qualname__)
+            if not isinstance(value, (tuple, frozenset)):
+                self.reads.sequences.append((value, tuple(value)))
+            self.parts("items", tuple(value), names)
+        elif isinstance(value, (dict, types.MappingProxyType)):
+            self.mapping(value, names)
+        elif isinstance(value, enum.Enum):
+            self.parts("enum", (type(value).__qualname__, value.name, value.value), names)
+        else:
+            self.an_object(value, names)
+
+    def parts(self, kind: str, parts: tuple[Any, ...], names: frozenset[str]) -> None:
+        self.say(kind, len(parts))
+        for part in parts:
+            self.value(part, names)
+
+    def mapping(self, mapping: Mapping[Any, Any], names: frozenset[str]) -> None:
+        items = tuple(mapping.items())
+        self.reads.mappings.append((mapping, tuple(k for k, _ in items), tuple(v for _, v in items)))
+        for key, value in items:
+            self.parts("entry", (key, value), names)
+
+    def module(self, module: types.ModuleType, names: frozenset[str]) -> None:
+        """Of a module that is no library, what the code names there."""
+        self.say("module", module.__name__)
+        if _is_library(module.__name__):
+            return
+        for name in sorted(names & vars(module).keys()):
+            if self.is_new((id(module), name), module):
+                self.place(vars(module), name, names)
+
+    def place(self, where: dict[str, Any], name: str, names: frozenset[str]) -> None:
+        value = where.get(name, _MISSING)
+        self.reads.named.append((where, name, value))
+        self.say(name)
+        self.value(value, names)
+
+    def function(self, f: types.FunctionType) -> None:
+        self.say("function", f.__qualname__)
+        self.reads.functions.append((f, f.__code__, f.__defaults__, f.__kwdefaults__))
+        cells = f.__closure__ or ()
+        if _is_library(f.__globals__.get("__name__") or "__main__"):
+            # Of a library's decorator, what it decorates.
+            inside = [_inside(cell) for cell in cells] + [vars(f).get("__wrapped__")]
+            self.parts("decorates", tuple(x for x in inside if callable(x)), frozenset())
+            return
+        self.code(f.__code__)
+        globals_, imported, names = _names_of(f.__code__)
+        for name in globals_:
+            if self.is_new((id(f.__globals__), name), None) or isinstance(f.__globals__.get(name), types.ModuleType):
+                self.place(f.__globals__, name, names)
+        for name in imported:
+            if name in sys.modules:
+                self.place(sys.modules, name, names)
+        for cell in cells:
+            value = _inside(cell)
+            self.reads.cells.append((cell, value))
+            self.value(value, names)
+        self.parts("defaults", (f.__defaults__, f.__kwdefaults__, vars(f).get("__wrapped__")), names)
+
+    def code(self, code: types.CodeType) -> None:
+        self.say("code", code.co_code, *code.co_names, "|", *code.co_varnames, "|", *code.co_freevars)
+        for constant in code.co_consts:
+            if isinstance(constant, types.CodeType):
+                self.code(constant)
+            else:
+                self.say(type(constant).__name__, repr(constant))
+
+    def a_class(self, cls: type) -> None:
+        self.say("class", cls.__module__, cls.__qualname__)
+        for base in cls.__mro__:
+            own = vars(base)
+            if _is_of_library(base):
+                continue
+            self.reads.mappings.append((own, tuple(own), tuple(own.values())))
+            for name, value in tuple(own.items()):
+                plain = not (name.startswith("__") and name.endswith("__"))
+                if plain or (isinstance(value, types.FunctionType) and value.__code__.co_filename != "<string>"):
+                    self.say(name)
+                    self.value(value, frozenset())
+
+    def array(self, array: np.ndarray) -> None:
+        if array.nbytes > _LARGEST_ARRAY or array.dtype.hasobject:
+            return self.opaque(array)
+        self.reads.arrays.append((array, array.copy()))
+        self.say("array", array.dtype.str, array.shape, array.tobytes())
+
+    def an_object(self, thing: Any, names: frozenset[str]) -> None:
+        kind = type(thing)
+        own = getattr(thing, "__dict__", None)
+        if _is_of_library(kind) and kind not in _NAMESPACES:
+            wrapped = own.get("__wrapped__") if isinstance(own, dict) else None
+            if isinstance(own, dict) and dataclasses.is_dataclass(thing):
+                self.say("object", kind.__qualname__)
+                self.mapping(own, names)
+            elif wrapped is not None:  # a function that is compiled, or remembers
+                self.parts("wrapper", (wrapped,), names)
+            else:
+                self.opaque(thing)
+            return
+        self.say("object")
+        self.value(kind, names)
+        if isinstance(own, dict):
+            self.mapping(own, names)
+        for base in kind.__mro__:
+            for name, member in vars(base).items():
+                if isinstance(member, types.MemberDescriptorType) and not _is_of_library(base):
+                    value = getattr(thing, name, _MISSING)
+                    self.reads.attributes.append((thing, name, value))
+                    self.parts("slot", (name, value), names)
+
+    def opaque(self, thing: Any) -> None:
+        """What cannot be looked into is told by which object it is."""
+        self.say("opaque", type(thing).__qualname__, _serial(thing))
+
+
+@functools.lru_cache(maxsize=1024)
+def _names_of(code: types.CodeType) -> tuple[tuple[str, ...], tuple[str, ...], frozenset[str]]:
+    """Of a function's code: the globals that it reads, the modules that it imports, and all names in it."""
+    read, imported, names = {}, {}, set()
+    codes = [code]
+    while codes:
+        now = codes.pop()
+        names |= {*now.co_names, *now.co_varnames, *now.co_freevars}
+        codes += [c for c in now.co_consts if isinstance(c, types.CodeType)]
+        for i in dis.get_instructions(now):
+            if i.opname in ("LOAD_GLOBAL", "LOAD_NAME"):  # the latter in the body of a class
+                read[i.argval] = None
+            elif i.opname == "IMPORT_NAME":
+                imported[i.argval] = None
+    return tuple(name for name in read if not name.startswith("__")), tuple(imported), frozenset(names)
+
+
+_serials: dict[int, tuple[Any, int]] = {}
+_count = itertools.count()
+
+
+def _serial(thing: Any) -> int:
+    """A number that no other object has had or will have, unlike its `id`."""
+    known = _serials.get(id(thing))
+    if known is not None and known[0]() is thing:
+        return known[1]
+    number, place = next(_count), id(thing)
+    try:
+        reference = weakref.ref(thing, lambda gone: _gone(place, gone))
+    except TypeError:  # one that has no weak references is another every time
+        return number
+    _serials[place] = reference, number
+    return number
+
+
+def _gone(place: int, reference: Any) -> None:
+    if place in _serials and _serials[place][0] is reference:
+        del _serials[place]
+
+
+_known: dict[int, Reads] = {}
+_lock = threading.Lock()
+_forgotten = b"0"
+_memories: list[Callable[[], None]] = []
+
+
+def _reads_of(root: Any) -> Reads:
+    reads = _known.get(id(root))
+    if reads is None or reads.root is not root or not reads.unchanged():
+        reads = _kept(Reads(root))
+    reads.used = next(_count)
+    return reads
+
+
+def _kept(reads: Reads) -> Reads:
+    if reads.is_passing:
+        return reads
+    with _lock:
+        if len(_known) >= _MOST_KEPT:
+            oldest = sorted(_known, key=lambda i: _known[i].used)
+            for i in oldest[: _MOST_KEPT // 2]:
+                del _known[i]
+        reads.used = next(_count)
+        _known[id(reads.root)] = reads
+    return reads
+
+
+_nothing_to_read: set[type] = {*_NUMBERS, np.ndarray, np.dtype}
+
+
+def _roots(value: Any, found: list[Any]) -> list[Any]:
+    """Classes, functions and objects in a tree of arguments whose code, or contents, a program depends on."""
+    kind = type(value)
+    parts: Any = ()
+    if kind is tuple or kind is list:
+        parts = value
+    elif kind is dict:
+        parts = value.values()
+    elif isinstance(value, eqx.Module):
+        # Its numbers are arguments of the program, and what is static in it is compared with them.
+        parts = vars(value).values()
+        if not _is_of_library(kind):
+            found.append(kind)
+    elif isinstance(value, (jax.Array, np.generic)):  # a tracer too
+        _nothing_to_read.add(kind)
+    elif isinstance(value, jax.tree_util.Partial):
+        parts = value.func, value.args, value.keywords
+    elif not jax.tree_util.all_leaves([value]):
+        own = getattr(value, "__dict__", None)
+        parts = own.values() if own else jax.tree.leaves(value, is_leaf=lambda x: x is not value)
+        if not _is_of_library(kind):
+            found.append(kind)
+    elif isinstance(value, type) or callable(value) or not _is_of_library(kind):
+        found.append(value)
+    for part in parts:
+        if type(part) not in _nothing_to_read:
+            _roots(part, found)
+    return found
+
+
+def version_of(*values: Any) -> bytes:
+    """A digest of all that the code in these values reads at this moment, for the key of a program."""
+    return b"".join([_forgotten, *[_reads_of(root).version for root in _roots(values, [])]])
+
+
+def settling(f: Callable[..., Any]) -> Callable[..., Any]:
+    """`f`, which is being traced: what it changes itself in what it reads (a counter, a memory) is no change."""
+
+    @functools.wraps(f)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        before = [_reads_of(root) for root in _roots((args, kwargs), [])]
+        found = f(*args, **kwargs)
+        for reads in before:
+            now = _known.get(id(reads.root))
+            if now is not None and now.version == reads.version and not now.unchanged():
+                after = Reads(reads.root)
+                after.version = reads.version
+                _kept(after)
+        return found
+
+    return call
+
+
+def compiled(f: Callable[..., Any]) -> Callable[..., Any]:
+    """`equinox.filter_jit(f)`, traced again where what the code of its arguments reads has changed.
+
+    How often it was traced, tests ask of its attribute `compiled`.
+    """
+
+    def run(version: bytes, args: Any, kwargs: Any) -> Any:
+        return settling(f)(*args, **kwargs)
+
+    run.__name__, run.__qualname__ = f.__name__, f.__qualname__  # under which programs are kept on disk
+    jitted = eqx.filter_jit(run)
+
+    @functools.wraps(f)
+    def call(*args: Any, **kwargs: Any) -> Any:
+        return jitted(version_of(args, kwargs), args, kwargs)
+
+    vars(call)["compiled"] = jitted
+    return call
+
+
+def on_forget(memory: Callable[[], None]) -> None:
+    """Call this function when everything is to be forgotten."""
+    _memories.append(memory)
+
+
+def forget() -> None:
+    """Forget every compiled program, so that all is read and traced again at the next call.
+
+        constants_of_a_library.gravity = 1.62  # nobody is told
+        jk.forget()
+
+    Changes of what a description, an input or a controller reads are noticed without it: see "What is noticed" on the
+    page about speed. It is for what cannot be seen, and for functions that you compiled yourself with `jax.jit`: their
+    programs are thrown away too (`jax.clear_caches`).
+    """
+    global _forgotten
+    with _lock:
+        _forgotten = b"%d" % next(_count)
+        _known.clear()
+    for memory in _memories:
+        memory()
+    jax.clear_caches()

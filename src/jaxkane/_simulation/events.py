@@ -1,0 +1,122 @@
+"""What ends a motion: the quantities of a description that may vanish, and the instant at which one does.
+
+Knows descriptions and their rates; knows no integrator.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._description.system import State, System
+from .._method.kane import Instant
+from .._scalars.fuse import fused
+from .._scalars.linear import as_vector, determinant
+from .._scalars.types import Component
+from .crossings import Crossing
+
+
+class Events(NamedTuple):
+    """The events of a system: their names in the order of the alphabet, the directions in which they count (1, -1, or 0
+    for both), and whether any of them reads speeds."""
+
+    names: tuple[str, ...]
+    directions: tuple[int, ...]
+    read_speeds: bool
+
+
+def events_of(system: System, t: Array, state: State) -> Events:
+    """What a description says may end its motion."""
+    found = jax.eval_shape(_named_events, system, t, state.q, state.u)
+    names = tuple(found)
+    directions = tuple(e.direction if isinstance(e, Crossing) else 0 for e in found.values())
+    values = lambda u: as_vector(_values(system, t, state.q, u), state.q)  # noqa: E731
+    return Events(names, directions, bool(names) and _is_read(values, state.u))
+
+
+def _is_read(f: Callable[[Array], Array], x: Array) -> bool:
+    """Whether the value of `f` depends on `x` at all."""
+    program = jax.make_jaxpr(f)(x).jaxpr
+    needed = {id(v) for v in program.outvars}
+    for equation in reversed(program.eqns):
+        if any(id(v) in needed for v in equation.outvars):
+            needed |= {id(v) for v in equation.invars}
+    return id(program.invars[0]) in needed
+
+
+def _named_events(system: System, t: Component, q: Array, u: Array) -> dict[str, Any]:
+    now = Instant(system, t, q, u)
+    found = dict(system.events(t, now.q, now.u_all))
+    return {name: _as_float(found[name], q.dtype) for name in sorted(found)}
+
+
+def _as_float(event: Any, dtype: Any) -> Any:
+    if isinstance(event, Crossing):
+        return Crossing(jnp.asarray(event.value, dtype=dtype), event.direction)
+    return jnp.asarray(event, dtype=dtype)
+
+
+def _values(system: System, t: Component, q: Array, u: Array) -> list[Array]:
+    return [e.value if isinstance(e, Crossing) else e for e in _named_events(system, t, q, u).values()]
+
+
+@fused
+def values_and_rates(system: System, t: Component, q: Array, u: Array, u_dot: Array) -> tuple[Array, Array]:
+    """All events (n,) and their time derivatives (n,) along the motion."""
+    q_dot = as_vector(Instant(system, t, q, u).q_dot, q)
+    f = lambda t, q, u: as_vector(_values(system, t, q, u), q)  # noqa: E731
+    return jax.jvp(f, (t, q, u), (jnp.ones_like(t), q_dot, u_dot))
+
+
+@fused
+def determinant_of_dependent_speeds(system: System, t: Component, q: Array, u: Array) -> Array:
+    """det C_dep: where it vanishes, the dependent speeds no longer follow from the independent ones."""
+    return as_vector([determinant(Instant(system, t, q, u).C_dep)], q)[0]
+
+
+class End(NamedTuple):
+    """Where a motion ended: `t` [s], `state`, and whether these move smoothly with what they follow from."""
+
+    t: Array
+    state: State
+    smooth: Array
+
+
+def at_zero(system: System, t: Array, state: State, which: Array, happened: Array, rates: Any, reach: Array) -> End:
+    """The instant beside `t` at which the event `which` vanishes, with derivatives up to the second order.
+
+        t_end = t - g / g_dot,   y_end = y + (t_end - t) y_dot,   twice
+
+    To first order that is the implicit function theorem. Here `t` is a number, near enough (within `reach`) that two
+    steps of Newton's method are exact, and `state` is the motion at that time.
+
+    **Arguments:** `rates`: (t, q, u) -> (q_dot, u_dot); `happened`: False where no event did: then it is `t` itself.
+    """
+    t = jax.lax.stop_gradient(t)
+
+    def measured(t: Array, q: Array, u: Array):
+        q_dot, u_dot = rates(t, q, u)
+        g, g_dot = values_and_rates(system, t, q, u, u_dot)
+        return q_dot, u_dot, g[which], g_dot[which]
+
+    def stage(carry: Any, k: Array):
+        (t, q, u), step, smooth = carry
+        q_dot, u_dot, g, g_dot = measured(t, q, u)
+        # Beside the first point, where to go; there halfway, by the rates in the middle; and there again.
+        is_small = jnp.abs(g) <= jnp.abs(g_dot) * reach
+        newton = -g / jnp.where(happened & is_small & (g_dot != 0), g_dot, jnp.ones_like(g_dot))
+        newton = jnp.where(happened & is_small, newton, jnp.zeros_like(newton))
+        step = jnp.where(k == 1, step, newton)
+        ahead = jnp.where(k == 0, 0.5 * step, step)
+        base = jax.tree.map(lambda x, x0: jnp.where(k == 1, x0, x), (t, q, u), (t0, q0, u0))
+        moved = jax.tree.map(lambda x, x_dot: x + ahead * x_dot, base, (jnp.ones_like(t), q_dot, u_dot))
+        return (moved, step, smooth & (is_small | (k == 1))), None
+
+    t0, q0, u0 = t, state.q, state.u
+    first = ((t0, q0, u0), jnp.zeros_like(t), jnp.array(True))
+    ((t, q, u), _, smooth), _ = jax.lax.scan(stage, first, jnp.arange(3))
+    return End(t, State(q, u), smooth)

@@ -1,0 +1,218 @@
+"""One motion as one compiled program: integrated, ended, masked. Knows diffrax and the method, and no mechanism."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._common.lookup import not_there
+from .._description.parameters import parameter_info
+from .._description.system import State, System
+from .._description.units import units_of
+from .._method.checks import configuration_residual, configuration_tolerance
+from .._method.drift import correction, has_configuration_constraints, projected
+from .._method.equations import dependent_speeds
+from .._method.kane import Instant, checked_inputs
+from .._method.rates import state_rates
+from .._scalars.nan import derivative_free_where_not_finite, nan_derivative_where, nan_where
+from .._scalars.reads import compiled
+from .._scalars.types import Component
+from .events import Events, at_zero, determinant_of_dependent_speeds, events_of, values_and_rates
+from .kinks import ToKinks
+from .settings import Settings
+from .signals import evaluate, sample_times, signals_are_sound, without_nonsense
+from .stops import AdaptiveToStops, Quantities, ToStops
+from .trajectory import Status, Trajectory
+
+
+class Now(eqx.Module):
+    """What an input function receives: `state.q`, `state.u`, and any coordinate or speed by name."""
+
+    q: Array
+    u: Array
+    t: Any
+    system: System
+
+    def __getitem__(self, name: str) -> Component:
+        system = self.system
+        for names, values in ((system.coordinates, self.q), (system.speeds, self.u)):
+            if name in names:
+                return values[names.index(name)]
+        if name in system.dependent_speeds:
+            now = Instant(system, self.t, self.q, self.u)
+            return jnp.asarray(now.u_dep[system.dependent_speeds.index(name)])
+        raise not_there(name, (*system.coordinates, *system.speeds, *system.dependent_speeds), "the state")
+
+
+@compiled
+def solve(system: System, state: State, ts: Array, signals: Any, settings: Settings) -> Trajectory:
+    """`simulate` without its checks: one compiled program."""
+    origin = (system, state, ts, signals)
+    valid = _is_valid(*origin)
+    # What is not finite must not enter the solver, where it would spoil the gradient of what is shared.
+    system, state = jax.tree.map(
+        lambda x: jnp.where(valid, x, jnp.ones_like(x)) if eqx.is_inexact_array(x) else x, (system, state)
+    )
+    ts = jnp.where(valid, ts, jnp.arange(ts.shape[0], dtype=ts.dtype))
+    signals = without_nonsense(signals, valid)
+    constrained = has_configuration_constraints(system, ts[0], state.q)
+
+    def vector_field(t, y, args):
+        system, signals = args
+        q, u = y
+        q_dot, u_dot = state_rates(system, t, q, u, inputs_at(system, signals, t, q, u))
+        if constrained and settings.stabilize:
+            q_dot = q_dot + settings.stabilize * correction(system, t, q)
+        return tuple(jnp.where(valid, rate, jnp.zeros_like(rate)) for rate in (q_dot, u_dot))
+
+    def trial_rates(t, y, args):
+        # A step that is rejected since its rates are not finite must not spoil a derivative in reverse mode.
+        return derivative_free_where_not_finite(vector_field, t, y, args)
+
+    forward = isinstance(settings.adjoint, diffrax.ForwardMode)
+    events = events_of(system, ts[0], state)
+    stops = bool(events.names or system.dependent_speeds)
+    step, controller, reach = _steps(ts, signals, settings)
+    if stops:
+        controller = _to_stops(controller, vector_field, events, system, ts, reach)
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(vector_field if forward else trial_rates),
+        settings.solver,
+        ts[0],
+        ts[-1],
+        step,
+        (state.q, state.u),
+        (system, signals),
+        saveat=diffrax.SaveAt(subs=(diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)), controller_state=stops),
+        stepsize_controller=controller,
+        adjoint=settings.adjoint,
+        max_steps=settings.max_steps,
+        progress_meter=diffrax.TqdmProgressMeter() if settings.progress else diffrax.NoProgressMeter(),
+        throw=False,
+    )
+    times, states = cast(Any, (solution.ts, solution.ys))
+    (t_reached, t_last), ((q, u), (q_last, u_last)) = jax.lax.stop_gradient(times), states
+    reached, t_end, end = jnp.isfinite(t_reached) & valid, t_last[0], State(q_last[0], u_last[0])
+
+    which = cast(Any, solution.controller_state).which if stops else jnp.array(-1)
+    status = jnp.where(valid, _status(solution, which, events), Status.INVALID).astype(jnp.int32)
+    smooth = status == Status.COMPLETED
+    t_end = jnp.where(smooth, ts[-1], jnp.where(valid, t_end, ts[0]))
+    if events.names:
+        happened = status >= Status.EVENT
+        beside = jax.tree.map(lambda x, first: jnp.where(happened, x, first), (t_end, end), (ts[0], state))
+        rates = lambda t, q, u: vector_field(t, (q, u), (system, signals))  # noqa: E731
+        found = at_zero(system, beside[0], beside[1], jnp.maximum(which, 0), happened, rates, 4 * reach)
+        t_end, end = jax.tree.map(lambda x, y: jnp.where(happened, x, y), (found.t, found.state), (t_end, end))
+        smooth |= happened & found.smooth
+        # The last step ends a little beside the event: samples from there to here are those of the event itself.
+        here = 64 * jnp.finfo(ts.dtype).eps * jnp.max(jnp.abs(ts))
+        late = happened & ~reached & (ts <= t_end + here)
+        reached = jnp.where(happened, ts <= t_end + here, reached)
+        q, u = (jnp.where(late[:, None], x[None], y) for x, y in zip((end.q, end.u), (q, u), strict=True))
+
+    # What follows from the motion is found where there is one, and from the first state elsewhere: a value that is
+    # not finite has derivatives that a mask behind it cannot take away.
+    q, u = (jnp.where(reached[:, None], y, first[None]) for y, first in ((q, state.q), (u, state.u)))
+    end = jax.tree.map(lambda y, first: jnp.where(valid, y, first), end, state)
+    if constrained and settings.project:
+        q = jax.vmap(lambda t, q: projected(system, t, q))(ts, q)
+        end = State(projected(system, t_end, end.q), end.u)
+    u_dep = jax.vmap(lambda t, q, u: dependent_speeds(system, t, q, u))(ts, q, u)
+    inputs = jax.vmap(lambda t, q, u: inputs_at(system, signals, t, q, u, all_of_them=True))(ts, q, u)
+    q, u, u_dep, inputs = nan_where(~reached, (q, u, u_dep, inputs), origin)
+    t_end, end = nan_derivative_where(~smooth, (t_end, end), origin)
+    return Trajectory(
+        t=ts,
+        q=q,
+        u=u,
+        u_dep=u_dep,
+        inputs=inputs,
+        status=status,
+        t_end=t_end,
+        stats={
+            "steps": solution.stats["num_steps"],
+            "accepted": solution.stats["num_accepted_steps"],
+            "rejected": solution.stats["num_rejected_steps"],
+        },
+        names=(tuple(system.coordinates), tuple(system.speeds), tuple(system.dependent_speeds)),
+        events=events.names,
+        adjoint=type(settings.adjoint).__name__,
+        units=tuple(units_of(system).items()),
+        end=nan_where(~valid, end, origin),
+    )
+
+
+def _steps(ts: Array, signals: Any, settings: Settings) -> tuple[Any, Any, Array]:
+    """The first step, the controller of the others, and how near to an event the last one must end [s]."""
+    whole = jax.lax.stop_gradient(ts[-1] - ts[0])
+    rounding = 1e3 * jnp.finfo(ts.dtype).eps * whole
+    reach = 8 * rounding + 1e-9 * whole
+    if settings.step is not None:
+        # A fixed step is spread evenly over the whole time: a rounding error must not make it one step more, after
+        # which no step would end where a sample of an input stands.
+        several = 1.0 + jnp.finfo(ts.dtype).eps ** 0.5
+        return several * settings.step, diffrax.ConstantStepSize(), reach
+    # A first step, right or wrong by a factor of ten, spares the two more copies of the right-hand side that diffrax
+    # would compile to choose one.
+    step = jnp.minimum(whole / 1000, jax.lax.stop_gradient(ts[1] - ts[0]))
+    controller = diffrax.PIDController(rtol=settings.rtol, atol=settings.atol, dtmin=rounding, force_dtmin=False)
+    kinks = sample_times(signals, ts.dtype)
+    return step, controller if kinks is None else ToKinks(controller, *kinks), reach
+
+
+def _to_stops(controller: Any, vector_field: Any, events: Events, system: System, ts: Array, reach: Array) -> ToStops:
+    """A controller that also ends the motion: at the events, and before the dependent speeds are singular."""
+
+    def watch(t, y, args):
+        q, u = y
+        values = rates = jnp.zeros(0, q.dtype)
+        if events.names:
+            u_dot = vector_field(t, y, args)[1] if events.read_speeds else jnp.zeros_like(u)
+            values, rates = values_and_rates(args[0], t, q, u, u_dot)
+        singular = bool(system.dependent_speeds)
+        bound = determinant_of_dependent_speeds(args[0], t, q, u) if singular else jnp.ones((), q.dtype)
+        return Quantities(values, rates, bound)
+
+    whole = jax.lax.stop_gradient(ts[-1] - ts[0])
+    adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
+    kind: Any = AdaptiveToStops if adaptive else ToStops
+    return kind(
+        controller=controller,
+        watch=watch,
+        direction=jnp.asarray(events.directions, ts.dtype),
+        resolution=reach,
+        rounding=1e3 * jnp.finfo(ts.dtype).eps * whole,
+        shortest=whole / 1000,
+    )
+
+
+def inputs_at(system: System, signals: Any, t: Component, q: Array, u: Array, all_of_them: bool = False):
+    values = evaluate(signals, t, Now(q, u, t, system))
+    names = checked_inputs(system, values) if all_of_them else values
+    return {name: jnp.asarray(values.get(name, 0.0), dtype=q.dtype) for name in names}
+
+
+def _is_valid(system: System, state: State, ts: Array, signals: Any) -> Array:
+    finite = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((system, state, ts)) if eqx.is_inexact_array(x)]
+    positive = [jnp.all(getattr(system, name) > 0) for name, info in parameter_info(system).items() if info.positive]
+    residual = configuration_residual(system, ts[0], state.q)
+    consistent = jnp.all(jnp.abs(residual) <= configuration_tolerance(residual.dtype))
+    # A window of a fit may stand still at its last time.
+    rising = jnp.all(ts[1:] >= ts[:-1]) & (ts[-1] > ts[0])
+    return jnp.all(jnp.stack([*finite, *positive, consistent, rising, signals_are_sound(signals)]))
+
+
+def _status(solution: diffrax.Solution, which: Array, events: Events) -> Array:
+    result = solution.result
+    status = jnp.where(result == diffrax.RESULTS.successful, Status.COMPLETED, Status.STEP_TOO_SMALL)
+    status = jnp.where(result == diffrax.RESULTS.max_steps_reached, Status.MAX_STEPS, status)
+    unmoved = (status == Status.STEP_TOO_SMALL) & (solution.stats["num_accepted_steps"] == 0)
+    status = jnp.where(unmoved, Status.NO_SOLUTION, status)
+    stopped = jnp.where(which < len(events.names), Status.EVENT + which, Status.SINGULAR_SPEEDS)
+    return jnp.where(result == diffrax.RESULTS.event_occurred, stopped, status)

@@ -1,0 +1,133 @@
+"""How to integrate, and what a simulation is given: options, times and states, checked. Knows no mechanics."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array
+
+from .._description.system import State, System
+from .._method.kane import by_names, refuse_incomplete
+from .signals import real_array
+
+ADJOINTS = {
+    "auto": diffrax.RecursiveCheckpointAdjoint,
+    "reverse": diffrax.RecursiveCheckpointAdjoint,
+    "forward": diffrax.ForwardMode,
+    "both": diffrax.DirectAdjoint,
+}
+
+
+class Settings(eqx.Module):
+    """How to integrate: what `simulate` was told, with its defaults filled in."""
+
+    rtol: float = eqx.field(static=True)
+    atol: float = eqx.field(static=True)
+    solver: diffrax.AbstractSolver
+    step: Any  # a number, or an array where it may change without another compilation
+    adjoint: diffrax.AbstractAdjoint
+    max_steps: int | None = eqx.field(static=True)  # None: as many as it takes
+    progress: bool = eqx.field(static=True)
+    project: bool = eqx.field(static=True)
+    stabilize: float = eqx.field(static=True)
+
+
+def settings_for(
+    ts: Array,
+    *,
+    rtol: float | None = None,
+    atol: float | None = None,
+    solver: diffrax.AbstractSolver | None = None,
+    step: float | None = None,
+    project: bool = False,
+    stabilize: float = 0.0,
+    adjoint: str | diffrax.AbstractAdjoint = "auto",
+    max_steps: int | None = 16384,
+    progress: bool = False,
+) -> Settings:
+    """The options of `simulate`, with defaults that follow the type of the times."""
+    default = 1e-8 if ts.dtype == jnp.float64 else 1e-5
+    if isinstance(adjoint, str) and adjoint not in ADJOINTS:
+        raise ValueError(f"adjoint is one of {', '.join(ADJOINTS)}, or a diffrax adjoint; got {adjoint!r}.")
+    for label, number in (("rtol", rtol), ("atol", atol), ("step", step)):
+        if number is not None and not isinstance(number, Tracer):
+            _check_number(label, number, lambda x: x > 0, "positive and finite")
+    _check_number("stabilize", stabilize, lambda x: x >= 0, "a rate [1/s], not negative and finite")
+    if max_steps is not None:
+        _check_number("max_steps", max_steps, lambda x: x >= 1 and x == int(x), "a whole number of 1 at least")
+    return Settings(
+        rtol=default if rtol is None else float(rtol),
+        atol=default if atol is None else float(atol),
+        solver=diffrax.Tsit5() if solver is None else solver,
+        step=step,
+        adjoint=ADJOINTS[adjoint]() if isinstance(adjoint, str) else adjoint,
+        max_steps=max_steps,
+        progress=progress,
+        project=project,
+        stabilize=float(stabilize),
+    )
+
+
+def _check_number(label: str, value: Any, fits: Callable[[float], bool], what: str) -> None:
+    try:
+        number = float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not (math.isfinite(number) and fits(number)):
+        raise ValueError(f"`{label}` must be {what}; got {value!r}.")
+
+
+def checked_times(ts: Any, dtype: Any) -> Array:
+    """Times as an array of a state's type. **Raises:** `ValueError` unless finite, increasing, and two at least."""
+    ts = real_array(ts, "`ts`", dtype)
+    if ts.ndim != 1 or ts.shape[0] < 2:
+        raise ValueError(f"`ts` must be at least two times in an array of shape (n_t,), got the shape {ts.shape}.")
+    if not isinstance(ts, Tracer):
+        steps: Any = np.diff(np.asarray(ts))
+        if not np.all(np.isfinite(steps)):
+            raise ValueError("`ts` holds times that are not finite.")
+        if not np.all(steps > 0):
+            i = int(np.argmax(steps <= 0))
+            raise ValueError(f"`ts` must increase: ts[{i}] = {float(ts[i]):.6g} is followed by {float(ts[i + 1]):.6g}.")
+    return ts
+
+
+def checked_state(system: System, state: Any) -> State:
+    """A state of the right shape for a system."""
+    name = type(system).__name__
+    if not isinstance(state, State):
+        raise TypeError(
+            f"{name}: the state must be a jaxkane.State(q, u), as assemble gives it; got {type(state).__name__}."
+        )
+    state = as_state(system, state)
+    for label, value, names in (("q", state.q, system.coordinates), ("u", state.u, system.speeds)):
+        if value.shape != (len(names),):
+            raise ValueError(
+                f"{name}: state.{label} must have the shape ({len(names)},) for {', '.join(names)}; got {value.shape}."
+                + (" For a batch use jaxkane.sweep or jax.vmap." if value.ndim > 1 else "")
+            )
+    return state
+
+
+def as_state(system: System, state: State) -> State:
+    """A state in arrays, of one in dicts by name. Coordinates and speeds that are left out are zero.
+
+    **Raises:** `ValueError` for an unknown name, a dependent coordinate left out, a dependent speed that is named.
+    """
+    refuse_incomplete(system, state.q, state.u)
+    title = type(system).__name__
+    q, u = (
+        by_names(values, names, f"{title}: state.{label}") if isinstance(values, Mapping) else values
+        for label, values, names in (("q", state.q, system.coordinates), ("u", state.u, system.speeds))
+    )
+    for label, values in (("q", q), ("u", u)):
+        if not hasattr(values, "shape"):
+            raise TypeError(f"{title}: state.{label} is an array of numbers, or a dict by name; got {values!r}.")
+    return State(q, u.astype(q.dtype) if isinstance(state.u, Mapping) else u)

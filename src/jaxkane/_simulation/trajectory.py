@@ -1,0 +1,113 @@
+"""What a simulation gives: motion over time by name, and how it ended. Knows names and numbers; knows no solver."""
+
+from __future__ import annotations
+
+import enum
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float, Int
+
+from .._common.lookup import by_name
+from .._description.system import State
+
+
+class Status(enum.IntEnum):
+    """How a simulation ended. Codes from `EVENT` on are events of the system, in the order of the alphabet."""
+
+    COMPLETED = 0
+    """Reached the last time."""
+    SINGULAR_SPEEDS = 1
+    """The dependent speeds are no longer determined by the independent ones: det C_dep passed zero."""
+    STEP_TOO_SMALL = 2
+    """The solver could not go on: the step fell below its minimum, as it does when something becomes infinite."""
+    MAX_STEPS = 3
+    """The solver took `max_steps` steps before the last time."""
+    INVALID = 4
+    """A parameter or an initial value was not finite, a positive parameter was not positive, a body had a mass or an
+    inertia that no body has, or the coordinates violated a configuration constraint: nothing was solved."""
+    INTERRUPTED = 5
+    """A sweep was stopped before it came to this member."""
+    NO_SOLUTION = 6
+    """The equations have no finite solution at the first state: a speed that no mass moves with, angles that lock,
+    constraints that cannot be solved for the dependent speeds. One simulation alone raises an error that says which."""
+    EVENT = 10
+
+
+class Trajectory(eqx.Module):
+    """Motion over time, by name: `ride["roll"]`, `ride["yaw_rate"]`, `ride["steer_torque"]`.
+
+    Values after the end of a simulation that stopped early are NaN. A batch has leading axes.
+
+    Attributes:
+
+    - `t` (n_t,) [s]; `q` (n_t, n_q); `u` (n_t, n_u) independent speeds; `u_dep` (n_t, k) dependent speeds.
+    - `inputs`: values (n_t,) of every input by name.
+    - `status`: a `Status` code; `reason` says it in words.
+    - `t_end` [s] and `end`, the state there: where the simulation ended. They have derivatives where it ended at the
+        last time or by an event, whose time moves with what it follows from; otherwise their derivatives are NaN.
+    - `stats`: numbers of steps taken, accepted and rejected. `adjoint`: how it is differentiated.
+    - `units`: pairs of a name and its unit, as the system declares them.
+    """
+
+    t: Float[Array, "*batch n_t"]
+    q: Float[Array, "*batch n_t n_q"]
+    u: Float[Array, "*batch n_t n_u"]
+    u_dep: Float[Array, "*batch n_t k"]
+    inputs: dict[str, Float[Array, "*batch n_t"]]
+    status: Int[Array, "*batch"]
+    t_end: Float[Array, "*batch"]
+    stats: dict[str, Int[Array, "*batch"]]
+    names: tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]] = eqx.field(static=True)
+    events: tuple[str, ...] = eqx.field(static=True)
+    adjoint: str = eqx.field(static=True)
+    units: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
+    end: State | None = None
+
+    def __getitem__(self, name: str) -> Float[Array, "*batch n_t"]:
+        groups = zip(self.names, (self.q, self.u, self.u_dep), strict=True)
+        return by_name(name, groups, self.inputs, "this trajectory")
+
+    @property
+    def ok(self) -> Any:
+        """Whether the last time was reached; an array for a batch."""
+        return self.status == Status.COMPLETED
+
+    @property
+    def reason(self) -> Any:
+        """The status in words; a list for a batch."""
+        codes = np.asarray(self.status)
+        words = [reason(int(code), self.events) for code in codes.ravel()]
+        return words[0] if codes.ndim == 0 else words
+
+    def state(self, i: int = -1) -> State:
+        """The state at the i-th time, to go on from."""
+        return State(self.q[..., i, :], self.u[..., i, :])
+
+    def __repr__(self) -> str:
+        if isinstance(self.status, Tracer) or np.ndim(self.status) > 0:
+            return f"Trajectory(shape={self.t.shape})"
+        steps = int(self.stats["steps"])
+        told = f"Trajectory({self.t.shape[-1]} times to {float(self.t_end):.6g} s in {steps} steps: {self.reason})"
+        advice = _advice(int(self.status), self.reason)
+        return f"{told}. {advice}" if advice else told
+
+
+def reason(code: int, events: tuple[str, ...]) -> str:
+    """A status code in words."""
+    if code >= Status.EVENT:
+        return events[code - Status.EVENT].replace("_", " ")
+    return Status(code).name.lower().replace("_", " ")
+
+
+def _advice(code: int, reason: str) -> str:
+    if reason.startswith("gimbal lock"):
+        return "Angles lock there: describe the orientation with Euler parameters, or with another sequence of angles."
+    advice = {
+        Status.SINGULAR_SPEEDS: "Choose other dependent speeds: see jaxkane.best_dependent_speeds(system, t, q).",
+        Status.STEP_TOO_SMALL: "Something becomes infinite or jumps: look at the last times that were reached.",
+        Status.MAX_STEPS: "Raise max_steps; or look for what is stiff or jumps.",
+    }
+    return advice.get(Status(code), "") if code < Status.EVENT else ""

@@ -1,0 +1,125 @@
+"""A Gaussian for a fit's posterior, and the evidence for its model. Knows densities; simulates nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from typing import TYPE_CHECKING
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._problem.blocks import Eliminated, eliminate
+from .._problem.problem import Problem
+
+if TYPE_CHECKING:
+    from .._result.result import Fit
+
+LOG_2PI = math.log(2 * math.pi)
+
+
+@dataclasses.dataclass(frozen=True)
+class Laplace:
+    """A Gaussian for the posterior of the free numbers x, at the fit's minimum.
+
+    - `mean` (p,), `covariance` (p, p): of x.
+    - `log_evidence`: the logarithm of the density of the measurements, all unknowns integrated out. Twice the
+        difference of two models' is what a prior's width (Occam's factor) leaves of the difference of their costs.
+    - `message`: why there is no evidence where it is NaN, in words; else empty.
+    """
+
+    fit: Fit
+    mean: np.ndarray
+    covariance: np.ndarray
+    log_evidence: float
+    message: str = ""
+
+    def sample(self, n: int, seed: int = 0) -> dict[str, np.ndarray]:
+        """Parameters (n,) by name, in their units: never outside their bounds."""
+        rng = np.random.default_rng(seed)
+        x = jnp.asarray(rng.multivariate_normal(self.mean, self.covariance, size=n), self.fit.point.x.dtype)
+        values = np.asarray(jax.vmap(self.fit.parameters.values)(x))
+        return dict(zip(self.fit.names, values.T, strict=True))
+
+
+def laplace(fit: Fit) -> Laplace:
+    """The Laplace approximation: `sigma` is taken as it was given, priors count, nuisance values are integrated out.
+
+        log evidence = log p(measurements | unknowns) + log p(unknowns) + 1/2 log det(2 pi C)
+
+    at the minimum, with C the covariance of all unknowns in their own units: of parameters in theirs, so that neither
+    `Free.scale` nor the choice of bounds for the search's sake changes it (MacKay, Bayesian interpolation, Neural
+    Computation 4, 1992). Exact where the motion is linear in all unknowns.
+
+    What a parameter's prior is: the Gaussian it was given, cut off at its bounds; without one, with two bounds, the
+    uniform density between them; else it is improper, and the evidence is NaN. Starts and biases without a standard
+    deviation have a density of one per unit: compare only models that have the same of these, or give deviations.
+
+    **Raises:** `ValueError` that names the parameters that the data do not tell (nothing bounds their posterior), and
+    for a fit that is not at a minimum.
+    """
+    untold = [name for name, error in fit.standard_errors.items() if np.isinf(error)]
+    if untold:
+        raise ValueError(f"These data do not tell {', '.join(untold)}: give a prior, or leave something out.")
+    eliminated = eliminate(fit.linearization.blocks, 0.0)
+    to_gain = fit.cost - float(eliminated.step(1e-9)[1])
+    if fit.status == "applied" or not to_gain < 0.1:
+        raise ValueError(
+            f"This is no minimum ({fit.status}): a step would lower the sum of squares by {to_gain:.3g}. Go on with "
+            "`least_squares(problem, start=fit.point)`."
+        )
+    A = np.asarray(eliminated.rows[0], float)
+    _, s, V = np.linalg.svd(A, full_matrices=False)
+    log_prior, message = _log_priors(fit)
+    message = message or _untold_nuisance(fit.problem, eliminated)
+    evidence = log_likelihood(fit.problem, fit.cost) + log_prior + _log_volume(fit, eliminated, s)
+    return Laplace(fit, np.asarray(fit.point.x), (V.T / s**2) @ V, math.nan if message else evidence, message)
+
+
+def log_likelihood(problem: Problem, cost: float) -> float:
+    """-cost/2 with the constants of the measurements' densities, so that they integrate to one."""
+    weight = np.asarray(problem.windows.weight, float)
+    return -0.5 * cost + float(np.sum(np.log(weight[weight > 0]) - 0.5 * LOG_2PI))
+
+
+def _log_priors(fit: Fit) -> tuple[float, str]:
+    """The logarithm of all priors' densities, but for the squares in the cost; and what is improper, in words."""
+    problem, n = fit.problem, fit.problem.model.nuisance
+    constants = fit.parameters.log_prior_constants
+    improper = [name for name, constant in zip(fit.names, constants, strict=True) if np.isnan(constant)]
+    counts = (  # how many densities of each nuisance value there are, whose squares are in the cost
+        (n.start_deviation, np.asarray(problem.windows.first).sum() if n.chained else len(problem.places)),
+        (n.trial_deviation, np.asarray(problem.windows.first).sum()),
+        (n.jump, np.asarray(problem.windows.linked).sum()),
+    )
+    total = constants.sum()
+    for deviations, count in counts:
+        known = np.asarray(deviations, float)[np.isfinite(deviations)]
+        total -= float(count) * np.sum(np.log(known) + 0.5 * LOG_2PI)
+    if not improper:
+        return float(total), ""
+    return float(total), (
+        f"No evidence: without a prior, or both bounds, any value of {', '.join(improper)} is as likely as any other, "
+        "and no data are expected more than others. Give `prior` or `bounds`."
+    )
+
+
+def _log_volume(fit: Fit, eliminated: Eliminated, s: np.ndarray) -> float:
+    """1/2 log det(2 pi C) of all unknowns in their units; those that have no density at all are left out."""
+    z, b = (np.asarray(x) for x in eliminated.told)
+    number = s.size + np.count_nonzero(z) + np.count_nonzero(b)
+    log_information = 2 * np.sum(np.log(s)) + float(eliminated.log_determinant)
+    to_units = float(fit.parameters.log_determinant(fit.point.x))
+    return 0.5 * number * LOG_2PI - 0.5 * log_information + to_units
+
+
+def _untold_nuisance(problem: Problem, eliminated: Eliminated) -> str:
+    """The starts and biases that have neither data nor a prior, in words: nothing bounds their posterior."""
+    z, b = (np.asarray(x) for x in eliminated.told)  # (T, m, n_z), (T, n_b)
+    counts, n = np.append(problem.seen, False)[np.asarray(problem.by_trial)], problem.model.nuisance  # (T, m)
+    names = [name for j, name in enumerate(n.start) if np.any(counts & ~z[..., j])]
+    names += [" ".join(pair) for j, pair in enumerate(n.trial) if np.any(counts.any(axis=1) & ~b[:, j])]
+    if not names:
+        return ""
+    return f"No evidence: the data do not tell {', '.join(names)} of every window. Give a standard deviation."

@@ -1,0 +1,193 @@
+"""What looks wrong with data, by name: signs, columns without content, bodies that cannot be. Knows a fit's numbers."""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from ..._method.checks import check_system
+from .._optimize.steps import settle, uninterrupted
+from .._problem.bijections import PossibleBody
+from .._problem.problem import Problem
+
+if TYPE_CHECKING:
+    from .._result.result import Fit
+
+
+def empty_columns(problem: Problem) -> list[str]:
+    """Measurements and inputs that say nothing."""
+    notes = []
+    for trial in problem.trials:
+        for channel, y in trial.measured.items():
+            seen = y[np.isfinite(y)]
+            if seen.size > 1 and np.ptp(seen) == 0:
+                notes.append(f"{trial.name}: {channel} is {seen[0]:g} throughout: was it recorded?")
+        for name, x in trial.inputs.items():
+            varies = any(np.ptp(other.inputs[name]) > 0 for other in problem.trials if name in other.inputs)
+            if np.ptp(x) == 0 and x[0] == 0 and varies:
+                notes.append(f"{trial.name}: the input {name} is zero throughout, in other trials it is not.")
+    return notes
+
+
+def contrary_rates(problem: Problem) -> list[str]:
+    """A measured rate that runs against the measured coordinate: one of the two has the wrong sign."""
+    notes = []
+    system = problem.system
+    for trial in problem.trials:
+        for coordinate in system.coordinates:
+            rates = [c for c in (f"{coordinate}_rate", f"{coordinate}_dot") if c in trial.measured]
+            if coordinate not in trial.measured or not rates:
+                continue
+            agreement = _correlation(np.gradient(trial.measured[coordinate], trial.t), trial.measured[rates[0]])
+            if agreement < -0.5:
+                notes.append(
+                    f"{trial.name}: {rates[0]} runs against the change of {coordinate} (correlation {agreement:.2f}): "
+                    "one of the two has the wrong sign."
+                )
+    return notes
+
+
+def fits_badly(fit: Fit) -> bool:
+    """Whether less than half of a channel's variance is accounted for, and noise does not explain that."""
+    tests = [t for channels in fit.tests.values() for t in channels.values()]
+    return fit.variance >= 2 and not all(t.accounted > 0.5 or np.isnan(t.accounted) for t in tests)
+
+
+def coarse_steps(fit: Fit) -> list[str]:
+    """Steps of integration that bias the estimates."""
+    if not fit.too_coarse:
+        return []
+    steps = np.asarray(fit.problem.windows.step)
+    return [
+        f"The step of integration ({steps.max():.3g} s) is too coarse where the fit ended: half of it moves the "
+        f"residuals by {fit.step_error:.2g} standard deviations together. Give a smaller `step`, or `rtol`."
+    ]
+
+
+def no_freedom(fit: Fit) -> list[str]:
+    """Fits that meet every measurement because there are no more of them than unknowns."""
+    n_r, n_unknown = fit.problem.size
+    if n_r > n_unknown:
+        return []
+    return [
+        f"There are {n_r} residuals for {n_unknown} unknowns: nothing is left that says how large errors are. The "
+        "standard errors are NaN; `laplace` has those for `sigma` as it was given."
+    ]
+
+
+def doubled_trials(problem: Problem) -> list[str]:
+    """Trials with the same samples, which count as if they had been measured twice."""
+    notes, first = [], {}
+    for trial in problem.trials:
+        key = b"".join([trial.t.tobytes(), *(c.encode() + y.tobytes() for c, y in sorted(trial.measured.items()))])
+        if key in first:
+            notes.append(f"{trial.name} has the samples of {first[key]}: what is measured once counts twice.")
+        first.setdefault(key, trial.name)
+    return notes
+
+
+def contrary_signs(fit: Fit) -> list[str]:
+    """Where a channel fits badly: inputs and channels with which the opposite sign would fit much better."""
+    if not fits_badly(fit):
+        return []
+    notes, problem = [], fit.problem
+    for i, name in enumerate(problem.system.inputs):
+        if name not in problem.model.driven:
+            continue
+        flipped = problem.windows.inputs.at[:, i].multiply(-1.0)
+        notes += _if_better(fit, eqx.tree_at(lambda w: w.inputs, problem.windows, flipped), f"the input {name}")
+    for c, channel in enumerate(problem.channels):
+        flipped = problem.windows.measured.at[:, c].multiply(-1.0)
+        notes += _if_better(fit, eqx.tree_at(lambda w: w.measured, problem.windows, flipped), channel)
+    return notes
+
+
+def _if_better(fit: Fit, windows, what: str) -> list[str]:
+    from .._optimize.least_squares import least_squares
+
+    problem = dataclasses.replace(fit.problem, windows=windows)
+    try:
+        # From both ends: a fit to the wrong sign may have led the parameters far away.
+        costs = [settle(problem, point, steps=4)[1].cost for point in (fit.point, problem.start)]
+        if min(costs) > 0.5 * fit.cost:
+            costs = [uninterrupted(least_squares(problem, steps=4, rtol=1e-2)).cost]
+    except ValueError:
+        return []
+    if min(costs) < 0.5 * fit.cost:
+        return [f"{what} seems to have the wrong sign: turned round, the sum of squares is below {min(costs):.4g}."]
+    return []
+
+
+def impossible_bodies(fit: Fit) -> list[str]:
+    """Bodies of the fitted system that no body can be."""
+    window = jax.tree.map(lambda x: x[0], fit.problem.windows)
+    n_q = len(fit.problem.system.coordinates)
+    notes = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        try:
+            check_system(fit.system, window.t[0], window.start[:n_q])
+        except ValueError as error:
+            notes.append(f"Not a possible body: {error}")
+    return notes + [f"Not a possible body: {warning.message}" for warning in caught]
+
+
+def bodies_at_the_edge(fit: Fit) -> list[str]:
+    """Bodies whose parameters are kept possible, and which went as far as that lets them."""
+    notes, first = [], 0
+    for bijection, size in zip(fit.parameters.bijections, fit.parameters.sizes, strict=True):
+        if isinstance(bijection, PossibleBody):
+            names = ", ".join(fit.names[first : first + size])
+            S = np.exp(np.asarray(bijection.factors(fit.point.x[first : first + size]))[4:7])
+            if S.min() < 1e-2 * S.max():
+                notes.append(
+                    f"{names}: the data want a body that cannot be; this one is at the edge, its mass in a plane or on "
+                    "a line. It is making up for what the model lacks."
+                )
+        first += size
+    return notes
+
+
+def trade_offs(fit: Fit) -> list[str]:
+    """Pairs of parameters of which the data tell little more than a combination."""
+    notes, correlation = [], fit.correlation
+    for i, name in enumerate(fit.names):
+        for j in range(i):
+            if abs(correlation[i, j]) > 0.95:
+                notes.append(f"{fit.names[j]} and {name} trade off: their correlation is {correlation[i, j]:.3f}.")
+    return notes
+
+
+def only_priors(fit: Fit) -> list[str]:
+    """Parameters of which the data say nothing beyond what was known."""
+    notes, deviations = [], np.asarray(fit.parameters.prior_deviation)
+    for i, name in enumerate(fit.names):
+        error = np.sqrt(fit.identifiability.covariance[i, i] / fit.variance)
+        if np.isfinite(deviations[i]) and error > 0.95 * deviations[i]:
+            notes.append(f"{name} is known by its prior alone: the data add nothing.")
+    return notes
+
+
+def far_from_start(fit: Fit) -> list[str]:
+    """Estimates that left what the user thought plausible by far, and are still called precise."""
+    notes = []
+    for name, value in fit.estimates.items():
+        start, error = fit.start[name], fit.standard_errors[name]
+        if start != 0 and not 0.4 <= value / start <= 2.5 and error < 0.2 * abs(value):
+            notes.append(
+                f"{name} went to {value / start:.2g} times its first guess with a small formal error. Unless that "
+                "guess was worth nothing, it is implausible: it may be making up for what the model lacks."
+            )
+    return notes
+
+
+def _correlation(a: np.ndarray, b: np.ndarray) -> float:
+    seen = np.isfinite(a) & np.isfinite(b)
+    if seen.sum() < 5 or np.ptp(a[seen]) == 0 or np.ptp(b[seen]) == 0:
+        return 0.0
+    return float(np.corrcoef(a[seen], b[seen])[0, 1])

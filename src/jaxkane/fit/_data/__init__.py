@@ -1,0 +1,1 @@
+"""Measured motion: trials, files, windows. Knows no optimizer."""

@@ -1,0 +1,1 @@
+"""A fit as a problem of least squares: parameters, windows' unknowns, the model, its linearization."""

@@ -1,0 +1,236 @@
+"""What is compiled: the residuals of one window and their exact linearization. Knows `simulate`; knows no trials.
+
+Nothing in a `Model` that is a number is fixed when it is compiled, so that other data, other first guesses and other
+priors of the same shapes run the same program.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..._description.system import State, System
+from ..._method.assembly import assemble
+from ..._scalars.reads import compiled
+from ..._simulation.ride import solve
+from ..._simulation.settings import Settings
+from ..._simulation.signals import Samples
+from ..._simulation.trajectory import Trajectory
+from .._data.windows import Windows
+from .blocks import Blocks
+from .parameters import Parameters
+
+
+class Point(eqx.Module):
+    """Where a fit stands: `x` (p,) the free parameters (see `Parameters`); `b` (T, n_b) what is unknown of every trial,
+    its sensors and inputs; `z` (W, n_z) unknown starts of every window."""
+
+    x: Float[Array, " p"]
+    b: Float[Array, "T n_b"]
+    z: Float[Array, "W n_z"]
+
+
+class Nuisance(eqx.Module):
+    """Unknowns that are not asked for: `start`, names of the unknown part of a window's start; `trial`, pairs of a kind
+    and a channel or input that every trial has its own of. Standard deviations are those of priors, infinite without.
+    `jump` (n_z,): of the difference between a window's end and the next window's start, infinite where it is free.
+    """
+
+    start: tuple[str, ...] = eqx.field(static=True)
+    trial: tuple[tuple[str, str], ...] = eqx.field(static=True)
+    chained: bool = eqx.field(static=True)
+    start_deviation: Float[Array, " n_z"]
+    trial_deviation: Float[Array, " n_b"]
+    jump: Float[Array, " n_z"]
+
+    def of_trial(self, b: Array, kind: str, name: str, otherwise: float) -> Array:
+        """The value of one of a trial's unknowns."""
+        if (kind, name) in self.trial:
+            return otherwise + b[self.trial.index((kind, name))]
+        return jnp.asarray(otherwise, b.dtype)
+
+
+class Held(eqx.Module):
+    """A signal that keeps each sample until the next: `ts`, `values` (n_t,)."""
+
+    ts: Float[Array, " n_t"]
+    values: Float[Array, " n_t"]
+
+    def __call__(self, t: Array, state: Any = None) -> Array:
+        # The end of a step is the beginning of the next sample, whichever way it was rounded.
+        i = jnp.sum(self.ts <= t + 1e-4 * (self.ts[1] - self.ts[0])) - 1
+        return self.values[jnp.clip(i, 0, self.ts.shape[0] - 1)]
+
+
+class Model(eqx.Module):
+    """A system, its free parameters, what else is unknown, and how measurements are compared with simulations.
+
+    residual = (gain * simulated + bias - measured) / sigma
+    """
+
+    system: System
+    parameters: Parameters
+    nuisance: Nuisance
+    settings: Settings
+    channels: tuple[str, ...] = eqx.field(static=True)
+    driven: tuple[str, ...] = eqx.field(static=True)  # inputs of which there are samples
+    held: tuple[str, ...] = eqx.field(static=True)
+    outputs: tuple[tuple[str, Callable[[Trajectory], Array]], ...] = eqx.field(static=True)
+
+    @property
+    def unknown_places(self) -> np.ndarray:
+        """Where the unknown part of a start stands in [q, u]."""
+        names = (*self.system.coordinates, *self.system.speeds)
+        return np.array([names.index(name) for name in self.nuisance.start], dtype=int)
+
+    def consistent(self, window: Windows, z: Array, x: Array) -> Array:
+        """The start (n_q + n_u,) of one window, its dependent coordinates found by `assemble`."""
+        system, _ = self.parameters.apply(self.system, x)
+        start = window.start.at[self.unknown_places].add(z)
+        n_q = len(system.coordinates)
+        state = assemble(system, start[:n_q], start[n_q:], window.t[0])
+        return jnp.concatenate([state.q, state.u])
+
+    def simulate(self, window: Windows, start: Array, b: Array, x: Array) -> Trajectory:
+        """One window's motion."""
+        system, roles = self.parameters.apply(self.system, x)
+        signals: dict[str, Any] = {}
+        for i, name in enumerate(system.inputs):
+            bias = self.nuisance.of_trial(b, "bias of input", name, 0.0)
+            if name in self.driven:
+                gain = roles.get(("gain", name), 1.0) * self.nuisance.of_trial(b, "gain of input", name, 1.0)
+                delay = roles.get(("delay", name), 0.0) + self.nuisance.of_trial(b, "delay of input", name, 0.0)
+                kind = Held if name in self.held else Samples
+                signals[name] = kind(window.t_input + delay, gain * window.inputs[i] + bias)
+            elif ("bias of input", name) in self.nuisance.trial:
+                signals[name] = bias
+        n_q = len(system.coordinates)
+        settings = self.settings if self.settings.step is None else dataclasses.replace(self.settings, step=window.step)
+        return solve(system, State(start[:n_q], start[n_q:]), window.t, signals, settings)
+
+    def simulated(self, ride: Trajectory, b: Array) -> Array:
+        """What the sensors would have said (n_c, n_t)."""
+        outputs, rows = dict(self.outputs), []
+        for c in self.channels:
+            value = outputs[c](ride) if c in outputs else ride[c]
+            gain = self.nuisance.of_trial(b, "gain of sensor", c, 1.0)
+            rows.append(gain * value + self.nuisance.of_trial(b, "bias of sensor", c, 0.0))
+        return jnp.stack(rows)
+
+    def residuals(self, window: Windows, start: Array, z: Array, b: Array, x: Array) -> tuple[Array, Any]:
+        """Residuals of one window, priors included (m,), in which the next window starts where it is first thought to;
+        and what was simulated (n_c, n_t), with the simulation's status."""
+        ride = self.simulate(window, start, b, x)
+        simulated, n = self.simulated(ride, b), self.nuisance
+        difference = jnp.where(window.weight > 0, (simulated - window.measured) * window.weight, 0.0)
+        end = jnp.concatenate([ride.q[-1], ride.u[-1]])
+        jump = jnp.where(window.linked > 0, (end - window.next_start)[self.unknown_places] / n.jump, 0.0)
+        # A prior of infinite width is a row of zeros. A trial's prior is counted in its first window, and so is that of
+        # a start from which all else follows.
+        of_start = jnp.where(window.first, z / n.start_deviation, 0.0) if n.chained else z / n.start_deviation
+        of_trial = jnp.where(window.first, b / n.trial_deviation, 0.0)
+        of_all = jnp.where(window.very_first, self.parameters.prior_residuals(x), 0.0)
+        rows = [difference.ravel(), *([jump] if n.chained else []), of_start, of_trial, of_all]
+        return jnp.concatenate(rows), (simulated, ride.status)
+
+
+@compiled
+def starts_of(model: Model, windows: Windows, point: Point) -> tuple[Array, Array]:
+    """Starts (W, n) and their derivatives (W, n, n_z + n_b + p) by z, b and x."""
+    # A program of its own: inside that of the simulation Newton's method would be differentiated a tangent at a time.
+    n_b = point.b.shape[1]
+
+    def start_of(arguments):
+        window, z = arguments
+        start = lambda z, x: model.consistent(window, z, x)  # noqa: E731
+        by_z, by_x = jax.jacfwd(start, argnums=(0, 1))(z, point.x)
+        return start(z, point.x), jnp.concatenate([by_z, jnp.zeros((by_z.shape[0], n_b), by_z.dtype), by_x], axis=1)
+
+    return jax.lax.map(start_of, (windows, point.z))
+
+
+def jacobian_of(model: Model, window: Windows, start: Array, start_dot: Array, z: Array, b: Array, x: Array):
+    """Residuals (m,) of a window, their derivatives (m, n_z + n_b + p), what was simulated and its status."""
+    n_z, n_b = z.shape[0], b.shape[0]
+    unit = jnp.eye(n_z + n_b + x.shape[0], dtype=z.dtype)
+    directions = (start_dot.T, unit[:, :n_z], unit[:, n_z : n_z + n_b], unit[:, n_z + n_b :])
+
+    def along(*direction):
+        residuals = lambda *unknowns: model.residuals(window, *unknowns)  # noqa: E731
+        return jax.jvp(residuals, (start, z, b, x), direction, has_aux=True)
+
+    return jax.vmap(along, out_axes=(None, -1, None))(*directions)
+
+
+@compiled
+def blocks_of(model: Model, windows: Windows, by_trial: Array, point: Point, starts: Array, starts_dot: Array):
+    """Blocks, what was simulated (W, n_c, n_t) and the status of every window (W,)."""
+    n_z, n_b = point.z.shape[1], point.b.shape[1]
+    n_next = n_z if model.nuisance.chained else 0
+
+    def window_block(arguments):
+        window, z, z_next, b, start, start_dot = arguments
+        r, J, more = jacobian_of(model, window, start, start_dot, z, b, point.x)
+        links = by_next(model, window, r.shape[0])[:, :n_next]
+        A = jnp.column_stack([J[:, :n_z], links, J[:, n_z:], r + links @ z_next[:n_next]])
+        # The triangle says all that the (m, k) matrix says about least squares. QR of NaN is not everywhere NaN.
+        bad = ~jnp.all(jnp.isfinite(A))
+        A = jnp.concatenate([jnp.where(bad, 0.0, A), jnp.zeros((A.shape[1], A.shape[1]), A.dtype)])
+        return jnp.where(bad, jnp.nan, jnp.linalg.qr(A, mode="r")), more
+
+    R, (simulated, status) = each(window_block, _arguments(windows, point, starts, starts_dot))
+    return Blocks(R, by_trial, n_z, n_next, n_b), simulated, status
+
+
+@compiled
+def costs_of(model: Model, windows: Windows, point: Point, starts: Array) -> tuple[Array, Array]:
+    """Sums of squares (W,), and what was simulated (W, n_c, n_t): `blocks_of` without derivatives."""
+
+    def window_cost(arguments):
+        window, z, z_next, b, start = arguments
+        r, (simulated, _) = model.residuals(window, start, z, b, point.x)
+        if model.nuisance.chained:
+            r = r + by_next(model, window, r.shape[0]) @ z_next
+        return jnp.sum(r**2), simulated
+
+    return each(window_cost, _arguments(windows, point, starts))
+
+
+@compiled
+def rides_of(model: Model, windows: Windows, point: Point, starts: Array) -> Trajectory:
+    """The motion of every window, stacked."""
+    return each(lambda now: model.simulate(now[0], now[4], now[3], point.x), _arguments(windows, point, starts))
+
+
+def _arguments(windows: Windows, point: Point, *more: Array) -> tuple[Any, ...]:
+    z_next = jnp.concatenate([point.z[1:], point.z[:1]])
+    return windows, point.z, z_next, point.b[windows.trial], *more
+
+
+def by_next(model: Model, window: Windows, m: int) -> Array:
+    """Derivatives (m, n_z) of a window's residuals by the next window's start."""
+    n_z, before = window_size(model), window.weight.size
+    links = jnp.zeros((m, n_z), window.t.dtype)
+    if not model.nuisance.chained:
+        return links
+    places = jnp.arange(n_z, dtype=jnp.int32)
+    return links.at[before + places, places].set(-window.linked / model.nuisance.jump)
+
+
+def window_size(model: Model) -> int:
+    """How many of a window's starting values are unknown."""
+    return len(model.nuisance.start)
+
+
+def each(f: Callable[..., Any], windows: Any) -> Any:
+    """`f` of every window."""
+    # One ride after another is fastest on a CPU, where a right-hand side is one scalar function; elsewhere all at once.
+    batch = None if jax.default_backend() == "cpu" else jax.tree.leaves(windows)[0].shape[0]
+    return jax.lax.map(f, windows, batch_size=batch)

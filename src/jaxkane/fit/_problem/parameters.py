@@ -1,0 +1,417 @@
+"""What a fit may move, and how: free numbers to parameters and back. Knows systems' leaves and no dynamics."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..._common.lookup import hint
+from ..._description.system import System
+from .bijections import Interval, PossibleBody
+
+Prior = tuple[float, float]
+
+
+@dataclasses.dataclass(frozen=True)
+class Free:
+    """A parameter to be found, with what is known about it.
+
+        Free("IBxx", bounds=(0.5, 20.0)), Free(lambda system: system.body.mass, prior=(12.0, 0.5))
+
+    **Arguments:**
+
+    - `where`: a name ("IBxx"), a path ("body.mass"), or a function from the system to a leaf as in `eqx.tree_at`. A
+        leaf with axes counts as its entries.
+    - `start`: the first guess; by default the system's value.
+    - `bounds`: (lower, upper) of which either may be None; it never leaves them. By default (0, None), a logarithmic
+        scale, where the parameter is declared positive, and none elsewhere.
+    - `scale`: how much is a lot, in the parameter's unit; by default the start's magnitude; for a start at
+        zero the prior's deviation, or 1: give it there, since what is called undetermined is counted in it.
+    - `prior`: (mean, standard deviation) of what was measured elsewhere.
+    - `tied`: other parameters that follow it: their name and factor, `Free("rR", tied={"rF": 1.0})`. All entries of
+        one with axes follow.
+    - `name`, `unit`: for tables.
+    """
+
+    where: str | Callable[[Any], Any]
+    start: float | None = None
+    bounds: tuple[float | None, float | None] | None = None
+    scale: float | None = None
+    prior: Prior | None = None
+    tied: Mapping[str, float] = dataclasses.field(default_factory=dict, hash=False)
+    name: str | None = None
+    unit: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Gain:
+    """The gain of an input, common to all trials: the system receives gain * samples + bias.
+
+    `input`: its name; the rest as in `Free`.
+    """
+
+    input: str
+    start: float = 1.0
+    bounds: tuple[float | None, float | None] | None = None
+    scale: float | None = None
+    prior: Prior | None = None
+    name: str | None = None
+    unit: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Delay:
+    """The delay [s] with which an input acts, common to all trials: the system receives samples(t - delay).
+
+    Of samples that are taken as linear in between; earlier than `LONGEST_DELAY` the first sample stands. The rest as
+    in `Free`.
+    """
+
+    input: str
+    start: float = 0.0
+    bounds: tuple[float | None, float | None] | None = None
+    scale: float | None = 0.02
+    prior: Prior | None = None
+    name: str | None = None
+    unit: str = "s"
+
+
+@dataclasses.dataclass(frozen=True)
+class Inertia:
+    """A rigid body's inertia, and with it mass and mass centre, that stays what a body can have.
+
+        Inertia(mass="mB", center=("xB", None, "zB"), moments=("IBxx", "IByy", "IBzz"), products=(None, "IBxz", None))
+
+    **Arguments:** names or paths of the system's parameters, as in `Free`.
+
+    - `moments`: Ixx, Iyy, Izz about the mass centre. Two equal names are a wheel's.
+    - `products`: Ixy, Ixz, Iyz as matrix entries; None for what symmetry makes zero: one alone is a body with a plane
+        of symmetry, none at all a body with principal axes.
+    - `matrix`: instead of these, a parameter of the shape (3, 3).
+    - `mass`, `center`: parameters, or None where the system has none that moves. `fixed`: those of them that stay.
+    - `prior`: (mean, standard deviation) by name.
+
+    The free numbers are logarithmic Cholesky factors of the pseudo-inertia (see `PossibleBody`).
+    """
+
+    moments: tuple[str, str, str] | None = None
+    products: tuple[str | None, str | None, str | None] = (None, None, None)
+    mass: str | None = None
+    center: tuple[str | None, str | None, str | None] = (None, None, None)
+    matrix: str | None = None
+    fixed: Sequence[str] = ()
+    prior: Mapping[str, Prior] = dataclasses.field(default_factory=dict, hash=False)
+    unit: str = "kg m^2"
+
+
+@dataclasses.dataclass(frozen=True)
+class _Entry:
+    """One value: what it is called, and where it goes: (leaf, place, factor) of the system, or an input's role."""
+
+    name: str
+    unit: str
+    targets: tuple[tuple[int, int, float], ...] = ()
+    role: tuple[str, str] | None = None  # ("gain" or "delay", input)
+
+
+class Parameters(eqx.Module):
+    """The free parameters of a fit: x (p,), zero at the start and about one where much has changed, to values (p,).
+
+    The maps are bijections, each from its own part of x to as many values: see `Interval` and `PossibleBody`.
+    """
+
+    entries: tuple[_Entry, ...] = eqx.field(static=True)
+    bijections: tuple[Interval | PossibleBody, ...]
+    sizes: tuple[int, ...] = eqx.field(static=True)
+    start: Float[Array, " p"]
+    scale: Float[Array, " p"]
+    prior_mean: Float[Array, " p"]
+    prior_deviation: Float[Array, " p"]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(e.name for e in self.entries)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return tuple(e.unit for e in self.entries)
+
+    def values(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
+        """Parameters in their own units."""
+        return jnp.concatenate([f(part) for f, part in zip(self.bijections, self._parts(x), strict=True)])
+
+    def inverse(self, values: Float[Array, " p"]) -> Float[Array, " p"]:
+        """The x (p,) of parameters in their own units; NaN outside their bounds."""
+        parts = self._parts(values)
+        return jnp.concatenate([f.inverse(part) for f, part in zip(self.bijections, parts, strict=True)])
+
+    def slopes(self, x: Float[Array, " p"]) -> Float[Array, "p p"]:
+        """d values / d x."""
+        return jax.jacfwd(self.values)(x)
+
+    def log_determinant(self, x: Float[Array, " p"]) -> Array:
+        """log |det d values / d x|: what a density over the values is multiplied by to be one over x."""
+        pairs = zip(self.bijections, self._parts(x), strict=True)
+        return sum((jnp.linalg.slogdet(jax.jacfwd(f)(part))[1] for f, part in pairs), jnp.zeros((), x.dtype))
+
+    def _parts(self, x: Any) -> list[Any]:
+        split = np.split if isinstance(x, np.ndarray) else jnp.split
+        return split(x, np.cumsum(self.sizes)[:-1])
+
+    def apply(self, system: System, x: Float[Array, " p"]) -> tuple[System, dict[tuple[str, str], Array]]:
+        """The system with these parameters, and gains and delays by ("gain", input)."""
+        leaves, structure = jax.tree.flatten(system)
+        roles = {}
+        values = self.values(x)
+        for i, entry in enumerate(self.entries):
+            value = values[i]
+            if entry.role is not None:
+                roles[entry.role] = value
+            for number, place, factor in entry.targets:
+                leaf = leaves[number]
+                flat = jnp.ravel(leaf).at[place].set((factor * value).astype(leaf.dtype))
+                leaves[number] = flat.reshape(leaf.shape)
+        return jax.tree.unflatten(structure, leaves), roles
+
+    def prior_residuals(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
+        """(value - mean) / deviation; zero without a prior."""
+        return (self.values(x) - self.prior_mean) / self.prior_deviation
+
+    @property
+    def log_prior_constants(self) -> np.ndarray:
+        """log p(value) + prior_residual^2 / 2 of every entry (p,), with p its prior's density in its unit: the Gaussian
+        inside the bounds, or uniform between them; NaN where it has neither."""
+        parts = [self._parts(np.asarray(x, float)) for x in (self.prior_mean, self.prior_deviation)]
+        constants = [f.log_prior_constants(*pair) for f, *pair in zip(self.bijections, *parts, strict=True)]
+        return np.concatenate(constants)
+
+    def with_priors(self, priors: Mapping[str, Prior]) -> Parameters:
+        """The same parameters with priors (mean, standard deviation) by name; names that are not free are left out."""
+        mean, deviation = np.array(self.prior_mean), np.array(self.prior_deviation)
+        for i, name in enumerate(self.names):
+            if name in priors:
+                mean[i], deviation[i] = _checked_prior(name, priors[name])
+        new = (jnp.asarray(mean, self.start.dtype), jnp.asarray(deviation, self.start.dtype))
+        return eqx.tree_at(lambda p: (p.prior_mean, p.prior_deviation), self, new)
+
+
+def _checked_prior(name: str, prior: Any) -> Prior:
+    if np.shape(prior) != (2,) or not (math.isfinite(prior[0]) and prior[1] > 0):
+        raise ValueError(f"{name}: a prior is (mean, standard deviation > 0), got {prior}.")
+    return float(prior[0]), float(prior[1])
+
+
+def parameters_of(system: System, free: Sequence[Any] | Any) -> Parameters:
+    """The free parameters of a system.
+
+    **Raises:** `ValueError` that names a parameter or input that does not exist, is named twice, starts outside its
+    bounds, or as a body that cannot be.
+    """
+    free = [free] if isinstance(free, (str, Free, Gain, Delay, Inertia)) or callable(free) else list(free)
+    parts: list[tuple[list[_Entry], Any, list[float], list[float], list[Prior | None]]] = []
+    for item in free:
+        if isinstance(item, (Gain, Delay)):
+            parts.append(_of_input(system, item))
+        elif isinstance(item, Inertia):
+            parts.append(_of_body(system, item))
+        else:
+            parts.extend(_of_leaves(system, item if isinstance(item, Free) else Free(item)))
+    if not parts:
+        raise ValueError("`free` names no parameter: give names such as ('IBxx', 'steer_damping').")
+    entries = [e for part in parts for e in part[0]]
+    names = [e.name for e in entries]
+    places = [place for e in entries for place in [*[t[:2] for t in e.targets], *([e.role] if e.role else [])]]
+    twice = [e.name for e in entries if any(places.count(t[:2]) > 1 for t in e.targets) or places.count(e.role) > 1]
+    twice += [name for name in names if names.count(name) > 1]
+    if twice:
+        raise ValueError(f"`free` names {', '.join(sorted(set(twice)))} twice, or ties it too: {', '.join(names)}.")
+    priors = [prior if prior else (0.0, math.inf) for part in parts for prior in part[4]]
+    array = lambda numbers: jnp.asarray(np.array(numbers, float), jnp.result_type(float))  # noqa: E731
+    return Parameters(
+        entries=tuple(entries),
+        bijections=tuple(part[1] for part in parts),
+        sizes=tuple(len(part[0]) for part in parts),
+        start=array([s for part in parts for s in part[2]]),
+        scale=array([s for part in parts for s in part[3]]),
+        prior_mean=array([mean for mean, _ in priors]),
+        prior_deviation=array([deviation for _, deviation in priors]),
+    )
+
+
+def _of_input(system: System, item: Gain | Delay):
+    role = type(item).__name__.lower()
+    if item.input not in system.inputs:
+        raise ValueError(
+            f"{type(system).__name__} has no input {item.input!r}; {hint(item.input, system.inputs, 'it has')}"
+        )
+    entry = _Entry(item.name or f"{role} of {item.input}", item.unit, role=(role, item.input))
+    return _scalar(entry, item, item.start, positive=False)
+
+
+def _of_leaves(system: System, item: Free):
+    chosen, leaves = _find(system, item.where)
+    followers = [follower for name, factor in item.tied.items() for follower in _followers(system, name, factor)]
+    parts = []
+    for i in chosen:
+        path, leaf = leaves[i]
+        many = leaf.size > 1 or len(chosen) > 1
+        if followers and many:
+            raise ValueError(f"{_path_name(path)} has several entries; only a number can have others tied to it.")
+        for place, index in enumerate(np.ndindex(leaf.shape)):
+            label = item.name if item.name and not many else _path_name(path)
+            label += str(list(index)) if leaf.ndim else ""
+            start = float(leaf[index]) if item.start is None else float(item.start)
+            entry = _Entry(label, item.unit, ((i, place, 1.0), *followers))
+            parts.append(_scalar(entry, item, start, _declared_positive(system, path)))
+    return parts
+
+
+def _followers(system: System, name: str, factor: float) -> list[tuple[int, int, float]]:
+    """(leaf, place, factor) of every entry of what is tied."""
+    chosen, leaves = _find(system, name)
+    for path in (leaves[i][0] for i in chosen):
+        if not math.isfinite(factor) or (factor <= 0 and _declared_positive(system, path)):
+            must = "positive, as the parameter is declared" if math.isfinite(factor) else "a finite number"
+            raise ValueError(f"`tied`: the factor of {_path_name(path)} must be {must}; got {factor}.")
+    return [(i, place, float(factor)) for i in chosen for place in range(leaves[i][1].size)]
+
+
+def _scalar(entry: _Entry, item: Free | Gain | Delay, start: float, positive: bool):
+    name = entry.name
+    lower, upper = _checked_bounds(name, item.bounds, positive)
+    if not math.isfinite(start):
+        raise ValueError(f"{name} starts at {start}.")
+    if (lower is not None and not start > lower) or (upper is not None and not start < upper):
+        raise ValueError(f"{name} starts at {start:.6g}, which is not inside its bounds ({lower}, {upper}).")
+    prior = _checked_prior(name, item.prior) if item.prior is not None else None
+    scale = abs(start) or (prior[1] if prior is not None and math.isfinite(prior[1]) else 1.0)
+    if item.scale is not None:
+        if not 0 < item.scale < math.inf:
+            raise ValueError(f"{name}: the scale must be positive and finite, got {item.scale}.")
+        scale = float(item.scale)
+    ends = (-math.inf if lower is None else lower, math.inf if upper is None else upper)
+    numbers = [jnp.asarray(float(x), jnp.result_type(float)) for x in (start, *ends, scale)]
+    return [entry], Interval(*numbers, bounded=(lower is not None, upper is not None)), [start], [scale], [prior]
+
+
+def _checked_bounds(name: str, bounds: Any, positive: bool) -> tuple[float | None, float | None]:
+    """(lower, upper), None where there is none; infinite ones are none."""
+    if bounds is None:
+        return (0.0, None) if positive else (None, None)
+    lower, upper = (end if b is None else float(b) for b, end in zip(bounds, (-math.inf, math.inf), strict=True))
+    if not lower < upper:
+        raise ValueError(
+            f"{name}: nothing lies between the bounds {bounds}; they are (lower, upper), or None for none."
+        )
+    return (None if lower == -math.inf else lower), (None if upper == math.inf else upper)
+
+
+_PRODUCTS = ((0, 1), (0, 2), (1, 2))
+
+
+def _of_body(system: System, item: Inertia):
+    """One `PossibleBody` and its entries. A value is found by (leaf, places)."""
+    if (item.matrix is None) == (item.moments is None):
+        raise ValueError("Inertia: give `moments` (and `products`), or `matrix`.")
+    names: list[str | None] = [item.mass, *item.center]
+    spots: list[Any] = [None if name is None else (_one(system, name), (0,)) for name in names]
+    wheel = None
+    if item.matrix is not None:
+        leaf = _one(system, item.matrix, (3, 3))
+        pairs = [(0, 0), (1, 1), (2, 2), *_PRODUCTS]
+        names += [f"{item.matrix}[{a}, {b}]" for a, b in pairs]
+        spots += [(leaf, tuple({3 * a + b, 3 * b + a})) for a, b in pairs]
+    else:
+        moments = item.moments or ("", "", "")
+        given = sum(name is not None for name in item.products)
+        if given == 2 or (given and len(set(moments)) < 3):
+            raise ValueError(
+                "Inertia: name all three `products`, or the one that a plane of symmetry leaves, or none where the "
+                "axes are principal, as a wheel's are."
+            )
+        if len(set(moments)) < 3:
+            a, b = next((a, b) for a, b in _PRODUCTS if moments[a] == moments[b])
+            wheel = (a, b)
+        names += [*moments, *item.products]
+        spots += [None if name is None else (_one(system, name), (0,)) for name in (*moments, *item.products)]
+    leaves = jax.tree.leaves(system)
+    values = [0.0 if s is None else float(np.ravel(leaves[s[0]])[s[1][0]]) for s in spots]
+    values[0] = values[0] if spots[0] is not None else 1.0
+    unknown = sorted(set(item.fixed) - {name for name in names[:4] if name})
+    if unknown:
+        raise ValueError(f"Inertia: `fixed` may name the mass and the place of its centre, not {', '.join(unknown)}.")
+    still = {i for i in range(4) if names[i] is None or names[i] in item.fixed} | ({4 + wheel[1]} if wheel else set())
+    moves = tuple(i for i in range(10) if spots[i] is not None and i not in still)
+    try:
+        body = PossibleBody.of(values, moves, wheel)
+    except ValueError as error:
+        raise ValueError(f"Inertia of {', '.join(n for n in names[4:7] if n)}: {error}") from None
+    units = ["kg", "m", "m", "m", *[item.unit] * 6]
+    entries, start, scale, priors = [], [], [], []
+    for i in moves:
+        name, (leaf, places) = str(names[i]), spots[i]
+        entries.append(_Entry(name, units[i], tuple((leaf, place, 1.0) for place in places)))
+        start.append(values[i])
+        scale.append(abs(values[i]) or float(body.scale[i]) if i < 4 else abs(values[i]) or max(values[4:7]))
+        priors.append(_checked_prior(name, item.prior[name]) if name in item.prior else None)
+    return entries, body, start, scale, priors
+
+
+def _one(system: System, name: str, shape: tuple[int, ...] = ()) -> int:
+    """The leaf of this name, which has this shape."""
+    (chosen, leaves) = _find(system, name)
+    if len(chosen) != 1 or leaves[chosen[0]][1].shape != shape:
+        raise ValueError(f"{type(system).__name__}.{name} must have the shape {shape}.")
+    return chosen[0]
+
+
+def _find(system: System, where: str | Callable[[Any], Any]) -> tuple[list[int], list[Any]]:
+    """Numbers of the leaves that are meant, and all (path, leaf)."""
+    title = type(system).__name__
+    leaves, structure = jax.tree_util.tree_flatten_with_path(system)
+    numbered = jax.tree.unflatten(structure, range(len(leaves)))  # where a leaf stands, its place in the list
+    try:
+        chosen = jax.tree.leaves(_follow(numbered, where) if isinstance(where, str) else where(numbered))
+    except (AttributeError, IndexError, KeyError, TypeError):
+        chosen = []
+    if not chosen or not all(isinstance(i, int) and 0 <= i < len(leaves) for i in chosen):
+        known = [_path_name(path) for path, _ in leaves]
+        raise ValueError(f"{title} has no parameter {where!r}; {hint(str(where), known, 'it has')}")
+    for i in chosen:
+        path, leaf = leaves[i]
+        if not (eqx.is_inexact_array(leaf) and not jnp.issubdtype(leaf.dtype, jnp.complexfloating)):
+            raise ValueError(f"{title}.{_path_name(path)} is no real number and cannot be fitted.")
+    return chosen, leaves
+
+
+def _follow(tree: Any, path: str) -> Any:
+    for part in path.split("."):
+        tree = tree[part] if isinstance(tree, Mapping) else tree[int(part)] if part.isdigit() else getattr(tree, part)
+    return tree
+
+
+def _path_name(path: tuple[Any, ...]) -> str:
+    return jax.tree_util.keystr(path).lstrip(".")
+
+
+def _declared_positive(system: Any, path: tuple[Any, ...]) -> bool:
+    """Whether the field that holds this leaf was declared by `parameter(positive=True)`."""
+    positive = False
+    for key in path:
+        if isinstance(key, jax.tree_util.GetAttrKey):
+            field = {f.name: f for f in dataclasses.fields(system)}.get(key.name)
+            positive = bool(field and "jaxkane" in field.metadata and field.metadata["jaxkane"].positive)
+            system = getattr(system, key.name)
+        elif isinstance(key, jax.tree_util.SequenceKey):
+            system = system[key.idx]
+        elif isinstance(key, jax.tree_util.DictKey):
+            system = system[key.key]
+    return positive

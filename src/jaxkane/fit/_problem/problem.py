@@ -1,0 +1,355 @@
+"""A fit that is posed: trials, windows, what is free and what is unknown. Knows names; knows no optimizer."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..._description.system import System
+from ..._method.checks import check_system
+from ..._simulation.settings import settings_for
+from ..._simulation.trajectory import Trajectory
+from .._data.trial import Trial
+from .._data.windows import Place, Windows, cut
+from .blocks import Blocks
+from .model import Model, Point, blocks_of, costs_of, rides_of, starts_of
+from .names import Names, checked_names, checked_trials, nuisance_of
+from .parallel import blocks_of_all, check_same, costs_of_all
+from .parameters import Delay, Parameters, Prior, parameters_of
+
+STEP_TOLERANCE = 0.05, 0.25
+"""By how much halving the step of integration may move all residuals together, of a window and of all windows: it
+bounds the bias of an estimate in its standard errors."""
+
+HALVINGS = 8
+"""Of a step between two samples, at most: what needs more is stiff or chaotic."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """Trials, free parameters and nuisance values of one fit.
+
+        residual = (gain * simulated + bias - measured) / sigma
+
+    Made by `Problem.of`; solved by `least_squares` and the other methods; looked at by `identifiability`.
+    """
+
+    model: Model
+    windows: Windows
+    by_trial: Array
+    trials: tuple[Trial, ...]
+    places: tuple[Place, ...]
+    posed: Mapping[str, Any]  # the arguments of `of`, but for the trials
+    processes: bool = False
+
+    @classmethod
+    def of(
+        cls,
+        system: System,
+        trials: Sequence[Trial] | Trial,
+        free: Any,
+        *,
+        unknown: Names = (),
+        sensor_bias: Names = (),
+        sensor_gain: Names = (),
+        input_bias: Names = (),
+        input_gain: Names = (),
+        input_delay: Names = (),
+        priors: Mapping[str, Prior] | None = None,
+        hold: Sequence[str] = (),
+        window: float | None = None,
+        continuity: Mapping[str, float] | None = None,
+        outputs: Mapping[str, Callable[[Trajectory], Array]] | None = None,
+        rtol: float | None = None,
+        atol: float | None = None,
+        step: float | None = None,
+        solver: diffrax.AbstractSolver | None = None,
+        max_steps: int | None = None,
+        processes: bool = False,
+    ) -> Problem:
+        """Pose a fit. The arguments are those of `jaxkane.fit.fit`."""
+        posed = {key: value for key, value in locals().items() if key not in ("cls", "trials")}
+        trials = (trials,) if isinstance(trials, Trial) else tuple(trials)
+        outputs = dict(outputs or {})
+        channels = checked_trials(system, trials, outputs)
+        if window is not None and not window > 0:
+            raise ValueError(f"`window` is a length of time [s], got {window}.")
+        if continuity is not None and window is None:
+            raise ValueError("`continuity` binds the windows of a trial together: give their length, `window` [s].")
+        _check_settings(rtol, atol, step, max_steps)
+        driven = tuple(name for name in system.inputs if any(name in trial.inputs for trial in trials))
+        per_trial = {
+            "bias of sensor": checked_names(system, "sensor_bias", sensor_bias, channels),
+            "gain of sensor": checked_names(system, "sensor_gain", sensor_gain, channels),
+            "bias of input": checked_names(system, "input_bias", input_bias, system.inputs),
+            "gain of input": checked_names(system, "input_gain", input_gain, driven),
+            "delay of input": checked_names(system, "input_delay", input_delay, driven),
+        }
+        items = [free] if isinstance(free, Delay) else free if isinstance(free, (list, tuple)) else ()
+        late = [*per_trial["delay of input"], *(item.input for item in items if isinstance(item, Delay))]
+        held = tuple(checked_names(system, "hold", hold, system.inputs))
+        stuck = sorted(set(late) & set(held))
+        if stuck:
+            raise ValueError(f"{stuck[0]} is held from sample to sample: nothing changes smoothly with its delay.")
+        parameters = parameters_of(system, free).with_priors(priors or {})
+        windows, places = cut(system, trials, window, channels, chained=continuity is not None, delayed=bool(late))
+        check_system(system, windows.t[0, 0], jnp.nan_to_num(windows.start[0, : len(system.coordinates)]))
+        varying = any(np.ptp(x) > 0 for t in trials for x in t.inputs.values())
+        fixed = step is not None or (rtol is None and atol is None and varying)
+        settings = settings_for(
+            windows.t[0],
+            rtol=1e-6 if rtol is None else rtol,
+            atol=atol,
+            solver=solver if solver is not None else diffrax.Bosh3() if fixed else diffrax.Tsit5(),
+            step=1.0 if fixed else None,  # every window has its own
+            adjoint="forward",
+            # A fixed step is taken as often as it fits into the time.
+            max_steps=max_steps if max_steps is not None or fixed else 4096,
+        )
+        model = Model(
+            system=system,
+            parameters=parameters,
+            nuisance=nuisance_of(system, unknown, per_trial, continuity),
+            settings=settings,
+            channels=channels,
+            driven=driven,
+            held=held,
+            outputs=tuple(outputs.items()),
+        )
+        if step is not None:  # one step in all windows
+            windows = eqx.tree_at(lambda w: w.step, windows, jnp.full_like(windows.step, step))
+        if processes:
+            check_same(model, windows)
+        problem = cls(model, windows, windows.by_trial, trials, places, posed, processes)
+        return problem.finer(problem.start) if fixed and step is None else problem
+
+    def finer(self, point: Point) -> Problem:
+        """With steps halved where that changes what is simulated at a point by more than a share of the noise.
+
+        An input that is linear between its samples has a kink at every sample, on which error control spends ten
+        steps; a step from kink to kink meets none. Measured (the rides of a steered bicycle, 100 Hz, 1 s): 1300 steps
+        at a tolerance of 1e-7 against 100 of Bosh3, which differ by 0.002 of the measurements' deviation.
+        """
+        first, problem, before = self.windows.step, self, simulated(self, point)
+        going, last = np.full(len(self.places), True), np.full(len(self.places), np.inf)
+        for halvings in range(HALVINGS):
+            half = jnp.where(jnp.asarray(going), problem.windows.step / 2, problem.windows.step)
+            halved = problem._with_steps(half)
+            after = simulated(halved, point)
+            apart = problem._apart(before, after)
+            going &= ~(apart <= self.step_tolerance)
+            # What halving does not bring nearer has no step: it is chaotic, or ends too early with each.
+            going &= (halvings < 2) | (np.isfinite(apart) & (apart <= last / 2))
+            if not going.any():
+                break
+            problem = problem._with_steps(jnp.where(jnp.asarray(going), half, problem.windows.step))
+            before, last = np.where(going[:, None, None], after, before), apart
+        lost = ~np.all(np.isfinite(np.where(np.asarray(self.windows.weight) > 0, before, 0.0)), axis=(1, 2))
+        return problem._with_steps(jnp.where(jnp.asarray(lost), first, problem.windows.step))
+
+    @property
+    def step_tolerance(self) -> float:
+        """By how much halving the step may move all residuals of one window together, in standard deviations."""
+        one, together = STEP_TOLERANCE
+        return min(one, together / len(self.places) ** 0.5)
+
+    def step_errors(self, point: Point, now: np.ndarray | None = None) -> np.ndarray:
+        """By how much halving the step moves all residuals of every window (W,) together, in standard deviations; NaN
+        where a window is not simulated to its end, or where the step follows from tolerances.
+
+        `now` (W, n_c, n_t): what is simulated at the point, where that is known.
+        """
+        if self.model.settings.step is None:
+            return np.full(len(self.places), np.nan)
+        alone = dataclasses.replace(self, processes=False)  # asked of one process, this must not wait for the others
+        now = simulated(alone, point) if now is None else now
+        return self._apart(now, simulated(alone._with_steps(self.windows.step / 2), point))
+
+    def _with_steps(self, step: Array) -> Problem:
+        return dataclasses.replace(self, windows=eqx.tree_at(lambda w: w.step, self.windows, step))
+
+    def _apart(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """The norm (W,) of a difference of simulations, in standard deviations; infinite where one of the two ended
+        earlier, NaN where both did."""
+        weight = np.asarray(self.windows.weight)
+        lost = [np.any((weight > 0) & ~np.isfinite(x), axis=(1, 2)) for x in (a, b)]
+        with np.errstate(invalid="ignore"):
+            moved = np.linalg.norm(np.where(weight > 0, (b - a) * weight, 0.0), axis=(1, 2))
+        return np.where(lost[0] & lost[1], np.nan, np.where(lost[0] | lost[1], np.inf, moved))
+
+    @property
+    def system(self) -> System:
+        return self.model.system
+
+    @property
+    def parameters(self) -> Parameters:
+        return self.model.parameters
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        return self.model.channels
+
+    @property
+    def start(self) -> Point:
+        """No parameter changed, no bias, every window starts as it was measured."""
+        p, T, W = len(self.parameters.entries), len(self.trials), len(self.places)
+        zeros = lambda *shape: jnp.zeros(shape, self.windows.t.dtype)  # noqa: E731
+        return Point(zeros(p), zeros(T, len(self.model.nuisance.trial)), zeros(W, len(self.model.nuisance.start)))
+
+    def at(self, values: Mapping[str, float], point: Point | None = None) -> Point:
+        """The point with these values of parameters, by name; the rest as in `point`, by default as at the start.
+
+        **Raises:** `ValueError` for a value outside its bounds, or that no body can have.
+        """
+        point = self.start if point is None else point
+        wrong = sorted(set(values) - set(self.parameters.names))
+        if wrong:
+            raise ValueError(f"{', '.join(wrong)} is not free; {', '.join(self.parameters.names)} are.")
+        now = self.parameters.values(point.x)
+        for name, value in values.items():
+            now = now.at[self.parameters.names.index(name)].set(float(value))
+        x = self.parameters.inverse(now)
+        if not bool(jnp.all(jnp.isfinite(x))):
+            bad = [n for n, ok in zip(self.parameters.names, np.isfinite(np.asarray(x)), strict=True) if not ok]
+            raise ValueError(f"{', '.join(bad)}: these values are outside their bounds, or no body can have them.")
+        return eqx.tree_at(lambda p: p.x, point, x)
+
+    @property
+    def seen(self) -> np.ndarray:
+        """Whether a window (W,) holds a measurement that counts, or stands between such."""
+        own = np.asarray(jnp.any(self.windows.weight > 0, axis=(1, 2)))
+        if not self.model.nuisance.chained:
+            return own
+        owner = np.asarray(self.windows.trial)
+        return np.isin(owner, owner[own])
+
+    @property
+    def clusters(self) -> int:
+        """The number of trials that count."""
+        return len(np.unique(np.asarray(self.windows.trial)[self.seen]))
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Numbers of residuals, priors and links among them, and of unknowns."""
+        n, seen, T = self.model.nuisance, self.seen, self.clusters
+        finite = lambda x: int(np.isfinite(np.asarray(x)).sum())  # noqa: E731
+        residuals = int(jnp.sum(self.windows.weight > 0)) + finite(self.parameters.prior_deviation)
+        residuals += (T if n.chained else int(seen.sum())) * finite(n.start_deviation) + T * finite(n.trial_deviation)
+        residuals += int(np.asarray(self.windows.linked)[seen].sum()) * finite(n.jump)
+        unknowns = len(self.parameters.entries) + T * len(n.trial) + int(seen.sum()) * len(n.start)
+        return residuals, unknowns
+
+    def trajectories(self, point: Point) -> list[Trajectory]:
+        """The motion of every window, in the order of `places`."""
+        rides = rides_of(self.model, self.windows, point, starts_of(self.model, self.windows, point)[0])
+        return [
+            jax.tree.map(lambda x, i=i, n=n: x[i, :n] if x.ndim > 1 else x[i], rides)
+            for i, (_, _, n) in enumerate(self.places)
+        ]
+
+    def shortened(self, samples: Any) -> Problem:
+        """The same problem with only the first `samples` (W,) of every window; nothing is compiled anew."""
+        windows, whole = self.windows, np.array([n for _, _, n in self.places])
+        if np.all(np.asarray(samples) >= whole):
+            return self
+        keep = jnp.asarray(samples, dtype=jnp.int32)[:, None]  # (W, 1)
+        inside = jnp.arange(windows.t.shape[1], dtype=jnp.int32)[None, :] < keep  # (W, n_t)
+        t = jnp.where(inside, windows.t, jnp.take_along_axis(windows.t, keep - 1, axis=1))
+        t = jnp.where(jnp.asarray(samples >= whole)[:, None], windows.t, t)
+        weight = jnp.where(inside[:, None, :], windows.weight, 0.0)
+        linked = jnp.where(jnp.asarray(samples >= whole), windows.linked, 0.0)
+        new = eqx.tree_at(lambda w: (w.t, w.weight, w.linked), windows, (t, weight, linked))
+        return dataclasses.replace(self, windows=new)
+
+    def only(self, trials: Collection[int]) -> Problem:
+        """The same problem in which only these trials (by number) count; nothing is compiled anew."""
+        counts = jnp.isin(self.windows.trial, jnp.asarray(sorted(trials), dtype=self.windows.trial.dtype))
+        weight = jnp.where(counts[:, None, None], self.windows.weight, 0.0)
+        linked = jnp.where(counts, self.windows.linked, 0.0)
+        new = eqx.tree_at(lambda w: (w.weight, w.linked), self.windows, (weight, linked))
+        return dataclasses.replace(self, windows=new)
+
+    def with_trials(self, trials: Sequence[Trial] | Trial) -> Problem:
+        """The same question, asked of other trials."""
+        return Problem.of(trials=trials, **self.posed)
+
+    def unchained(self) -> Problem:
+        """The same problem in which every window starts freely; nothing is compiled anew."""
+        windows = eqx.tree_at(lambda w: w.linked, self.windows, jnp.zeros_like(self.windows.linked))
+        return dataclasses.replace(self, windows=windows)
+
+    def with_priors(self, priors: Mapping[str, Prior]) -> Problem:
+        """The same problem with priors (mean, standard deviation) of parameters by name; nothing is compiled anew."""
+        return dataclasses.replace(
+            self, model=eqx.tree_at(lambda m: m.parameters, self.model, self.parameters.with_priors(priors))
+        )
+
+
+def _check_settings(rtol: float | None, atol: float | None, step: float | None, max_steps: int | None) -> None:
+    for name, value in (("rtol", rtol), ("atol", atol), ("step", step), ("max_steps", max_steps)):
+        if value is not None and not 0 < value < float("inf"):
+            raise ValueError(f"`{name}` must be positive and finite, got {value}.")
+    if step is not None and (rtol is not None or atol is not None):
+        raise ValueError("`step` fixes the step of integration, `rtol` and `atol` let it follow the error: give one.")
+
+
+class Linearization(eqx.Module):
+    """A problem at a point: its blocks, what was simulated (W, n_c, n_t) and the status of every window (W,)."""
+
+    blocks: Blocks
+    simulated: Array
+    status: Array
+
+    @property
+    def cost(self) -> float:
+        """Sum of squares; NaN or infinite where a window could not be simulated."""
+        return float(self.blocks.cost)
+
+    @property
+    def good(self) -> np.ndarray:
+        """Whether a window (W,) has finite residuals and derivatives."""
+        return np.all(np.isfinite(np.asarray(self.blocks.R)), axis=(1, 2))
+
+
+def linearize(problem: Problem, point: Point) -> Linearization | None:
+    """Residuals and their exact derivatives, by forward mode through the simulation; None where no start is found."""
+    found = _starts(problem, point)
+    if found is None:
+        return None
+    blocks: Any = blocks_of_all if problem.processes else blocks_of
+    return Linearization(*blocks(problem.model, problem.windows, problem.by_trial, point, *found))
+
+
+def cost(problem: Problem, point: Point) -> float:
+    """Sum of squares, without derivatives; NaN or infinite where a window could not be simulated."""
+    found = _starts(problem, point)
+    if found is None:
+        return float("nan")
+    return float(jnp.sum(_costs(problem, point, found[0])[0]))
+
+
+def simulated(problem: Problem, point: Point) -> np.ndarray:
+    """What the sensors would have said (W, n_c, n_t); NaN where that cannot be simulated."""
+    found = _starts(problem, point)
+    if found is None:
+        return np.full(problem.windows.measured.shape, np.nan)
+    return np.asarray(_costs(problem, point, found[0])[1])
+
+
+def _costs(problem: Problem, point: Point, starts: Array) -> tuple[Array, Array]:
+    return (costs_of_all if problem.processes else costs_of)(problem.model, problem.windows, point, starts)
+
+
+def _starts(problem: Problem, point: Point) -> tuple[Array, Array] | None:
+    try:
+        return starts_of(problem.model, problem.windows, point)
+    except eqx.EquinoxRuntimeError:  # Newton's linear solver raises on what is not finite
+        return None

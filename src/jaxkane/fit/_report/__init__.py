@@ -1,0 +1,1 @@
+"""A fit told: tables, text, pictures, a page."""

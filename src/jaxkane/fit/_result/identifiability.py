@@ -1,0 +1,202 @@
+"""What the data can tell: singular values of the sensitivity, and the directions in which nothing changes."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._optimize.steps import settle
+from .._problem.blocks import eliminate
+from .._problem.model import Point
+from .._problem.problem import Linearization, Problem
+
+
+@dataclasses.dataclass(frozen=True)
+class Direction:
+    """A combination of parameters, and how well it is known.
+
+    Attributes: `singular_value`: by how many standard deviations of one measurement all residuals together move for a
+    step of one along it; `deviation`: its own standard deviation, in scaled units (1 is a change by the whole scale,
+    for a positive parameter by all of itself); `parts`: the parameters in it with their shares; `text`: in words.
+    """
+
+    singular_value: float
+    deviation: float
+    parts: tuple[tuple[str, float], ...]
+    text: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Identifiability:
+    """The sensitivity of all residuals to the free parameters, nuisance values eliminated.
+
+    - `names`, `units` (p,); `scales` (p,): what parameters are counted in, each in its unit.
+    - `singular_values` (p,), largest first; `vectors` (p, p), a row for each, in scaled parameters.
+    - `deviations` (p,): standard deviation along each row, in scaled units.
+    - `without_influence`: names of the parameters that change no residual at all. `at_bound`: of those that went as far
+        as their bounds let them.
+    - `undetermined`: the directions that the data do not tell, weakest first.
+    - `covariance` (p, p) of the parameters in their units, infinite for those without influence.
+    - `covariance_of_x` (p, p) of the free numbers behind them.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    scales: np.ndarray
+    singular_values: np.ndarray
+    vectors: np.ndarray
+    deviations: np.ndarray
+    without_influence: tuple[str, ...]
+    at_bound: tuple[str, ...]
+    undetermined: tuple[Direction, ...]
+    covariance: np.ndarray
+    covariance_of_x: np.ndarray
+
+    @property
+    def ok(self) -> bool:
+        """Whether every parameter can be told."""
+        return not self.undetermined
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        return tuple(direction.text for direction in self.undetermined)
+
+    @property
+    def information(self) -> np.ndarray:
+        """Fisher information (p, p) of the scaled parameters, for residuals of variance one."""
+        return (self.vectors.T * self.singular_values**2) @ self.vectors
+
+    def __str__(self) -> str:
+        lines = ["singular value   deviation   direction (scaled parameters)"]
+        for s, deviation, row in zip(self.singular_values, self.deviations, self.vectors, strict=True):
+            lines.append(f"{s:14.4g}   {deviation:9.2g}   {combination(self.names, row)}")
+        return "\n".join([*lines, *self.messages])
+
+
+def identifiability(
+    problem: Any, trials: Any = None, free: Any = None, *, flat: float = 0.5, at: Point | None = None, **options: Any
+) -> Identifiability:
+    """Which parameters, or combinations of them, the data can tell.
+
+        identifiability(result), identifiability(problem), identifiability(system, trials, free, unknown=("roll",))
+
+    The residuals' sensitivity to the scaled parameters, with the nuisance values eliminated, is taken apart by singular
+    values. A direction whose standard deviation exceeds `flat` of the parameters' scale is called undetermined.
+
+    **Arguments:**
+
+    - `problem`: a `Fit`, a `Problem`, or a system with `trials`, `free` and the other arguments of `fit`.
+    - `flat`: where undetermined begins. `at`: a point of the problem; by default its start, nuisance values settled.
+
+    **Returns:** an `Identifiability`; print it for a table.
+    """
+    if hasattr(problem, "identifiability"):
+        return look(problem.problem, problem.point, problem.linearization, flat)
+    if not isinstance(problem, Problem):
+        problem = Problem.of(problem, trials, free, **options)
+    point, linearization = settle(problem, problem.start if at is None else at)
+    return look(problem, point, linearization, flat)
+
+
+def residual_variance(problem: Problem, cost: float) -> float:
+    """The sum of squares by residuals less unknowns; NaN where there are no more residuals than unknowns."""
+    n_r, n_unknown = problem.size
+    return cost / (n_r - n_unknown) if n_r > n_unknown else float("nan")
+
+
+def look(problem: Problem, point: Point, at: Linearization, flat: float = 0.5) -> Identifiability:
+    """Identifiability at a point where the problem has been linearized."""
+    parameters = problem.parameters
+    names, p = parameters.names, len(parameters.names)
+    to_values = np.asarray(parameters.slopes(point.x))
+    # What a step of one in the free numbers does; at a bound, nothing at all.
+    scales = np.maximum(np.linalg.norm(to_values, axis=1), 1e-100)
+    # From scaled parameters; at the edge of what a body can have, a free number moves nothing any more.
+    to_x = np.linalg.pinv(to_values / scales[:, None], rcond=1e-9)
+    eliminated = eliminate(at.blocks, 0.0)
+    A = np.asarray(eliminated.rows[0]) @ to_x
+    before = np.linalg.norm(np.asarray(at.blocks.R)[:, :, -1 - p : -1] @ to_x, axis=(0, 1))
+    eps = float(jnp.finfo(eliminated.R.dtype).eps)
+    silent = before <= 1e4 * eps * before.max()
+    variance = residual_variance(problem, at.cost)
+    # Without a degree of freedom nothing says that `sigma` is wrong.
+    deviation = 1.0 if np.isnan(variance) else variance**0.5
+    heard = np.flatnonzero(~silent)
+    s, V = np.zeros(p), np.zeros((p, p))
+    if heard.size:
+        # Columns that belong to silent free numbers are left out of the elimination: nothing is lost.
+        _, s[: heard.size], V[: heard.size, heard] = np.linalg.svd(A[:, heard], full_matrices=False)
+    # Each silent parameter is a direction of its own.
+    V[np.arange(heard.size, p), np.flatnonzero(silent)] = 1.0
+    s = np.where(s <= 1e3 * eps * before.max(), 0.0, s)  # elimination leaves rounding errors of what it removed
+    with np.errstate(divide="ignore"):
+        deviations = deviation / s
+        inverse = np.where(s > 0, 1 / s, 0.0)
+    V = V * np.sign(V[np.arange(p), np.abs(V).argmax(axis=1)])[:, None]
+    told = ~silent & np.all((np.abs(V) < 1e-6) | (s[:, None] > 0), axis=0)
+    scaled = variance * (V.T * inverse**2) @ V
+    of_x = to_x @ scaled @ to_x.T
+    covariance = scaled * np.outer(scales, scales)
+    covariance[~told, :] = covariance[:, ~told] = np.nan
+    covariance[~told, ~told] = np.inf
+    seen = Identifiability(
+        names=names,
+        units=parameters.units,
+        scales=scales,
+        singular_values=s,
+        vectors=V,
+        deviations=deviations,
+        without_influence=tuple(name for name, quiet in zip(names, silent, strict=True) if quiet),
+        at_bound=(),
+        undetermined=(),
+        covariance=covariance,
+        covariance_of_x=of_x,
+    )
+    # Beside a bound nothing moves any more: that is not a parameter which the data do not see.
+    alone = np.count_nonzero(to_values, axis=1) <= 1
+    edge = alone & (scales < 1e-3 * np.asarray(parameters.scale))
+    at_bound = tuple(name for name, there in zip(names, edge, strict=True) if there)
+    seen = dataclasses.replace(
+        seen,
+        at_bound=at_bound,
+        without_influence=tuple(name for name in seen.without_influence if name not in at_bound),
+    )
+    weak = [i for i in reversed(range(p)) if not deviations[i] <= flat]
+    return dataclasses.replace(seen, undetermined=tuple(_direction(seen, i) for i in weak))
+
+
+def _direction(seen: Identifiability, i: int) -> Direction:
+    s, deviation, row = seen.singular_values[i], seen.deviations[i], seen.vectors[i]
+    order = [j for j in np.argsort(-np.abs(row), kind="stable") if abs(row[j]) > 0.1]
+    parts = tuple((seen.names[j], float(row[j])) for j in order)
+    first = parts[0][0]
+    if len(parts) == 1 and first in seen.at_bound:
+        text = f"{first} has gone to its bound: the data want it beyond. It may be making up for what the model lacks."
+    elif len(parts) == 1 and first in seen.without_influence:
+        text = f"{first} has no influence on these data; it stays at its start."
+    elif len(parts) == 1 and s == 0:
+        text = f"{first} cannot be told from the unknown starts and biases."
+    elif len(parts) == 1:
+        unit = f" {seen.units[order[0]]}" * bool(seen.units[order[0]])
+        error = deviation * seen.scales[order[0]]
+        text = f"{first} is undetermined: its standard deviation is {error:.2g}{unit}, {deviation:.2g} of its scale."
+    else:
+        size = min(deviation, 1.0)
+        together = ", ".join(
+            f"{name} by {share * size * seen.scales[j]:+.2g}{' ' * bool(seen.units[j])}{seen.units[j]}"
+            for j, (name, share) in zip(order, parts, strict=True)
+        )
+        how = "changes nothing" if s == 0 else f"changes the fit by {size / deviation:.2g} standard deviations"
+        text = f"{', '.join(name for name, _ in parts)} trade off: moving {together} together {how}."
+    return Direction(float(s), float(deviation), parts, text)
+
+
+def combination(names: Sequence[str], row: np.ndarray) -> str:
+    """`0.71 mB - 0.70 zB`."""
+    order = [i for i in np.argsort(-np.abs(row), kind="stable") if abs(row[i]) > 0.1]
+    text = " ".join(f"{'-' if row[i] < 0 else '+'} {abs(row[i]):.2f} {names[i]}" for i in order)
+    return text.removeprefix("+ ")

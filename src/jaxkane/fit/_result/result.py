@@ -1,0 +1,378 @@
+"""What a fit found, how sure it is, and what it could not tell."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..._description.system import System
+from ..._scalars.reads import compiled
+from ..._simulation.trajectory import Trajectory
+from .._analysis import suspicions
+from .._data.trial import Trial
+from .._optimize.steps import settle
+from .._problem.model import Point
+from .._problem.parameters import Parameters
+from .._problem.problem import STEP_TOLERANCE, Linearization, Problem
+from .identifiability import Identifiability, look, residual_variance
+from .residual_tests import ResidualTest, residual_test
+from .uncertainty import clustered_covariance, t_quantile
+
+STATUS = {
+    "converged": "converged",
+    "steps": "stopped after the last step, before it converged",
+    "stuck": "stuck: no step lowers the cost",
+    "interrupted": "interrupted: this is the best so far",
+    "applied": "not fitted: these are the parameters of another fit",
+}
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Fit:
+    """The result of a fit; print it for a table, `report()` for more, `save_report(path)` for a page with pictures.
+
+    - `system`: with the estimates in it. `estimates`, `start`: values by name. Gains and delays are among them.
+    - `standard_errors`: by name, formal: from the inverse of J^T J with the nuisance values eliminated, times the
+        residuals' variance. They hold for independent residuals of equal scaled size, and a right model.
+    - `clustered_errors`: by name, robust to residuals that are correlated within a trial (sandwich, one cluster a
+        trial); NaN with fewer trials than parameters plus two.
+    - `intervals(level)`: by name. `correlation` (p, p) of the estimates, in the order of `names`.
+    - `cost`: sum of squared residuals; `history`: of the cost. `status`, `message`: how it ended, in a word and in
+        words.
+    - `identifiability`: singular values and directions of the sensitivity, and what the data do not tell.
+    - `residuals`: by trial and channel, (simulated - measured) / sigma (n_t,), NaN in gaps; `fitted`: simulated (n_t,).
+        `tests`: by trial and channel, a `ResidualTest`. `variance_accounted_for`: by channel, over all trials.
+    - `nuisance`: by trial, values of the biases and of the windows' starts by name.
+    - `notes`: what a reader should know, in words.
+    """
+
+    problem: Problem
+    point: Point
+    linearization: Linearization
+    history: tuple[float, ...]
+    status: str
+    method: str
+
+    @classmethod
+    def of(
+        cls,
+        problem: Problem,
+        point: Point,
+        at: Linearization,
+        history: Sequence[float],
+        status: str,
+        method: str,
+    ) -> Fit:
+        """The result at a point."""
+        return cls(problem, point, at, tuple(history), status, method)
+
+    @property
+    def parameters(self) -> Parameters:
+        return self.problem.parameters
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.parameters.names
+
+    @property
+    def cost(self) -> float:
+        return self.linearization.cost
+
+    @property
+    def variance(self) -> float:
+        """Of a residual: the sum of squares by residuals less unknowns; one where `sigma` and the model are right, and
+        NaN where there are no more residuals than unknowns."""
+        return residual_variance(self.problem, self.cost)
+
+    @property
+    def system(self) -> System:
+        return self.parameters.apply(self.problem.system, self.point.x)[0]
+
+    @property
+    def start(self) -> dict[str, float]:
+        return dict(zip(self.names, np.asarray(self.parameters.start).tolist(), strict=True))
+
+    @property
+    def estimates(self) -> dict[str, float]:
+        return dict(zip(self.names, np.asarray(self.parameters.values(self.point.x)).tolist(), strict=True))
+
+    @functools.cached_property
+    def identifiability(self) -> Identifiability:
+        return look(self.problem, self.point, self.linearization)
+
+    @property
+    def message(self) -> str:
+        words = STATUS[self.status]
+        if self.status == "converged" and not self.identifiability.ok:
+            words = "the cost has converged, but not every parameter is determined"
+        notes = (*self.identifiability.messages, *suspicions.no_freedom(self), *suspicions.coarse_steps(self))
+        return "; ".join([words, *(note.rstrip(".") for note in notes)])
+
+    @property
+    def ok(self) -> bool:
+        """Whether it converged, every parameter is determined, and the steps of integration are fine enough."""
+        return self.status == "converged" and self.identifiability.ok and not self.too_coarse
+
+    @functools.cached_property
+    def _step_errors(self) -> np.ndarray:
+        return self.problem.step_errors(self.point, np.asarray(self.linearization.simulated))
+
+    @property
+    def step_error(self) -> float:
+        """By how much halving the fixed step of integration moves all residuals together, in standard deviations: about
+        by as many of its standard errors an estimate can be off at most. NaN where the step follows from tolerances."""
+        return float(np.linalg.norm(self._step_errors))
+
+    @property
+    def too_coarse(self) -> bool:
+        """Whether halving the fixed step moves all residuals together by more than a quarter of what noise does: by as
+        much of its standard errors an estimate may be off."""
+        noise = max(1.0, np.nan_to_num(self.variance, nan=1.0)) ** 0.5
+        return bool(self.step_error > noise * STEP_TOLERANCE[1])
+
+    @property
+    def singular_values(self) -> np.ndarray:
+        return self.identifiability.singular_values
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(p, p), in the parameters' units."""
+        return self.identifiability.covariance
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        return dict(zip(self.names, np.sqrt(self.covariance.diagonal()).tolist(), strict=True))
+
+    @functools.cached_property
+    def clustered_covariance(self) -> np.ndarray:
+        """(p, p), in the parameters' units, robust to residuals that are correlated within a trial."""
+        slopes = np.asarray(self.parameters.slopes(self.point.x))
+        return slopes @ clustered_covariance(self) @ slopes.T
+
+    @property
+    def clustered_errors(self) -> dict[str, float]:
+        return dict(zip(self.names, np.sqrt(self.clustered_covariance.diagonal()).tolist(), strict=True))
+
+    @property
+    def robust(self) -> bool:
+        """Whether `intervals` use the clustered errors: the residuals are not noise, and there are trials enough."""
+        known = np.all(np.isfinite(self.clustered_covariance.diagonal()))
+        return bool(known and abs(self.autocorrelation) > 0.2)
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom of all intervals: trials less one where `robust`, else residuals less unknowns."""
+        n_r, n_unknown = self.problem.size
+        return self.problem.clusters - 1 if self.robust else n_r - n_unknown
+
+    def quantile(self, level: float = 0.95) -> float:
+        """Of Student's distribution, two-sided, with as many degrees of freedom as `freedom`."""
+        return t_quantile(level, self.freedom)
+
+    def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Confidence intervals by name, inside a parameter's bounds: symmetric in the free numbers.
+
+        From the clustered errors where `robust`, from the formal ones else; `freedom` says with how many degrees.
+
+        **Raises:** `ValueError` for a level that is not between 0 and 1.
+        """
+        errors = self.clustered_errors if self.robust else self.standard_errors
+        quantile = self.quantile(level)
+        values, slopes = (np.asarray(f(self.parameters, self.point.x)) for f in (_values, _slopes))
+        alone = (np.count_nonzero(slopes, axis=1) == 1) & (slopes.diagonal() != 0)
+        half = quantile * np.array(list(errors.values()))
+        # What moves with others, as a body's values do, is taken as linear.
+        in_x = np.where(alone & np.isfinite(half), half / np.where(alone, np.abs(slopes.diagonal()), 1.0), 0.0)
+        ends = [np.asarray(_values(self.parameters, self.point.x + jnp.asarray(s * in_x, self.point.x.dtype)))
+                for s in (-1, 1)]  # fmt: skip
+        low, high = (np.where(in_x > 0, end, values + s * half) for s, end in zip((-1, 1), ends, strict=True))
+        return {name: (float(min(a, b)), float(max(a, b))) for name, a, b in zip(self.names, low, high, strict=True)}
+
+    @property
+    def correlation(self) -> np.ndarray:
+        deviation = np.sqrt(self.covariance.diagonal())
+        with np.errstate(invalid="ignore"):
+            return self.covariance / np.outer(deviation, deviation)
+
+    @functools.cached_property
+    def fitted(self) -> dict[str, dict[str, np.ndarray]]:
+        return self._by_trial(lambda simulated, measured, sigma: simulated)
+
+    @functools.cached_property
+    def residuals(self) -> dict[str, dict[str, np.ndarray]]:
+        return self._by_trial(lambda simulated, measured, sigma: (simulated - measured) / sigma)
+
+    def _by_trial(self, value: Any) -> dict[str, dict[str, np.ndarray]]:
+        problem, simulated = self.problem, np.asarray(self.linearization.simulated)
+        found = {}
+        for k, name in enumerate(self.trial_names):
+            trial, found[name] = problem.trials[k], {}
+            for c, channel in enumerate(problem.channels):
+                if channel not in trial.measured:
+                    continue
+                y = np.full(trial.t.shape, np.nan)
+                for i, (owner, first, n) in enumerate(problem.places):
+                    if owner == k:
+                        y[first : first + n] = simulated[i, c, :n]
+                found[name][channel] = value(y, trial.measured[channel], trial.sigma[channel])
+        return found
+
+    @functools.cached_property
+    def tests(self) -> dict[str, dict[str, ResidualTest]]:
+        return {
+            name: {
+                channel: residual_test(trial.measured[channel], self.fitted[name][channel], r)
+                for channel, r in self.residuals[name].items()
+            }
+            for name, trial in zip(self.trial_names, self.problem.trials, strict=True)
+        }
+
+    @property
+    def variance_accounted_for(self) -> dict[str, float]:
+        found = {}
+        for channel in self.problem.channels:
+            left = total = 0.0
+            for name, trial in zip(self.trial_names, self.problem.trials, strict=True):
+                if channel in trial.measured:
+                    y, f = trial.measured[channel], self.fitted[name][channel]
+                    left, total = left + np.nansum((f - y) ** 2), total + np.nansum((y - np.nanmean(y)) ** 2)
+            found[channel] = float(1 - left / total) if total > 0 else float("nan")
+        return found
+
+    @functools.cached_property
+    def autocorrelation(self) -> float:
+        """Of neighbouring residuals, over all channels, each weighted by its size."""
+        above = below = 0.0
+        for channels in self.residuals.values():
+            for r in channels.values():
+                above += float(np.nansum(r[1:] * r[:-1]))
+                below += float(np.nansum(r**2))
+        return above / below if below > 0 else 0.0
+
+    @property
+    def trial_names(self) -> tuple[str, ...]:
+        """Names of the trials, numbered where they repeat."""
+        names = [trial.name for trial in self.problem.trials]
+        return tuple(n if names.count(n) == 1 else f"{n} ({i})" for i, n in enumerate(names))
+
+    @property
+    def nuisance(self) -> dict[str, dict[str, Any]]:
+        problem, n = self.problem, self.problem.model.nuisance
+        starts = np.asarray(problem.windows.start)[:, problem.model.unknown_places] + np.asarray(self.point.z)
+        owner = np.array([k for k, _, _ in problem.places])
+        found = {}
+        for k, name in enumerate(self.trial_names):
+            found[name] = {}
+            for j, (kind, what) in enumerate(n.trial):
+                value = float(self.point.b[k, j]) + (1.0 if kind.startswith("gain") else 0.0)
+                found[name][f"{kind.split()[0]} of {what}"] = value
+            found[name] |= {f"start of {s}": starts[owner == k, j] for j, s in enumerate(n.start)}
+        return found
+
+    @functools.cached_property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader should know. Where a channel fits badly, a few steps of a fit with each sign turned round."""
+        return (*self.short_notes, *suspicions.contrary_signs(self))
+
+    @functools.cached_property
+    def short_notes(self) -> tuple[str, ...]:
+        """The notes for which nothing is fitted anew."""
+        notes = [*self.identifiability.messages, *suspicions.trade_offs(self)]
+        lag = self.autocorrelation
+        if lag > 0.3:
+            notes.append(
+                f"The residuals are not noise: neighbours correlate by {lag:.2f}. The formal standard errors are too "
+                f"small by a factor of about {((1 + lag) / max(1 - lag, 0.01)) ** 0.5:.1f}; compare `clustered_errors`."
+            )
+        notes += [*suspicions.no_freedom(self), *suspicions.coarse_steps(self)]
+        notes += [*suspicions.impossible_bodies(self), *suspicions.bodies_at_the_edge(self)]
+        notes += [*suspicions.far_from_start(self), *suspicions.only_priors(self)]
+        notes += [*suspicions.empty_columns(self.problem), *suspicions.contrary_rates(self.problem)]
+        return (*notes, *suspicions.doubled_trials(self.problem))
+
+    def applied_to(self, trials: Sequence[Trial] | Trial) -> Fit:
+        """These parameters on other trials, of which only starts and biases are found: a look at data held back.
+
+        `cost`, `variance_accounted_for`, `tests`, `report()` are then those of these trials.
+        """
+        problem = self.problem.with_trials(trials)
+        first = dataclasses.replace(problem.start, x=self.point.x)
+        if problem.posed["step"] is None and problem.model.settings.step is not None:
+            problem = problem.finer(first)
+        before = settle(problem, problem.start)[1].cost
+        point, at = settle(problem, first, steps=20, rtol=1e-6)
+        return Fit.of(problem, point, at, (before, at.cost), "applied", self.method)
+
+    def trajectories(self) -> list[tuple[str, Trajectory]]:
+        """The fitted motion of every window, with its trial's name."""
+        names = self.trial_names
+        rides = self.problem.trajectories(self.point)
+        return [(names[k], ride) for (k, _, _), ride in zip(self.problem.places, rides, strict=True)]
+
+    def table(self, truth: Mapping[str, float] | System | None = None) -> str:
+        """Name, start, estimate and standard error of every parameter; and the truth, where it is known."""
+        known = known_values(self, truth)
+        head = f"{'parameter':<22}{'start':>12}{'estimate':>12}{'std. error':>12}"
+        lines = [head + (f"{'truth':>12}{'error':>9}" if known else "")]
+        errors, start = self.standard_errors, self.start
+        for name, unit, value in zip(self.names, self.parameters.units, self.estimates.values(), strict=True):
+            line = f"{name:<22}{start[name]:>12.5g}{value:>12.5g}{errors[name]:>12.2g}"
+            if name in known:
+                right = known[name]
+                line += f"{right:>12.5g}{(value / right - 1 if right else value):>9.2{'%' if right else 'g'}}"
+            lines.append(f"{line}  {unit}".rstrip())
+        return "\n".join(lines)
+
+    def report(self, truth: Mapping[str, float] | System | None = None) -> str:
+        """All that is known about this fit, as a text: estimates, intervals, directions, residuals, notes."""
+        from .._report.report import text
+
+        return text(self, truth)
+
+    def save_report(self, path: Any, **options: Any) -> Any:
+        """The same as one HTML page with pictures, which needs nothing else; see `jaxkane.fit.save_report`."""
+        from .._report.report import save_report
+
+        return save_report(self, path, **options)
+
+    def __str__(self) -> str:
+        end = f"sum of squares {self.history[0]:.6g} -> {self.cost:.6g} by {self.method}: {STATUS[self.status]}"
+        # Printing a fit must not start others.
+        signs = ["A channel fits badly: `notes` tries whether a sign is wrong."] * suspicions.fits_badly(self)
+        return "\n".join([self.title, self.table(), end, *self.short_notes, *signs])
+
+    @property
+    def title(self) -> str:
+        n_r, n_unknown = self.problem.size
+        return (
+            f"{type(self.problem.system).__name__}: {len(self.problem.trials)} trials, "
+            f"{len(self.problem.places)} windows, {n_r} residuals, {len(self.names)} parameters, "
+            f"{n_unknown - len(self.names)} nuisance values"
+        )
+
+    __repr__ = __str__
+
+
+@compiled
+def _values(parameters: Parameters, x: Any) -> Any:
+    return parameters.values(x)
+
+
+@compiled
+def _slopes(parameters: Parameters, x: Any) -> Any:
+    return parameters.slopes(x)
+
+
+def known_values(fit: Fit, truth: Any) -> dict[str, float]:
+    """The true values of free parameters, from a system that has them or by name."""
+    if truth is None or isinstance(truth, Mapping):
+        return dict(truth or {})
+    leaves = jax.tree.leaves(truth)
+    targets = {e.name: e.targets[0] for e in fit.parameters.entries if e.targets}
+    return {name: float(jnp.ravel(leaves[leaf])[place]) for name, (leaf, place, _) in targets.items()}
