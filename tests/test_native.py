@@ -8,7 +8,7 @@ import pytest
 import jaxkane as jk
 from jaxkane._method.rates import _state_rates, state_rates
 from jaxkane._scalars import fuse
-from jaxkane._scalars import native as kernels
+from jaxkane._scalars import native as native_kernels
 from jaxkane._scalars.fuse import _Program, fused
 
 LARGEST = 19
@@ -65,7 +65,7 @@ def every_operation(x):
 def test_every_operation(plainly, kernels):
     x, expected = plainly
     program = fused(every_operation)
-    assert kernels.Scalars(jax.make_jaxpr(every_operation)(x[0])).graph.nodes, "cannot be written as scalars"
+    assert native_kernels.Scalars(jax.make_jaxpr(every_operation)(x[0])).graph.nodes, "cannot be written as scalars"
     tolerance = 1e-14 if x.dtype == jnp.float64 else 1e-6
     check = lambda a, b: np.testing.assert_allclose(a, b, rtol=20 * tolerance, atol=tolerance)  # noqa: E731
     for n in (1, LARGEST):
@@ -150,8 +150,8 @@ def test_batches_of_batches():
 def test_what_cannot_be_written_is_left_to_xla():
     f = fused(lambda x: jnp.round(x) + jnp.sin(x))
     fuse._told.clear()
-    with pytest.raises(kernels.NotScalarError, match="round"):
-        kernels.Scalars(jax.make_jaxpr(jnp.round)(1.0))
+    with pytest.raises(native_kernels.NotScalarError, match="round"):
+        native_kernels.Scalars(jax.make_jaxpr(jnp.round)(1.0))
     with pytest.warns(UserWarning, match="uses round of float64, which native kernels do not know") as told:
         found = jax.jit(f)(1.7), *jax.jit(jax.vmap(f))(jnp.array([1.7, 2.2]))
     np.testing.assert_allclose(found, np.round([1.7, 1.7, 2.2]) + np.sin([1.7, 1.7, 2.2]))
@@ -168,7 +168,7 @@ def bicycle():
 def both(f, *args):
     found = []
     for native in (True, False):
-        kernels.use(native)
+        native_kernels.use(native)
         found.append(jax.jit(f)(*args))
     return found
 
