@@ -143,7 +143,10 @@ def test_every_public_function_says_what_it_does():
 
 def test_importing_changes_nothing_and_prints_nothing():
     code = (
-        "import os, jax; before = dict(os.environ), jax.config.values.copy(); import jaxkane, jaxkane.fit; "
+        "import os, sys, jax; before = dict(os.environ), jax.config.values.copy(); import jaxkane; "
+        "late = {'scipy', 'optax', 'matplotlib', 'pandas', 'tqdm', 'jaxkane.fit', 'jaxkane.plot', 'jaxkane.sweep'}; "
+        "assert not late & sys.modules.keys(), late & sys.modules.keys(); "
+        "assert all(hasattr(jaxkane, name) for name in dir(jaxkane)) and late & sys.modules.keys(); "
         "assert (dict(os.environ), jax.config.values) == before; assert not jax.config.jax_enable_x64; "
         "import jax._src.xla_bridge as bridge; assert not bridge.backends_are_initialized()"
     )

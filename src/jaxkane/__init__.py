@@ -1,15 +1,10 @@
 """Kane's equations in JAX: describe a mechanism; simulate, sweep, audit and identify it by gradients."""
 
-from . import catalog as catalog
-from . import fit as fit
+import importlib as _importlib
+import typing as _typing
+
 from . import loads as loads
-from . import plot as plot
 from . import rotations as rotations
-from . import stability as stability
-from . import sweep as sweep
-from ._animate import Animation as Animation
-from ._animate import Sketch as Sketch
-from ._animate import animate as animate
 from ._description.bodies import Body as Body
 from ._description.bodies import Force as Force
 from ._description.bodies import Motion as Motion
@@ -57,3 +52,31 @@ from ._simulation.trajectory import Status as Status
 from ._simulation.trajectory import Trajectory as Trajectory
 
 __version__ = "0.1.0"
+
+# Rooms that a description and its motion do not need, and what they import (scipy, optax), are imported when named.
+if _typing.TYPE_CHECKING:
+    from . import catalog as catalog
+    from . import fit as fit
+    from . import plot as plot
+    from . import stability as stability
+    from . import sweep as sweep
+    from ._animate import Animation as Animation
+    from ._animate import Sketch as Sketch
+    from ._animate import animate as animate
+
+_ROOMS = ("catalog", "fit", "plot", "stability", "sweep")
+_OF_ANIMATE = ("Animation", "Sketch", "animate")
+
+
+def __getattr__(name: str) -> _typing.Any:
+    if name in _ROOMS:
+        return _importlib.import_module(f".{name}", __name__)
+    if name in _OF_ANIMATE:
+        thing = getattr(_importlib.import_module("._animate", __name__), name)
+        globals()[name] = thing
+        return thing
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_ROOMS, *_OF_ANIMATE})
