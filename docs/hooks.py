@@ -10,6 +10,8 @@ from latex2mathml.converter import convert
 from mkdocs.structure.files import File
 from nbconvert import MarkdownExporter
 
+from jaxkane.catalog import CATALOG
+
 ROOT = Path(__file__).parents[1]
 PACKAGE = ROOT / "src" / "jaxkane"
 # Folder of NAME.html, as examples/draw_catalogue.py writes them; without it the gallery shows its pictures alone.
@@ -19,10 +21,11 @@ NOTEBOOKS = Path(os.environ.get("JAXKANE_NOTEBOOKS") or ROOT / "notebooks")
 
 
 def public_names(module):
-    """What a module's `__init__.py` exports, `from ._x import y as y`, but for submodules."""
+    """What a module's `__init__.py` exports, `from ._x import y as y`, with the room it is from; no submodules."""
     tree = ast.parse((PACKAGE.joinpath(*module.split(".")[1:]) / "__init__.py").read_text(encoding="utf-8"))
     imports = [node for node in tree.body if isinstance(node, ast.ImportFrom) and node.module]
-    return [alias.asname for node in imports for alias in node.names if alias.asname == alias.name]
+    names = [(alias, node.module.split(".")[0]) for node in imports for alias in node.names]
+    return {alias.asname: room for alias, room in names if alias.asname == alias.name}
 
 
 def modules():
@@ -47,14 +50,41 @@ def on_config(config):
     return config
 
 
+# What one wants to do, by the room in which it is done, and the page that explains it.
+SUBJECTS = {
+    "_description": ("Describe a mechanism", "describing"),
+    "_method": ("Ask for its equations", "coming_from_sympy"),
+    "_simulation": ("Simulate, and look at a motion", "simulation"),
+    "_animate": ("Show it", "pictures"),
+    "_scalars": ("Set up the process", "speed"),
+}
+PAGES = {
+    "fit": "identification",
+    "sweep": "sweeps",
+    "stability": "stability",
+    "plot": "pictures",
+    "catalog": "catalogue",
+}
+PAGES |= {"loads": "describing", "rotations": "describing"}
+
+
 def reference(module):
-    """The page of a module: its own words, then each of its names."""
+    """The page of a module: its own words, then each of its names; the library's own by what one wants to do."""
     package = PACKAGE.joinpath(*module.split(".")[1:])
     head = f"# {module}\n\n::: {module}\n    options:\n      show_root_heading: false\n"
+    page = PAGES.get(module.split(".")[-1])
+    more = f"\nExplained in [{page}](../{page}.md).\n" if page else ""
     if not package.is_dir():
-        return head
-    names = [f"::: {module}.{name}\n" for name in public_names(module)]
-    return "\n".join([f"{head}      members: false\n", *names])
+        return f"{head}{more}"
+    entry = "::: {}.{}\n    options:\n      heading_level: {}\n"
+    if package != PACKAGE:
+        names = [entry.format(module, name, 2) for name in public_names(module)]
+        return "\n".join([f"{head}      members: false\n{more}", *names])
+    parts = [f"{head}      members: false\n"]
+    for room, (title, page) in SUBJECTS.items():
+        parts.append(f"## {title}\n\nExplained in [{page}](../{page}.md).\n")
+        parts += [entry.format(module, name, 3) for name, home in public_names(module).items() if home == room]
+    return "\n".join(parts)
 
 
 def pages_of(notebook):
@@ -81,11 +111,29 @@ def on_files(files, config):
     return files
 
 
+GALLERY = "<!-- The gallery"
+STYLE = "display: grid; grid-template-columns: repeat(auto-fill, minmax(200px, 1fr)); gap: 1.2em"
+
+
+def gallery():
+    """Every entry of the catalogue: its picture, which leads to its animation where there is one, and its words."""
+    for name, entry in CATALOG.items():
+        picture = ""
+        if (ROOT / "docs" / "catalogue" / f"{name}.png").exists():
+            picture = f'<img src="catalogue/{name}.png" alt="{name}" width="220">'
+        if ANIMATIONS and (Path(ANIMATIONS) / f"{name}.html").exists():
+            where = f'href="animations/{name}.html" title="watch it move" target="_blank"'
+            picture = f"<a {where}>{picture or 'animation'}</a>"
+        words = f"<strong>{entry.book}</strong><br><code>{name}</code><br>{entry.shows}"
+        yield f'<figure style="margin: 0">{picture}\n<figcaption>{words}</figcaption></figure>'
+
+
 def on_page_markdown(markdown, page, config, files):
-    if page.file.src_uri != "catalogue.md" or not ANIMATIONS:
+    if page.file.src_uri != "catalogue.md":
         return markdown
-    frame = r'<a href="animations/\1.html" title="watch it move" target="_blank">\g<0></a>'
-    return re.sub(r'<img src="catalogue/(\w+)\.png"[^>]*>', frame, markdown)
+    assert GALLERY in markdown
+    figures = "\n".join(gallery())
+    return re.sub(f"{GALLERY}.*?-->", lambda _: f'<div style="{STYLE}">\n{figures}\n</div>', markdown)
 
 
 def on_page_content(html, page, config, files):

@@ -10,6 +10,8 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import pytest
 
+import jaxkane as jk
+
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = sorted(path for path in DOCS.glob("*.md") if path.name != "describing.md")  # see test_documentation.py
 
@@ -34,8 +36,13 @@ def test_links_and_pictures_are_there():
                 assert (DOCS / target).exists(), f"{page.name}: {target}"
 
 
-def test_the_gallery_shows_the_whole_catalogue():
-    from jaxkane.catalog import CATALOG
+def test_every_picture_of_the_gallery_is_of_an_entry():
+    """The site's gallery is made from the catalogue; a picture is wanted of each, and of nothing else."""
+    assert {path.stem for path in (DOCS / "catalogue").glob("*.png")} == set(jk.catalog.CATALOG)
 
-    shown = re.findall(r'src="catalogue/(\w+)\.png"', (DOCS / "catalogue.md").read_text(encoding="utf-8"))
-    assert shown == list(CATALOG)
+
+def test_code_is_not_wider_than_its_box():
+    for page in DOCS.glob("*.md"):
+        for block in re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL):
+            wide = [line for line in block.splitlines() if len(line) > 80]
+            assert not wide, f"{page.name}: {wide[0]}"

@@ -49,7 +49,7 @@ def configure(
         own folder where one is set, else `jaxkane` in the user's folder of caches; or a folder; or False.
     - `devices`: split the CPU into this many devices, which a sweep then uses side by side; one for each core is
         plenty. By default JAX decides: one, unless XLA_FLAGS says otherwise.
-    - `native`: right-hand sides and their derivatives as machine code through LLVM (the extra `native`), called by XLA;
+    - `native`: right-hand sides and their derivatives as machine code through LLVM (llvmlite), called by XLA;
         on the CPU only. By default where llvmlite is installed, unless the environment has JAXKANE_NATIVE=0. False
         leaves all work to XLA. Both agree to rounding errors. On a machine that has called none yet, a first one is
         tried in another process, which takes a second; the verdict is kept beside the programs, or else in the

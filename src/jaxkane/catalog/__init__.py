@@ -1,12 +1,13 @@
 """The systems of Kamman, Volume II, Unit 5: Examples 1 to 7 and Exercises 5.1 to 5.8, one file a mechanism.
 
-`CATALOG` lists them all, each with an example instance and a consistent state. A new mechanism is a file here and an
-`Entry` in `_entries.py`; the laws in `tests/catalog/test_laws.py` then hold it to account.
+`CATALOG` lists them all, each with an example instance and a consistent state. A new mechanism is a file here, with
+`@entry(...)` above its class, and its line below; the laws in `tests/catalog/test_laws.py` then hold it to account, and
+the site's catalogue shows it.
 """
 
 from ._bicycle_file import read_bicycle_file as read_bicycle_file
-from ._entries import CATALOG as CATALOG
-from ._entries import Entry as Entry
+from ._entry import CATALOG as CATALOG
+from ._entry import Entry as Entry
 from .aircraft import Aircraft as Aircraft
 from .aircraft import AircraftEulerParameters as AircraftEulerParameters
 from .bar_with_piston import BarWithPiston as BarWithPiston

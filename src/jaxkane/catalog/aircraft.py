@@ -12,6 +12,15 @@ from .._description.parameters import parameter
 from .._description.system import System
 from .._description.vectors import Frame, Point, inertial
 from .._scalars.types import Component, Scalar
+from ._entry import entry
+
+_EULER = (0.1, -0.3, 0.5, 0.65**0.5)  # of unit norm, the scalar last
+_ENGINES = {
+    "engine1_speed": 400.0,
+    "engine1_acceleration": 15.0,
+    "engine2_speed": 380.0,
+    "engine2_acceleration": -10.0,
+}
 
 
 class _Aircraft(System):
@@ -78,6 +87,15 @@ class _Aircraft(System):
         return Force(F, motion["G"]), Torque(T, motion["airframe"])
 
 
+@entry(
+    "Example 5",
+    "rotors with prescribed speeds: terms in time",
+    q=(100.0, -50.0, -1000.0, 0.4, 0.2, -0.3),
+    u=(120.0, 4.0, 7.0, 0.3, -0.2, 0.15),
+    operations=648,
+    example=lambda: Aircraft(**_ENGINES),
+    conservative=False,  # the motors that hold the engines' prescribed speeds do work
+)
 class Aircraft(_Aircraft):
     """An airframe with two engines that turn at prescribed speeds; 3-2-1 angles (Kamman, Unit 5, Example 5).
 
@@ -113,6 +131,15 @@ class Aircraft(_Aircraft):
         return {"gimbal_lock": jnp.cos(q["theta"])}
 
 
+@entry(
+    "Example 5",
+    "the same without angles that lock",
+    q=(100.0, -50.0, -1000.0, *_EULER),
+    u=(120.0, 4.0, 7.0, 0.3, -0.2, 0.15),
+    operations=657,
+    example=lambda: AircraftEulerParameters(**_ENGINES),
+    conservative=False,
+)
 class AircraftEulerParameters(_Aircraft):
     """`Aircraft` oriented by Euler parameters, which do not lock (Kamman, Unit 5, Example 5, last paragraph).
 

@@ -9,8 +9,17 @@ from .._description.parameters import parameter
 from .._description.system import System
 from .._description.vectors import inertial
 from .._scalars.types import Scalar
+from ._entry import entry
 
 
+@entry(
+    "Exercise 5.1",
+    "a mechanism with one degree of freedom, spring and damper",
+    q=(0.6,),
+    u=(-0.9,),
+    operations=121,
+    conservative=False,  # a damper
+)
 class BarWithPiston(System):
     """A bar whose upper end A carries a vertical piston, its lower end B a horizontal light slider on a spring and
     a damper (Kamman, Unit 5, Exercise 5.1).

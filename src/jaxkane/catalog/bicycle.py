@@ -14,6 +14,7 @@ from .._description.system import System
 from .._description.vectors import Point, inertial
 from .._scalars.types import Scalar
 from ._bicycle_file import read_bicycle_file
+from ._entry import entry
 
 # Meijaard et al. (2007), Table 1: the benchmark bicycle.
 _BENCHMARK = {
@@ -33,6 +34,14 @@ _PARTS_OF_H = frozenset(f"{what}{part}" for part in "GS" for what in ("m", "x", 
 )
 
 
+@entry(
+    "Example 7",
+    "ideal rolling: dependent speeds, a dependent coordinate",
+    q=(0.2, 0.2, 0.15, -0.8, -0.0023122917367326048, -0.1, 0.3, -0.4),  # the pitch follows from roll and steer
+    u=(0.3, -17.0, -0.4),  # about 5 m/s, where the benchmark bicycle rights itself
+    operations=2070,
+    example=lambda: WhippleBicycle.benchmark(),
+)
 class WhippleBicycle(System):
     """A bicycle with four rigid bodies, knife-edge wheels and ideal rolling on level ground (Example 7).
 

@@ -10,8 +10,16 @@ from .._description.parameters import parameter
 from .._description.system import System
 from .._description.vectors import inertial
 from .._scalars.types import Scalar
+from ._entry import entry
 
 
+@entry(
+    "Exercise 5.8",
+    "a ball joint, body-fixed angles",
+    q=(0.5, -0.4, 0.7),
+    u=(0.9, -0.6, 1.2),
+    operations=142,
+)
 class Bracket(System):
     """A cross of two identical slender bars OA and BC on a ball joint at O (Kamman, Unit 5, Exercise 5.8).
 

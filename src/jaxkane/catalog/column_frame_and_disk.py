@@ -9,8 +9,16 @@ from .._description.parameters import parameter
 from .._description.system import System
 from .._description.vectors import inertial
 from .._scalars.types import Scalar
+from ._entry import entry
 
 
+@entry(
+    "Exercise 5.7",
+    "three nested rotations",
+    q=(0.2, 0.9, -0.4),
+    u=(-1.0, 0.2, 3.0),
+    operations=265,
+)
 class ColumnFrameAndDisk(System):
     """A light column that turns about the vertical, a frame A that turns on it, and a disk D that spins on the frame
     (Kamman, Unit 5, Exercise 5.7).

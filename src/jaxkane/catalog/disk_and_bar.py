@@ -7,8 +7,17 @@ from .._description.parameters import parameter
 from .._description.system import System
 from .._description.vectors import inertial
 from .._scalars.types import Scalar
+from ._entry import entry
 
 
+@entry(
+    "Exercise 5.5",
+    "a damper, a bar on a turning disk",
+    q=(0.3, 0.6),
+    u=(1.5, -0.8),
+    operations=108,
+    conservative=False,  # a damper
+)
 class DiskAndBar(System):
     """A horizontal disk that turns about the vertical, and a slender bar that hangs from a pin on it
     (Kamman, Unit 5, Exercise 5.5).

@@ -7,8 +7,16 @@ from .._description.parameters import parameter
 from .._description.system import System
 from .._description.vectors import inertial
 from .._scalars.types import Scalar
+from ._entry import entry
 
 
+@entry(
+    "Example 1",
+    "speeds that are rates of angles, joint torques",
+    q=(0.7, -0.4),
+    u=(1.1, -0.8),
+    operations=146,
+)
 class DoublePendulum(System):
     """Two identical uniform slender links in a vertical plane, driven at both joints (Kamman, Unit 5, Example 1).
 

@@ -8,8 +8,16 @@ from .._description.parameters import parameter
 from .._description.system import System
 from .._description.vectors import Point, inertial
 from .._scalars.types import Scalar
+from ._entry import entry
 
 
+@entry(
+    "Example 2",
+    "Euler parameters, body-fixed speeds",
+    q=(0.3, -0.2, 0.5, 0.1, -0.3, 0.5, 0.65**0.5),
+    u=(1.0, -0.5, 0.8, 0.6, -1.1, 0.9),
+    operations=181,
+)
 class RigidBody(System):
     """A free rigid body with body-fixed speeds and Euler parameters (Kamman, Unit 5, Example 2).
 

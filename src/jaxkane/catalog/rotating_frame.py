@@ -7,6 +7,7 @@ from .._description.parameters import parameter
 from .._description.system import System
 from .._description.vectors import inertial
 from .._scalars.types import Scalar
+from ._entry import entry
 
 
 class _FrameAndBar(System):
@@ -37,6 +38,13 @@ class _FrameAndBar(System):
         )
 
 
+@entry(
+    "Example 3",
+    "a light rotating frame",
+    q=(0.5, 0.8),
+    u=(1.3, -0.9),
+    operations=64,
+)
 class RotatingFrameAndBar(_FrameAndBar):
     """A light frame that turns about the vertical, a slender bar that turns on it (Kamman, Unit 5, Example 3).
 
@@ -55,6 +63,13 @@ class RotatingFrameAndBar(_FrameAndBar):
     speeds = ("phi_dot", "theta_dot")
 
 
+@entry(
+    "Example 4",
+    "the same with chosen speeds",
+    q=(0.5, 0.8),
+    u=(0.65, -0.9),
+    operations=93,
+)
 class RotatingFrameAndBarChosenSpeeds(_FrameAndBar):
     """`RotatingFrameAndBar` with the speeds of Example 4; all else is the same mechanism (Kamman, Unit 5).
 

@@ -9,6 +9,7 @@ from .._description.parameters import parameter
 from .._description.system import System
 from .._description.vectors import inertial
 from .._scalars.types import Scalar
+from ._entry import entry
 
 
 def _shaft_and_bar(mass, length, q, q_dot):
@@ -28,6 +29,13 @@ def _motor_torques(motion, inputs):
     )
 
 
+@entry(
+    "Exercise 5.3",
+    "speeds that are rates of angles",
+    q=(0.3, 0.9),
+    u=(1.4, -0.7),
+    operations=67,
+)
 class ShaftAndBar(System):
     """A shaft that turns about the vertical, a slender bar pinned through its centre (Kamman, Unit 5, Exercise 5.3).
 
@@ -60,6 +68,13 @@ class ShaftAndBar(System):
         return _motor_torques(motion, inputs)
 
 
+@entry(
+    "Exercise 5.4",
+    "the same mechanism, light shaft: body-fixed speeds",
+    q=(0.3, 0.9),
+    u=(-1.1, -0.7),
+    operations=86,
+)
 class LightShaftAndBar(System):
     """`ShaftAndBar` with a light shaft and body-fixed speeds (Kamman, Unit 5, Exercise 5.4).
 

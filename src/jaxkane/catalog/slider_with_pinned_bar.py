@@ -7,8 +7,17 @@ from .._description.parameters import parameter
 from .._description.system import System
 from .._description.vectors import inertial
 from .._scalars.types import Scalar
+from ._entry import entry
 
 
+@entry(
+    "Exercise 5.2",
+    "spring, damper, driving force",
+    q=(0.2, 0.7),
+    u=(0.4, -1.2),
+    operations=101,
+    conservative=False,
+)
 class SliderWithPinnedBar(System):
     """A mass on a horizontal rail, with spring, damper and a driving force, and a slender bar pinned to it
     (Kamman, Unit 5, Exercise 5.2).

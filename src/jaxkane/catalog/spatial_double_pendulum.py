@@ -10,8 +10,16 @@ from .._description.parameters import parameter
 from .._description.system import System
 from .._description.vectors import inertial
 from .._scalars.types import Scalar
+from ._entry import entry
 
 
+@entry(
+    "Example 6",
+    "ball joints, 3-1-3 angles",
+    q=(0.4, 1.1, -0.3, -0.6, 0.9, 0.8),
+    u=(0.7, -0.4, 0.5, -0.6, 0.3, 0.9),
+    operations=594,
+)
 class SpatialDoublePendulum(System):
     """Two links on ball joints, oriented by 3-1-3 angles, with body-fixed speeds (Kamman, Unit 5, Example 6).
 

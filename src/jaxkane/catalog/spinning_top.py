@@ -8,8 +8,16 @@ from .._description.parameters import parameter
 from .._description.system import System
 from .._description.vectors import inertial
 from .._scalars.types import Scalar
+from ._entry import entry
 
 
+@entry(
+    "Exercise 5.6",
+    "a ball joint, Euler parameters",
+    q=(0.15, -0.2, 0.35, 0.815**0.5),
+    u=(0.8, -0.6, 40.0),
+    operations=119,
+)
 class SpinningTop(System):
     """A symmetric top on a ball joint at O, with body-fixed speeds (Kamman, Unit 5, Exercise 5.6).
 

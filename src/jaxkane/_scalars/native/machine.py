@@ -97,7 +97,7 @@ def without_llvm() -> str | None:
     try:
         from llvmlite.binding import llvm_version_info
     except ImportError:
-        return "llvmlite is not installed: pip install 'jaxkane[native]'"
+        return "llvmlite is not installed: pip install llvmlite"
     except OSError as error:  # its shared library does not load
         return f"LLVM does not work here: {error}"
     return None if llvm_version_info >= (_OLDEST_LLVM,) else "llvmlite is too old: pip install 'llvmlite>=0.45'"
