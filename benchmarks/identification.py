@@ -22,7 +22,17 @@ import numpy as np
 
 import jaxkane as jk
 from jaxkane.catalog import WhippleBicycle
-from jaxkane.fit import Gain, Problem, Trial, cross_validate, fit_bicycle, least_squares, multi_start, read_trials
+from jaxkane.fit import (
+    Gain,
+    Problem,
+    Trial,
+    cross_validate,
+    fit_bicycle,
+    least_squares,
+    multi_start,
+    read_trials,
+    report,
+)
 
 jax.config.update("jax_enable_x64", True)
 
@@ -106,7 +116,7 @@ def coverage(repetitions):
         hits += [low <= float(getattr(truth, n)) <= high for n, (low, high) in intervals.items()]
         scores.append([(result.estimates[n] - float(getattr(truth, n))) / errors[n] for n in EIGHT])
         if k == 0:
-            print(f"{result}\n{result.table(truth)}\n{result.report()}", flush=True)
+            print(f"{result}\n{result.table(truth)}\n{report(result)}", flush=True)
         if (k + 1) % 10 == 0:
             print(
                 f"{k + 1} repetitions, {time.perf_counter() - began:.0f} s: {dict(zip(EIGHT, hits.tolist()))}",

@@ -29,7 +29,7 @@ import numpy as np
 
 import jaxkane as jk
 from jaxkane.catalog import WhippleBicycle
-from jaxkane.fit import Gain, Trial, cross_validate, fit_bicycle, frame_inertia, profile, read_trials
+from jaxkane.fit import Gain, Trial, cross_validate, fit_bicycle, frame_inertia, profile, read_trials, save_report
 
 jax.config.update("jax_enable_x64", True)
 
@@ -94,8 +94,8 @@ def main():
     low, high = likelihood.interval
     print(f"\nThe damping, by its profile likelihood: {low:.3f} to {high:.3f} N m s/rad")
     print(f"Trials left out in turn: {100 * left_out.score:.1f} % of the sum of squares is taken away all the same.")
-    page = first.save_report(
-        arguments.out / "identify_measured_bicycle.html", cross_validation=left_out, profiles=[likelihood]
+    page = save_report(
+        first, arguments.out / "identify_measured_bicycle.html", cross_validation=left_out, profiles=[likelihood]
     )
     print(f"The report: {page}")
     if arguments.data:

@@ -22,7 +22,7 @@ SOURCE = Path(jk.__file__).parent
 # no file imports another that imports it, directly or by way of others.
 FLOORS = ["_common", "_scalars", "rotations", "_description", "loads", "catalog", "_method", "_simulation"]
 FLOORS += ["sweep", "plot", "fit", "stability", "_animate"]
-FLOORS_OF_FIT = ["_data", "_problem", "_optimize", "_result", "_analysis", "_report", "_fit", "bicycle"]
+FLOORS_OF_FIT = ["_data", "_problem", "_result", "_optimize", "_analysis", "_report", "_fit", "bicycle"]
 
 
 def room_of(path, base=SOURCE):

@@ -160,7 +160,7 @@ def test_steps_into_nowhere_are_halved(problem):
 def test_a_parameter_without_influence_is_named(swings):
     # Without inputs only the ratio of gravity and length matters, and the mass not at all.
     quiet = [Trial(s.t, s.measured, sigma=SIGMA, name=s.name) for s in swings]
-    seen = identifiability(GUESS, quiet, ("mass", "length", "gravity"), **OPTIONS)
+    seen = identifiability(Problem.of(GUESS, quiet, ("mass", "length", "gravity"), **OPTIONS))
     assert not seen.ok
     assert seen.without_influence == ("mass",)
     assert any("mass has no influence" in text for text in seen.messages)

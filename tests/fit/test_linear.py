@@ -276,4 +276,4 @@ def test_as_many_unknowns_as_residuals():
     assert found.problem.size[0] < found.problem.size[1]
     assert np.isnan(found.variance)
     assert all(not np.isfinite(error) for error in found.standard_errors.values())
-    assert any("residuals for" in note for note in found.short_notes)
+    assert any("residuals for" in note for note in found.notes)

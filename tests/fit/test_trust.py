@@ -9,22 +9,26 @@ import pytest
 from systems import Cart
 from test_transcriptions import GUESS, TRUTH, record
 
-import jaxkane.fit._analysis.suspicions as suspicions
+import jaxkane.fit._analysis.signs as signs
 from jaxkane.fit import (
     Fit,
     Free,
     Problem,
     Trial,
+    applied_to,
+    contrary_signs,
     cross_validate,
     laplace,
     least_squares,
     log_density,
     multi_start,
     profile,
+    report,
+    save_report,
 )
-from jaxkane.fit._analysis.suspicions import contrary_rates, doubled_trials, empty_columns
 from jaxkane.fit._optimize.steps import settle
-from jaxkane.fit._result.residual_tests import residual_test
+from jaxkane.fit._result.notes import contrary_rates, doubled_trials, empty_columns
+from jaxkane.fit._result.residuals import residual_test
 
 NAMES = ("mass", "stiffness", "damping")
 T = np.arange(0.0, 4.0, 0.1)
@@ -124,7 +128,7 @@ def test_trials_left_out(result):
 
 def test_other_trials_are_looked_at_with_the_parameters_held(result):
     others = [record(T, seed) for seed in range(20, 26)]
-    held = result.applied_to(others)
+    held = applied_to(result, others)
     assert held.status == "applied"
     assert held.estimates == result.estimates
     # What is left is noise: the parameters were found elsewhere, only starts were found here.
@@ -143,7 +147,7 @@ def test_many_first_guesses(problem, result):
 
 
 def test_the_density_is_that_of_the_residuals(problem, result):
-    density = log_density(result, over="x")
+    density = log_density(problem, over="x")
     there = result.point
     assert float(density(there)) == pytest.approx(-result.cost / 2, rel=1e-9)
     rng = np.random.default_rng(3)
@@ -187,7 +191,7 @@ def test_samplers_find_the_laplace_approximation(package):
     sampler, key = pytest.importorskip(package), jax.random.key(0)
     begun = record(T, 0, initial={"x": 0.2, "x_dot": 0.0})
     mode = least_squares(Problem.of(GUESS, begun, ("mass", "stiffness"), step=0.1))
-    density = jax.jit(log_density(mode, over="x"))
+    density = jax.jit(log_density(mode.problem, over="x"))
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         if package == "numpyro":
             kernel = sampler.infer.NUTS(potential_fn=lambda point: -density(point), max_tree_depth=4)
@@ -222,12 +226,14 @@ def test_priors_are_weighed_and_told(problem, result):
 def test_a_wrong_sign_of_an_input(problem, trials, monkeypatch):
     wrong = [Trial(t.t, t.measured, {"push": -t.inputs["push"]}, sigma=0.01, name=t.name) for t in trials]
     found, fits = again(problem, wrong), []
-    monkeypatch.setattr(suspicions, "settle", lambda *a, **k: fits.append(1) or settle(*a, **k))
+    monkeypatch.setattr(signs, "settle", lambda *a, **k: fits.append(1) or settle(*a, **k))
     # To print a fit starts no other one.
-    assert "`notes` tries whether a sign is wrong" in str(found)
+    assert "`jaxkane.fit.contrary_signs(fit)` tries whether a sign is wrong" in str(found)
     assert not fits
-    assert any("the input push seems to have the wrong sign" in note for note in found.notes)
+    (note,) = [note for note in contrary_signs(found) if "input" in note]
+    assert "the input push seems to have the wrong sign" in note
     assert fits
+    assert note in report(found)
 
 
 def test_a_rate_against_its_coordinate_and_a_column_of_zeros(trials):
@@ -255,7 +261,7 @@ def test_what_runs_to_its_bound_is_told_so(trials):
         laplace(found)
     with pytest.raises(ValueError, match="These data do not tell damping: the cost has converged, but"):
         profile(found, "damping")
-    assert "bound" in found.report()
+    assert "bound" in report(found)
 
 
 def test_what_trades_off_is_told_in_units(trials):
@@ -287,8 +293,8 @@ class _Page(html.parser.HTMLParser):
 
 def test_the_report_is_one_page_that_says_it_all(result, tmp_path):
     left_out, likelihood = cross_validate(result, folds=2), profile(result, "mass", n=3)
-    path = result.save_report(
-        tmp_path / "a" / "report.html", truth=TRUTH, cross_validation=left_out, profiles=[likelihood], trials=2
+    path = save_report(
+        result, tmp_path / "a" / "report.html", truth=TRUTH, cross_validation=left_out, profiles=[likelihood], trials=2
     )
     text = path.read_text()
     page = _Page(text)
@@ -297,6 +303,6 @@ def test_the_report_is_one_page_that_says_it_all(result, tmp_path):
     assert "Held-out score" in text
     for words in (*NAMES, "Ljung-Box", "variance accounted for", "correlation", "singular value", "jax 0", "run 3"):
         assert words in text, words
-    told = result.report(TRUTH)
+    told = report(result, TRUTH)
     assert "95 % interval" in told
     assert "truth" in told

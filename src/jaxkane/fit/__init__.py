@@ -2,8 +2,18 @@
 
 from ._analysis.design import Design as Design
 from ._analysis.design import design as design
+from ._analysis.held_back import CrossValidation as CrossValidation
+from ._analysis.held_back import applied_to as applied_to
+from ._analysis.held_back import cross_validate as cross_validate
+from ._analysis.identifiability import identifiability as identifiability
 from ._analysis.laplace import Laplace as Laplace
 from ._analysis.laplace import laplace as laplace
+from ._analysis.motions import trajectories as trajectories
+from ._analysis.multistart import MultiStart as MultiStart
+from ._analysis.multistart import multi_start as multi_start
+from ._analysis.profile import Profile as Profile
+from ._analysis.profile import profile as profile
+from ._analysis.signs import contrary_signs as contrary_signs
 from ._data.read import read_trials as read_trials
 from ._data.trial import Trial as Trial
 from ._fit import fit as fit
@@ -11,8 +21,6 @@ from ._optimize.bfgs import bfgs as bfgs
 from ._optimize.gradient_descent import gradient_descent as gradient_descent
 from ._optimize.least_squares import gauss_newton as gauss_newton
 from ._optimize.least_squares import least_squares as least_squares
-from ._optimize.multistart import MultiStart as MultiStart
-from ._optimize.multistart import multi_start as multi_start
 from ._problem.bijections import Interval as Interval
 from ._problem.bijections import PossibleBody as PossibleBody
 from ._problem.density import log_density as log_density
@@ -23,16 +31,12 @@ from ._problem.parameters import Free as Free
 from ._problem.parameters import Gain as Gain
 from ._problem.parameters import Inertia as Inertia
 from ._problem.problem import Problem as Problem
+from ._report.report import report as report
 from ._report.report import save_report as save_report
 from ._result.identifiability import Direction as Direction
 from ._result.identifiability import Identifiability as Identifiability
-from ._result.identifiability import identifiability as identifiability
-from ._result.residual_tests import ResidualTest as ResidualTest
+from ._result.residuals import ResidualTest as ResidualTest
 from ._result.result import Fit as Fit
-from ._result.uncertainty import CrossValidation as CrossValidation
-from ._result.uncertainty import Profile as Profile
-from ._result.uncertainty import cross_validate as cross_validate
-from ._result.uncertainty import profile as profile
 from .bicycle import bicycle_priors as bicycle_priors
 from .bicycle import bicycle_rides as bicycle_rides
 from .bicycle import fit_bicycle as fit_bicycle

@@ -74,7 +74,7 @@ def fit_bicycle(
 def bicycle_rides(rides: Sequence[Trial] | Trial, bicycle: WhippleBicycle) -> tuple[Trial, ...]:
     """Rides with the rear wheel's rate in the place of their speed, as a fit takes them.
 
-    held_back = fit.applied_to(bicycle_rides(other_rides, bicycle))
+    held_back = applied_to(fit, bicycle_rides(other_rides, bicycle))
     """
     rides = (rides,) if isinstance(rides, Trial) else tuple(rides)
     return tuple(_with_wheel_rate(ride, bicycle) for ride in rides)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import TYPE_CHECKING
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +11,7 @@ import numpy as np
 
 from .._problem.blocks import Eliminated, eliminate
 from .._problem.problem import Problem
-
-if TYPE_CHECKING:
-    from .._result.result import Fit
+from .._result.result import Fit
 
 LOG_2PI = math.log(2 * math.pi)
 

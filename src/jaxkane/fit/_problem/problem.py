@@ -169,9 +169,8 @@ class Problem:
         """
         if self.model.settings.step is None:
             return np.full(len(self.places), np.nan)
-        alone = dataclasses.replace(self, processes=False)  # asked of one process, this must not wait for the others
-        now = simulated(alone, point) if now is None else now
-        return self._apart(now, simulated(alone._with_steps(self.windows.step / 2), point))
+        now = simulated(self, point) if now is None else now
+        return self._apart(now, simulated(self._with_steps(self.windows.step / 2), point))
 
     def _with_steps(self, step: Array) -> Problem:
         return dataclasses.replace(self, windows=eqx.tree_at(lambda w: w.step, self.windows, step))

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from .._result.uncertainty import Profile
-
-if TYPE_CHECKING:
-    from .._result.result import Fit
+from .._analysis.profile import Profile
+from .._result.residuals import autocorrelations
+from .._result.result import Fit
 
 
 def _figure(width: float, height: float) -> Any:
@@ -69,7 +68,7 @@ def draw_history(fit: Fit) -> Any:
 
 def draw_trials(fit: Fit, number: int | None) -> list[Any]:
     """Measured and fitted, three trials a figure."""
-    from ... import plot
+    from ... import plot  # with matplotlib
 
     T, rows = len(fit.trial_names), 2 * len(fit.problem.channels)
     chosen = np.unique(np.linspace(0, T - 1, min(T, number or T)).astype(int)).tolist()
@@ -85,8 +84,6 @@ def draw_trials(fit: Fit, number: int | None) -> list[Any]:
 
 def draw_residuals(fit: Fit) -> Any:
     """Histograms and autocorrelations, by channel."""
-    from .._result.residual_tests import autocorrelations
-
     channels = fit.problem.channels
     figure = _figure(9, 1.9 * len(channels))
     axes = figure.subplots(len(channels), 2, squeeze=False, width_ratios=(1, 1.4))

@@ -9,21 +9,27 @@ import os
 import platform
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from .._result.uncertainty import CrossValidation, Profile, cross_validate
+from ..._description.system import System
+from .._analysis.held_back import CrossValidation, cross_validate
+from .._analysis.profile import Profile
+from .._analysis.signs import contrary_signs
+from .._result.identifiability import combination
+from .._result.result import STATUS, Fit, known_values
 from . import pictures
-
-if TYPE_CHECKING:
-    from .._result.result import Fit
 
 Row = Sequence[str]
 
 
-def text(fit: Fit, truth: Any = None) -> str:
-    """All that is known about a fit, without pictures."""
+def report(fit: Fit, truth: Mapping[str, float] | System | None = None) -> str:
+    """All that is known about a fit, as a text: estimates, intervals, directions, residuals, notes.
+
+    `truth`: parameters by name, or a system, where they are known. Where a channel fits badly, `contrary_signs` is
+    asked, which makes a few steps of a fit with each sign turned round.
+    """
     parts = [
         fit.title,
         _plain(*_parameters(fit, truth)),
@@ -34,7 +40,7 @@ def text(fit: Fit, truth: Any = None) -> str:
         _plain(*_correlations(fit)),
         _plain(*_channels(fit)),
         *([_plain(*_biases(fit, brief=True))] if fit.problem.model.nuisance.trial else []),
-        "\n".join(f"- {note}" for note in fit.notes) or "Nothing to remark.",
+        "\n".join(f"- {note}" for note in _all_notes(fit)) or "Nothing to remark.",
         "; ".join(f"{key}: {value}" for key, value in _settings(fit)),
     ]
     return "\n\n".join(parts)
@@ -92,12 +98,14 @@ def save_report(
     return path
 
 
+def _all_notes(fit: Fit) -> tuple[str, ...]:
+    return (*fit.notes, *contrary_signs(fit))
+
+
 # What is told: a heading and rows of text for each table.
 
 
 def _parameters(fit: Fit, truth: Any) -> tuple[Row, Sequence[Row]]:
-    from .._result.result import known_values
-
     known, errors, robust = known_values(fit, truth), fit.standard_errors, fit.clustered_errors
     head = ["parameter", "unit", "start", "estimate", "std. error", "by trial", "95 % interval"]
     rows, intervals = [], fit.intervals()
@@ -110,8 +118,6 @@ def _parameters(fit: Fit, truth: Any) -> tuple[Row, Sequence[Row]]:
 
 
 def _ending(fit: Fit) -> str:
-    from .._result.result import STATUS
-
     return (
         f"Sum of squares {fit.history[0]:.6g} → {fit.cost:.6g} by {fit.method} in {len(fit.history) - 1} steps: "
         f"{STATUS[fit.status]}. Variance of a residual: {fit.variance:.3g} (one where sigma and the model are right)."
@@ -128,8 +134,6 @@ def _how_sure(fit: Fit) -> str:
 
 
 def _directions(fit: Fit) -> tuple[Row, Sequence[Row]]:
-    from .._result.identifiability import combination
-
     seen = fit.identifiability
     rows = [
         [f"{s:.4g}", f"{d:.2g}", combination(seen.names, row)]
@@ -219,9 +223,10 @@ def _paragraph(words: str) -> str:
 
 
 def _notes(fit: Fit) -> str:
-    if not fit.notes:
+    notes = _all_notes(fit)
+    if not notes:
         return _paragraph("Every parameter is determined, and nothing looks suspicious.")
-    return '<ul class="notes">' + "".join(f"<li>{html.escape(note)}</li>" for note in fit.notes) + "</ul>"
+    return '<ul class="notes">' + "".join(f"<li>{html.escape(note)}</li>" for note in notes) + "</ul>"
 
 
 def _details(summary: str, body: str) -> str:

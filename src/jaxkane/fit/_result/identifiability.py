@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from .._optimize.steps import settle
 from .._problem.blocks import eliminate
 from .._problem.model import Point
 from .._problem.problem import Linearization, Problem
@@ -77,38 +75,13 @@ class Identifiability:
         return "\n".join([*lines, *self.messages])
 
 
-def identifiability(
-    problem: Any, trials: Any = None, free: Any = None, *, flat: float = 0.5, at: Point | None = None, **options: Any
-) -> Identifiability:
-    """Which parameters, or combinations of them, the data can tell.
-
-        identifiability(result), identifiability(problem), identifiability(system, trials, free, unknown=("roll",))
-
-    The residuals' sensitivity to the scaled parameters, with the nuisance values eliminated, is taken apart by singular
-    values. A direction whose standard deviation exceeds `flat` of the parameters' scale is called undetermined.
-
-    **Arguments:**
-
-    - `problem`: a `Fit`, a `Problem`, or a system with `trials`, `free` and the other arguments of `fit`.
-    - `flat`: where undetermined begins. `at`: a point of the problem; by default its start, nuisance values settled.
-
-    **Returns:** an `Identifiability`; print it for a table.
-    """
-    if hasattr(problem, "identifiability"):
-        return look(problem.problem, problem.point, problem.linearization, flat)
-    if not isinstance(problem, Problem):
-        problem = Problem.of(problem, trials, free, **options)
-    point, linearization = settle(problem, problem.start if at is None else at)
-    return look(problem, point, linearization, flat)
-
-
 def residual_variance(problem: Problem, cost: float) -> float:
     """The sum of squares by residuals less unknowns; NaN where there are no more residuals than unknowns."""
     n_r, n_unknown = problem.size
     return cost / (n_r - n_unknown) if n_r > n_unknown else float("nan")
 
 
-def look(problem: Problem, point: Point, at: Linearization, flat: float = 0.5) -> Identifiability:
+def identifiability_at(problem: Problem, point: Point, at: Linearization, flat: float = 0.5) -> Identifiability:
     """Identifiability at a point where the problem has been linearized."""
     parameters = problem.parameters
     names, p = parameters.names, len(parameters.names)

@@ -1,4 +1,4 @@
-"""What a fit found, how sure it is, and what it could not tell."""
+"""What a fit found, how sure it is, and what it could not tell: numbers only. Simulates nothing, fits nothing."""
 
 from __future__ import annotations
 
@@ -12,17 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..._description.system import System
-from ..._scalars.reads import compiled
-from ..._simulation.trajectory import Trajectory
-from .._analysis import suspicions
-from .._data.trial import Trial
-from .._optimize.steps import settle
 from .._problem.model import Point
 from .._problem.parameters import Parameters
 from .._problem.problem import STEP_TOLERANCE, Linearization, Problem
-from .identifiability import Identifiability, look, residual_variance
-from .residual_tests import ResidualTest, residual_test
-from .uncertainty import clustered_covariance, t_quantile
+from . import covariance, notes, residuals
+from .identifiability import Identifiability, identifiability_at, residual_variance
+from .residuals import ByTrial, ResidualTest, residual_test
 
 STATUS = {
     "converged": "converged",
@@ -35,7 +30,10 @@ STATUS = {
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Fit:
-    """The result of a fit; print it for a table, `report()` for more, `save_report(path)` for a page with pictures.
+    """The result of a fit; print it for a table, `jaxkane.fit.report(fit)` for more, and `jaxkane.fit.save_report(fit,
+    path)` for a page with pictures.
+
+    It holds numbers: to look at it simulates nothing and fits nothing.
 
     - `system`: with the estimates in it. `estimates`, `start`: values by name. Gains and delays are among them.
     - `standard_errors`: by name, formal: from the inverse of J^T J with the nuisance values eliminated, times the
@@ -49,28 +47,33 @@ class Fit:
     - `residuals`: by trial and channel, (simulated - measured) / sigma (n_t,), NaN in gaps; `fitted`: simulated (n_t,).
         `tests`: by trial and channel, a `ResidualTest`. `variance_accounted_for`: by channel, over all trials.
     - `nuisance`: by trial, values of the biases and of the windows' starts by name.
+    - `step_error`: by how much halving the step of integration moves the residuals.
     - `notes`: what a reader should know, in words.
     """
 
     problem: Problem
     point: Point
     linearization: Linearization
+    step_errors: np.ndarray  # (W,), see `Problem.step_errors`
     history: tuple[float, ...]
     status: str
     method: str
 
     @classmethod
     def of(
-        cls,
-        problem: Problem,
-        point: Point,
-        at: Linearization,
-        history: Sequence[float],
-        status: str,
-        method: str,
+        cls, problem: Problem, point: Point, at: Linearization, history: Sequence[float], status: str, method: str
     ) -> Fit:
-        """The result at a point."""
-        return cls(problem, point, at, tuple(history), status, method)
+        """The result at a point where the problem has been linearized.
+
+        With a fixed step of integration all windows are simulated once more, with half of it; not after Ctrl-C.
+        """
+        errors = np.full(len(problem.places), np.nan)
+        if status != "interrupted":
+            try:
+                errors = problem.step_errors(point, np.asarray(at.simulated))
+            except KeyboardInterrupt:
+                status = "interrupted"
+        return cls(problem, point, at, errors, tuple(history), status, method)
 
     @property
     def parameters(self) -> Parameters:
@@ -104,30 +107,27 @@ class Fit:
 
     @functools.cached_property
     def identifiability(self) -> Identifiability:
-        return look(self.problem, self.point, self.linearization)
+        return identifiability_at(self.problem, self.point, self.linearization)
 
     @property
     def message(self) -> str:
         words = STATUS[self.status]
         if self.status == "converged" and not self.identifiability.ok:
             words = "the cost has converged, but not every parameter is determined"
-        notes = (*self.identifiability.messages, *suspicions.no_freedom(self), *suspicions.coarse_steps(self))
-        return "; ".join([words, *(note.rstrip(".") for note in notes)])
+        more = (*self.identifiability.messages, *notes.no_freedom(self), *notes.coarse_steps(self))
+        return "; ".join([words, *(note.rstrip(".") for note in more)])
 
     @property
     def ok(self) -> bool:
         """Whether it converged, every parameter is determined, and the steps of integration are fine enough."""
         return self.status == "converged" and self.identifiability.ok and not self.too_coarse
 
-    @functools.cached_property
-    def _step_errors(self) -> np.ndarray:
-        return self.problem.step_errors(self.point, np.asarray(self.linearization.simulated))
-
     @property
     def step_error(self) -> float:
         """By how much halving the fixed step of integration moves all residuals together, in standard deviations: about
-        by as many of its standard errors an estimate can be off at most. NaN where the step follows from tolerances."""
-        return float(np.linalg.norm(self._step_errors))
+        by as many of its standard errors an estimate can be off at most. NaN where the step follows from tolerances,
+        and after Ctrl-C."""
+        return float(np.linalg.norm(self.step_errors))
 
     @property
     def too_coarse(self) -> bool:
@@ -152,8 +152,9 @@ class Fit:
     @functools.cached_property
     def clustered_covariance(self) -> np.ndarray:
         """(p, p), in the parameters' units, robust to residuals that are correlated within a trial."""
-        slopes = np.asarray(self.parameters.slopes(self.point.x))
-        return slopes @ clustered_covariance(self) @ slopes.T
+        if not np.all(np.isfinite(self.covariance)):
+            return np.full_like(self.covariance, np.nan)
+        return covariance.clustered_covariance(self.problem, self.point, self.linearization)
 
     @property
     def clustered_errors(self) -> dict[str, float]:
@@ -173,7 +174,7 @@ class Fit:
 
     def quantile(self, level: float = 0.95) -> float:
         """Of Student's distribution, two-sided, with as many degrees of freedom as `freedom`."""
-        return t_quantile(level, self.freedom)
+        return covariance.t_quantile(level, self.freedom)
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Confidence intervals by name, inside a parameter's bounds: symmetric in the free numbers.
@@ -183,16 +184,8 @@ class Fit:
         **Raises:** `ValueError` for a level that is not between 0 and 1.
         """
         errors = self.clustered_errors if self.robust else self.standard_errors
-        quantile = self.quantile(level)
-        values, slopes = (np.asarray(f(self.parameters, self.point.x)) for f in (_values, _slopes))
-        alone = (np.count_nonzero(slopes, axis=1) == 1) & (slopes.diagonal() != 0)
-        half = quantile * np.array(list(errors.values()))
-        # What moves with others, as a body's values do, is taken as linear.
-        in_x = np.where(alone & np.isfinite(half), half / np.where(alone, np.abs(slopes.diagonal()), 1.0), 0.0)
-        ends = [np.asarray(_values(self.parameters, self.point.x + jnp.asarray(s * in_x, self.point.x.dtype)))
-                for s in (-1, 1)]  # fmt: skip
-        low, high = (np.where(in_x > 0, end, values + s * half) for s, end in zip((-1, 1), ends, strict=True))
-        return {name: (float(min(a, b)), float(max(a, b))) for name, a, b in zip(self.names, low, high, strict=True)}
+        half = self.quantile(level) * np.array(list(errors.values()))
+        return dict(zip(self.names, covariance.intervals(self.parameters, self.point.x, half), strict=True))
 
     @property
     def correlation(self) -> np.ndarray:
@@ -201,27 +194,12 @@ class Fit:
             return self.covariance / np.outer(deviation, deviation)
 
     @functools.cached_property
-    def fitted(self) -> dict[str, dict[str, np.ndarray]]:
-        return self._by_trial(lambda simulated, measured, sigma: simulated)
+    def fitted(self) -> ByTrial:
+        return residuals.by_trial(self.problem, np.asarray(self.linearization.simulated))
 
     @functools.cached_property
-    def residuals(self) -> dict[str, dict[str, np.ndarray]]:
-        return self._by_trial(lambda simulated, measured, sigma: (simulated - measured) / sigma)
-
-    def _by_trial(self, value: Any) -> dict[str, dict[str, np.ndarray]]:
-        problem, simulated = self.problem, np.asarray(self.linearization.simulated)
-        found = {}
-        for k, name in enumerate(self.trial_names):
-            trial, found[name] = problem.trials[k], {}
-            for c, channel in enumerate(problem.channels):
-                if channel not in trial.measured:
-                    continue
-                y = np.full(trial.t.shape, np.nan)
-                for i, (owner, first, n) in enumerate(problem.places):
-                    if owner == k:
-                        y[first : first + n] = simulated[i, c, :n]
-                found[name][channel] = value(y, trial.measured[channel], trial.sigma[channel])
-        return found
+    def residuals(self) -> ByTrial:
+        return residuals.scaled_residuals(self.problem, self.fitted)
 
     @functools.cached_property
     def tests(self) -> dict[str, dict[str, ResidualTest]]:
@@ -235,31 +213,17 @@ class Fit:
 
     @property
     def variance_accounted_for(self) -> dict[str, float]:
-        found = {}
-        for channel in self.problem.channels:
-            left = total = 0.0
-            for name, trial in zip(self.trial_names, self.problem.trials, strict=True):
-                if channel in trial.measured:
-                    y, f = trial.measured[channel], self.fitted[name][channel]
-                    left, total = left + np.nansum((f - y) ** 2), total + np.nansum((y - np.nanmean(y)) ** 2)
-            found[channel] = float(1 - left / total) if total > 0 else float("nan")
-        return found
+        return residuals.variance_accounted_for(self.problem, self.fitted)
 
     @functools.cached_property
     def autocorrelation(self) -> float:
         """Of neighbouring residuals, over all channels, each weighted by its size."""
-        above = below = 0.0
-        for channels in self.residuals.values():
-            for r in channels.values():
-                above += float(np.nansum(r[1:] * r[:-1]))
-                below += float(np.nansum(r**2))
-        return above / below if below > 0 else 0.0
+        return residuals.autocorrelation(self.residuals)
 
     @property
     def trial_names(self) -> tuple[str, ...]:
         """Names of the trials, numbered where they repeat."""
-        names = [trial.name for trial in self.problem.trials]
-        return tuple(n if names.count(n) == 1 else f"{n} ({i})" for i, n in enumerate(names))
+        return residuals.trial_names(self.problem)
 
     @property
     def nuisance(self) -> dict[str, dict[str, Any]]:
@@ -277,43 +241,8 @@ class Fit:
 
     @functools.cached_property
     def notes(self) -> tuple[str, ...]:
-        """What a reader should know. Where a channel fits badly, a few steps of a fit with each sign turned round."""
-        return (*self.short_notes, *suspicions.contrary_signs(self))
-
-    @functools.cached_property
-    def short_notes(self) -> tuple[str, ...]:
-        """The notes for which nothing is fitted anew."""
-        notes = [*self.identifiability.messages, *suspicions.trade_offs(self)]
-        lag = self.autocorrelation
-        if lag > 0.3:
-            notes.append(
-                f"The residuals are not noise: neighbours correlate by {lag:.2f}. The formal standard errors are too "
-                f"small by a factor of about {((1 + lag) / max(1 - lag, 0.01)) ** 0.5:.1f}; compare `clustered_errors`."
-            )
-        notes += [*suspicions.no_freedom(self), *suspicions.coarse_steps(self)]
-        notes += [*suspicions.impossible_bodies(self), *suspicions.bodies_at_the_edge(self)]
-        notes += [*suspicions.far_from_start(self), *suspicions.only_priors(self)]
-        notes += [*suspicions.empty_columns(self.problem), *suspicions.contrary_rates(self.problem)]
-        return (*notes, *suspicions.doubled_trials(self.problem))
-
-    def applied_to(self, trials: Sequence[Trial] | Trial) -> Fit:
-        """These parameters on other trials, of which only starts and biases are found: a look at data held back.
-
-        `cost`, `variance_accounted_for`, `tests`, `report()` are then those of these trials.
-        """
-        problem = self.problem.with_trials(trials)
-        first = dataclasses.replace(problem.start, x=self.point.x)
-        if problem.posed["step"] is None and problem.model.settings.step is not None:
-            problem = problem.finer(first)
-        before = settle(problem, problem.start)[1].cost
-        point, at = settle(problem, first, steps=20, rtol=1e-6)
-        return Fit.of(problem, point, at, (before, at.cost), "applied", self.method)
-
-    def trajectories(self) -> list[tuple[str, Trajectory]]:
-        """The fitted motion of every window, with its trial's name."""
-        names = self.trial_names
-        rides = self.problem.trajectories(self.point)
-        return [(names[k], ride) for (k, _, _), ride in zip(self.problem.places, rides, strict=True)]
+        """What a reader should know, in words."""
+        return notes.notes_of(self)
 
     def table(self, truth: Mapping[str, float] | System | None = None) -> str:
         """Name, start, estimate and standard error of every parameter; and the truth, where it is known."""
@@ -329,23 +258,9 @@ class Fit:
             lines.append(f"{line}  {unit}".rstrip())
         return "\n".join(lines)
 
-    def report(self, truth: Mapping[str, float] | System | None = None) -> str:
-        """All that is known about this fit, as a text: estimates, intervals, directions, residuals, notes."""
-        from .._report.report import text
-
-        return text(self, truth)
-
-    def save_report(self, path: Any, **options: Any) -> Any:
-        """The same as one HTML page with pictures, which needs nothing else; see `jaxkane.fit.save_report`."""
-        from .._report.report import save_report
-
-        return save_report(self, path, **options)
-
     def __str__(self) -> str:
         end = f"sum of squares {self.history[0]:.6g} -> {self.cost:.6g} by {self.method}: {STATUS[self.status]}"
-        # Printing a fit must not start others.
-        signs = ["A channel fits badly: `notes` tries whether a sign is wrong."] * suspicions.fits_badly(self)
-        return "\n".join([self.title, self.table(), end, *self.short_notes, *signs])
+        return "\n".join([self.title, self.table(), end, *self.notes])
 
     @property
     def title(self) -> str:
@@ -357,16 +272,6 @@ class Fit:
         )
 
     __repr__ = __str__
-
-
-@compiled
-def _values(parameters: Parameters, x: Any) -> Any:
-    return parameters.values(x)
-
-
-@compiled
-def _slopes(parameters: Parameters, x: Any) -> Any:
-    return parameters.slopes(x)
 
 
 def known_values(fit: Fit, truth: Any) -> dict[str, float]:

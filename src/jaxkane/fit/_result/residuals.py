@@ -1,11 +1,71 @@
-"""Whether residuals are noise, and how much of a measurement they leave. Knows numbers; knows no fit."""
+"""Residuals by trial and channel, whether they are noise, and how much of a measurement they leave. Knows numbers."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 
 import numpy as np
 from scipy import stats
+
+from .._problem.problem import Problem
+
+ByTrial = dict[str, dict[str, np.ndarray]]
+"""By the names of trial and channel, samples (n_t,)."""
+
+
+def trial_names(problem: Problem) -> tuple[str, ...]:
+    """Names of the trials, numbered where they repeat."""
+    names = [trial.name for trial in problem.trials]
+    return tuple(n if names.count(n) == 1 else f"{n} ({i})" for i, n in enumerate(names))
+
+
+def by_trial(problem: Problem, simulated: np.ndarray) -> ByTrial:
+    """What was simulated (W, n_c, n_t) in windows, put together; NaN where no window is."""
+    found = {}
+    for k, name in enumerate(trial_names(problem)):
+        trial, found[name] = problem.trials[k], {}
+        for c, channel in enumerate(problem.channels):
+            if channel not in trial.measured:
+                continue
+            y = np.full(trial.t.shape, np.nan)
+            for i, (owner, first, n) in enumerate(problem.places):
+                if owner == k:
+                    y[first : first + n] = simulated[i, c, :n]
+            found[name][channel] = y
+    return found
+
+
+def scaled_residuals(problem: Problem, fitted: ByTrial) -> ByTrial:
+    """(fitted - measured) / sigma; NaN in gaps."""
+    pairs = zip(fitted.items(), problem.trials, strict=True)
+    return {
+        name: {channel: (y - trial.measured[channel]) / trial.sigma[channel] for channel, y in channels.items()}
+        for (name, channels), trial in pairs
+    }
+
+
+def variance_accounted_for(problem: Problem, fitted: ByTrial) -> dict[str, float]:
+    """1 - sum (y - fit)^2 / sum (y - mean y)^2 of every channel, over all trials."""
+    found = {}
+    for channel in problem.channels:
+        left = total = 0.0
+        for channels, trial in zip(fitted.values(), problem.trials, strict=True):
+            if channel in trial.measured:
+                y, f = trial.measured[channel], channels[channel]
+                left, total = left + np.nansum((f - y) ** 2), total + np.nansum((y - np.nanmean(y)) ** 2)
+        found[channel] = float(1 - left / total) if total > 0 else float("nan")
+    return found
+
+
+def autocorrelation(residuals: Mapping[str, Mapping[str, np.ndarray]]) -> float:
+    """Of neighbouring residuals, over all channels, each weighted by its size."""
+    above = below = 0.0
+    for channels in residuals.values():
+        for r in channels.values():
+            above += float(np.nansum(r[1:] * r[:-1]))
+            below += float(np.nansum(r**2))
+    return above / below if below > 0 else 0.0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from .._optimize.least_squares import least_squares
 from .._problem.problem import Problem, cost
 from .._result.result import Fit
-from .least_squares import least_squares
 
 
 @dataclasses.dataclass(frozen=True, repr=False)

@@ -1,22 +1,39 @@
-"""What looks wrong with data, by name: signs, columns without content, bodies that cannot be. Knows a fit's numbers."""
+"""What a reader of a fit should know: columns without content, trade-offs, bodies that cannot be. Fits nothing anew."""
 
 from __future__ import annotations
 
-import dataclasses
 import warnings
 from typing import TYPE_CHECKING
 
-import equinox as eqx
 import jax
 import numpy as np
 
 from ..._method.checks import check_system
-from .._optimize.steps import settle, uninterrupted
 from .._problem.bijections import PossibleBody
 from .._problem.problem import Problem
 
 if TYPE_CHECKING:
-    from .._result.result import Fit
+    from .result import Fit
+
+
+def notes_of(fit: Fit) -> tuple[str, ...]:
+    """All of them, for a fit."""
+    problem = fit.problem
+    return (
+        *fit.identifiability.messages,
+        *trade_offs(fit),
+        *coloured_residuals(fit),
+        *no_freedom(fit),
+        *coarse_steps(fit),
+        *impossible_bodies(fit),
+        *bodies_at_the_edge(fit),
+        *far_from_start(fit),
+        *only_priors(fit),
+        *empty_columns(problem),
+        *contrary_rates(problem),
+        *doubled_trials(problem),
+        *bad_channels(fit),
+    )
 
 
 def empty_columns(problem: Problem) -> list[str]:
@@ -52,10 +69,32 @@ def contrary_rates(problem: Problem) -> list[str]:
     return notes
 
 
-def fits_badly(fit: Fit) -> bool:
-    """Whether less than half of a channel's variance is accounted for, and noise does not explain that."""
-    tests = [t for channels in fit.tests.values() for t in channels.values()]
-    return fit.variance >= 2 and not all(t.accounted > 0.5 or np.isnan(t.accounted) for t in tests)
+def bad_channels(fit: Fit) -> list[str]:
+    """Channels of which less than half of the variance is accounted for, where noise does not explain that."""
+    if not fit.variance >= 2:
+        return []
+    bad = [
+        channel
+        for channel in fit.problem.channels
+        if any(c[channel].accounted <= 0.5 for c in fit.tests.values() if channel in c)
+    ]
+    if not bad:
+        return []
+    return [
+        f"{', '.join(bad)}: less than half of the variance is accounted for, in one trial at least. "
+        "`jaxkane.fit.contrary_signs(fit)` tries whether a sign is wrong."
+    ]
+
+
+def coloured_residuals(fit: Fit) -> list[str]:
+    """Residuals that are no noise, so that the formal errors are too small."""
+    lag = fit.autocorrelation
+    if lag <= 0.3:
+        return []
+    return [
+        f"The residuals are not noise: neighbours correlate by {lag:.2f}. The formal standard errors are too "
+        f"small by a factor of about {((1 + lag) / max(1 - lag, 0.01)) ** 0.5:.1f}; compare `clustered_errors`."
+    ]
 
 
 def coarse_steps(fit: Fit) -> list[str]:
@@ -89,38 +128,6 @@ def doubled_trials(problem: Problem) -> list[str]:
             notes.append(f"{trial.name} has the samples of {first[key]}: what is measured once counts twice.")
         first.setdefault(key, trial.name)
     return notes
-
-
-def contrary_signs(fit: Fit) -> list[str]:
-    """Where a channel fits badly: inputs and channels with which the opposite sign would fit much better."""
-    if not fits_badly(fit):
-        return []
-    notes, problem = [], fit.problem
-    for i, name in enumerate(problem.system.inputs):
-        if name not in problem.model.driven:
-            continue
-        flipped = problem.windows.inputs.at[:, i].multiply(-1.0)
-        notes += _if_better(fit, eqx.tree_at(lambda w: w.inputs, problem.windows, flipped), f"the input {name}")
-    for c, channel in enumerate(problem.channels):
-        flipped = problem.windows.measured.at[:, c].multiply(-1.0)
-        notes += _if_better(fit, eqx.tree_at(lambda w: w.measured, problem.windows, flipped), channel)
-    return notes
-
-
-def _if_better(fit: Fit, windows, what: str) -> list[str]:
-    from .._optimize.least_squares import least_squares
-
-    problem = dataclasses.replace(fit.problem, windows=windows)
-    try:
-        # From both ends: a fit to the wrong sign may have led the parameters far away.
-        costs = [settle(problem, point, steps=4)[1].cost for point in (fit.point, problem.start)]
-        if min(costs) > 0.5 * fit.cost:
-            costs = [uninterrupted(least_squares(problem, steps=4, rtol=1e-2)).cost]
-    except ValueError:
-        return []
-    if min(costs) < 0.5 * fit.cost:
-        return [f"{what} seems to have the wrong sign: turned round, the sum of squares is below {min(costs):.4g}."]
-    return []
 
 
 def impossible_bodies(fit: Fit) -> list[str]:

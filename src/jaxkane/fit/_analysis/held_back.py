@@ -1,0 +1,123 @@
+"""Parameters on trials that they were not found from: trials left out in turn, or measured later."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from .._data.trial import Trial
+from .._optimize.least_squares import least_squares
+from .._optimize.steps import settle, uninterrupted
+from .._problem.model import Point
+from .._problem.problem import Problem
+from .._result.result import Fit
+
+
+def applied_to(fit: Fit, trials: Sequence[Trial] | Trial) -> Fit:
+    """The parameters of a fit on other trials, of which only starts and biases are found: a look at data held back.
+
+        jk.fit.applied_to(result, others).variance_accounted_for
+
+    **Returns:** a `Fit` of these trials, with the status "applied": its `cost`, `variance_accounted_for`, `tests` and
+    report are those of these trials.
+
+    **Raises:** `ValueError` as `fit` does, for trials that do not suit the system or cannot be simulated.
+    """
+    problem = fit.problem.with_trials(trials)
+    first = dataclasses.replace(problem.start, x=fit.point.x)
+    if problem.posed["step"] is None and problem.model.settings.step is not None:
+        problem = problem.finer(first)
+    before = settle(problem, problem.start)[1].cost
+    point, at = settle(problem, first, steps=20, rtol=1e-6)
+    return Fit.of(problem, point, at, (before, at.cost), "applied", fit.method)
+
+
+@dataclasses.dataclass(frozen=True)
+class CrossValidation:
+    """Trials left out in turn: sums of squares of each, its own starts and biases found with the parameters held.
+
+    - `trials`: their names; `n`: numbers of residuals; `at_start`, `fitted`, `held_out` (T,): with the parameters of
+        the start, of the fit of all, and of the fit of the others.
+    - `estimates`: by parameter, of each fold.
+    """
+
+    trials: tuple[str, ...]
+    n: np.ndarray
+    at_start: np.ndarray
+    fitted: np.ndarray
+    held_out: np.ndarray
+    estimates: dict[str, np.ndarray]
+
+    @property
+    def score(self) -> float:
+        """The share of the sum of squares at the start that the fit takes away from trials it has not seen."""
+        return float(1 - self.held_out.sum() / self.at_start.sum())
+
+    def __str__(self) -> str:
+        lines = [f"{'trial':<28}{'residuals':>10}{'start':>12}{'fitted':>12}{'held out':>12}"]
+        rows = zip(self.trials, self.n, self.at_start, self.fitted, self.held_out, strict=True)
+        lines += [f"{name:<28}{n:>10}{a:>12.5g}{b:>12.5g}{c:>12.5g}" for name, n, a, b, c in rows]
+        total = (self.n.sum(), self.at_start.sum(), self.fitted.sum(), self.held_out.sum())
+        lines.append("{:<28}{:>10}{:>12.5g}{:>12.5g}{:>12.5g}".format("all", *total))
+        lines.append(f"held-out score: {100 * self.score:.1f} % of the start's sum of squares is taken away.")
+        return "\n".join(lines)
+
+
+def cross_validate(fit: Fit, folds: int | Sequence[Sequence[int]] | None = None) -> CrossValidation:
+    """Fit some trials and look at the others: does what was found hold where it was not looked for?
+
+    **Arguments:** `folds`: how many, or the numbers of the trials that are left out together; by default each trial
+    alone, and five folds from eleven trials on.
+
+    **Raises:** `ValueError` with fewer than two trials.
+    """
+    T = len(fit.problem.trials)
+    if T < 2:
+        raise ValueError("Leaving trials out needs two at least: cut a long one with `Trial.between`.")
+    if folds is None:
+        folds = T if T <= 10 else 5
+    groups = _folds(folds, T)
+    held, estimates = np.full(T, np.nan), {name: [] for name in fit.names}
+    for group in groups:
+        others = fit.problem.only(set(range(T)) - set(group))
+        found = uninterrupted(least_squares(others, start=fit.point))
+        held[group] = costs_by_trial(fit.problem, found.point)[group]
+        for name, value in found.estimates.items():
+            estimates[name].append(value)
+    owner = np.asarray(fit.problem.windows.trial)
+    counts = np.asarray(jnp.sum(fit.problem.windows.weight > 0, axis=(1, 2)))
+    return CrossValidation(
+        trials=fit.trial_names,
+        n=np.array([counts[owner == k].sum() for k in range(T)]),
+        at_start=costs_by_trial(fit.problem, fit.problem.start),
+        fitted=costs_by_trial(fit.problem, fit.point),
+        held_out=held,
+        estimates={name: np.array(values) for name, values in estimates.items()},
+    )
+
+
+def _folds(folds: int | Sequence[Sequence[int]], T: int) -> list[list[int]]:
+    if isinstance(folds, int):
+        if not 2 <= folds <= T:
+            raise ValueError(f"`folds`: {T} trials can be left out in 2 to {T} parts, not in {folds}.")
+        return [list(range(k, T, folds)) for k in range(folds)]
+    groups = [[int(k) for k in group] for group in folds]
+    if sorted(k for group in groups for k in group) != list(range(T)) or not all(groups) or len(groups) < 2:
+        raise ValueError(f"`folds` must leave out each of the trials 0 to {T - 1} once, in two groups at least.")
+    return groups
+
+
+def costs_by_trial(problem: Problem, point: Point) -> np.ndarray:
+    """Sums of squares (T,) with these parameters, starts and biases found for them.
+
+    With the priors of a trial's starts and biases, and without those of the parameters, which belong to no trial.
+    """
+    windows = eqx.tree_at(lambda w: w.very_first, problem.windows, jnp.zeros_like(problem.windows.very_first))
+    problem = dataclasses.replace(problem, windows=windows)
+    _, at = settle(problem, point, rtol=1e-5)
+    costs = np.sum(np.asarray(at.blocks.R)[:, :, -1] ** 2, axis=1)
+    return np.bincount(np.asarray(problem.windows.trial), costs, minlength=len(problem.trials))

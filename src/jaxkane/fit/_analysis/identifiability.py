@@ -1,0 +1,30 @@
+"""What data can tell before anything is fitted to them. Knows how to find the nuisance values."""
+
+from __future__ import annotations
+
+from .._optimize.steps import settle
+from .._problem.model import Point
+from .._problem.problem import Problem
+from .._result.identifiability import Identifiability, identifiability_at
+
+
+def identifiability(problem: Problem, *, flat: float = 0.5, at: Point | None = None) -> Identifiability:
+    """Which parameters, or combinations of them, the data can tell; of a `Fit`, `fit.identifiability` says it.
+
+        identifiability(Problem.of(system, trials, free, unknown=("roll",)))
+
+    The residuals' sensitivity to the scaled parameters, with the nuisance values eliminated, is taken apart by singular
+    values. A direction whose standard deviation exceeds `flat` of the parameters' scale is called undetermined.
+
+    **Arguments:**
+
+    - `problem`: a `Problem`.
+    - `flat`: where undetermined begins. `at`: a point of the problem; by default its start. The nuisance values are
+        found for it.
+
+    **Returns:** an `Identifiability`; print it for a table.
+
+    **Raises:** `ValueError` that names a window which cannot be simulated to its end.
+    """
+    point, linearization = settle(problem, problem.start if at is None else at)
+    return identifiability_at(problem, point, linearization, flat)
