@@ -34,12 +34,12 @@ GOLD, BLUE, INK = "#e8a33d", "#3d8fd1", "#2b2f36"
 class CrankRocker(jk.System):
     """Three slender bars in a chain from the pin A to the pin D, both on the ground. N.y is up."""
 
-    ground: jk.Scalar = jk.parameter(1.0, positive=True)  # [m], from A to D
-    l_crank: jk.Scalar = jk.parameter(0.3, positive=True)  # [m]
-    l_coupler: jk.Scalar = jk.parameter(0.9, positive=True)  # [m]
-    l_rocker: jk.Scalar = jk.parameter(0.7, positive=True)  # [m]
-    density: jk.Scalar = jk.parameter(2.0, positive=True)  # [kg/m]
-    load: jk.Scalar = jk.parameter(1.5, positive=True)  # [kg], on the coupler
+    ground: jk.Scalar = jk.parameter(1.0, positive=True, unit="m")  # from A to D
+    l_crank: jk.Scalar = jk.parameter(0.3, positive=True, unit="m")
+    l_coupler: jk.Scalar = jk.parameter(0.9, positive=True, unit="m")
+    l_rocker: jk.Scalar = jk.parameter(0.7, positive=True, unit="m")
+    density: jk.Scalar = jk.parameter(2.0, positive=True, unit="kg/m")
+    load: jk.Scalar = jk.parameter(1.5, positive=True, unit="kg")  # on the coupler
 
     coordinates = ("crank", "coupler", "rocker")
     speeds = ("crank_rate",)

@@ -37,11 +37,11 @@ GOLD, BLUE, INK = "#e8a33d", "#3d8fd1", "#2b2f36"
 class RotaryPendulum(jk.System):
     """A rod on the end of a motor-driven level arm. N.z is up; the arm lies along A.x, the rod hangs along -R.z."""
 
-    reach: jk.Scalar = jk.parameter(0.3, positive=True)  # [m]
-    length: jk.Scalar = jk.parameter(0.4, positive=True)  # [m]
-    mass: jk.Scalar = jk.parameter(0.2, positive=True)  # [kg]
-    arm_inertia: jk.Scalar = jk.parameter(0.01, positive=True)  # [kg m^2]
-    damping: jk.Scalar = jk.parameter(2e-4)  # [N m s/rad]
+    reach: jk.Scalar = jk.parameter(0.3, positive=True, unit="m")
+    length: jk.Scalar = jk.parameter(0.4, positive=True, unit="m")
+    mass: jk.Scalar = jk.parameter(0.2, positive=True, unit="kg")
+    arm_inertia: jk.Scalar = jk.parameter(0.01, positive=True, unit="kg m^2")
+    damping: jk.Scalar = jk.parameter(2e-4, unit="N m s/rad")
 
     coordinates = ("arm", "rod")
     speeds = ("arm_rate", "rod_rate")

@@ -40,9 +40,9 @@ class Chain(jk.System):
     """Equal thin rods, the first on a pin at the origin. N.y is up; a link points along -R.y of its own frame."""
 
     links: int = eqx.field(static=True, default=21)
-    length: jk.Scalar = jk.parameter(1.0, positive=True)  # [m]
-    mass: jk.Scalar = jk.parameter(0.1, positive=True)  # [kg]
-    gravity: jk.Scalar = jk.parameter(9.81)  # [m/s^2]
+    length: jk.Scalar = jk.parameter(1.0, positive=True, unit="m")
+    mass: jk.Scalar = jk.parameter(0.1, positive=True, unit="kg")
+    gravity: jk.Scalar = jk.parameter(9.81, unit="m/s^2")
 
     @property
     def coordinates(self):

@@ -1,5 +1,6 @@
 """Pictures: drawn on a dark and on a light page, with what was asked for in them."""
 
+import re
 import types
 
 import jax.numpy as jnp
@@ -12,7 +13,8 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._description.units import unit_of
+from jaxkane._description.parameters import parameter_info
+from jaxkane._description.units import unit_of, units_of
 from jaxkane.plot._stability import stable_ranges
 
 
@@ -56,13 +58,24 @@ def trajectory(status=0, t_end=2.0, batch=()):
         (("roll", "x"), ("yaw_rate",), ()),
         ("fell_over",),
         "none",
+        units=(("roll", "rad"), ("yaw_rate", "rad/s"), ("x", "m"), ("steer_torque", "N m")),
     )
 
 
-def test_names_tell_units():
-    told = {"roll": "rad", "theta1_dot": "rad/s", "x": "m", "y_dot": "m/s", "omega2": "rad/s", "steer_torque": "N m"}
-    told |= {"rear_wheel_rate": "rad/s", "rear_wheel_angle": "rad", "e4": "", "v1": "m/s", "force1": "N", "charge": ""}
-    assert {name: unit_of(name) for name in told} == told
+def test_units_are_those_declared_and_of_their_rates():
+    declared = {"roll": "rad", "x": "m", "push": "N"}
+    told = declared | {"roll_rate": "rad/s", "x_dot": "m/s", "yaw": "", "yaw_rate": "", "y_dot": "", "rate": ""}
+    assert {name: unit_of(name, declared) for name in told} == told
+
+
+@pytest.mark.parametrize("name", jk.catalog.CATALOG)
+def test_the_catalogue_declares_its_units(name):
+    """All but Euler parameters, which have none."""
+    system = jk.catalog.CATALOG[name].example()
+    names = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.auxiliary_speeds, *system.inputs)
+    declared = units_of(system)
+    assert [n for n in names if not unit_of(n, declared)] == [n for n in names if re.fullmatch(r"e\d", n)]
+    assert all(info.unit for info in parameter_info(system).values())
 
 
 def test_trajectories_have_names_units_and_an_end(style):

@@ -145,7 +145,7 @@ def test_degrees_go_by_the_units_that_were_declared():
     axes = jk.plot.trajectories(ride, ["q0", "u0", "q1"], degrees=True)
     assert [ax.get_ylabel() for ax in axes] == ["q0\n[deg]", "u0\n[deg/s]", "q1"]
     np.testing.assert_allclose(axes[0].lines[0].get_ydata(), np.degrees(ride["q0"]))
-    with pytest.raises(ValueError, match=r"none of q1 is known to be an angle.*units = \{'q1': \"rad\"\}"):
+    with pytest.raises(ValueError, match=r"none of q1 is declared to be an angle.*units = \{'q1': \"rad\"\}"):
         jk.plot.trajectories(ride, ["q1"], degrees=True)
     several = jk.sweep.sweep(Cart(), jk.State({"q0": np.array([0.1, 0.2])}, {}), [0.0, 0.5, 1.0])
     assert dict(several.trajectory.units) == {"q0": "rad", "push": "N", "u0": "rad/s"}

@@ -16,12 +16,16 @@ if TYPE_CHECKING:
 
 
 def parameter(
-    default: Any = dataclasses.MISSING, *, positive: bool = False, shape: tuple[int, ...] | None = None
+    default: Any = dataclasses.MISSING,
+    *,
+    positive: bool = False,
+    shape: tuple[int, ...] | None = None,
+    unit: str = "",
 ) -> Any:
     """A physical parameter of a `System`: a float array from birth, in SI units and radians.
 
-        mass: Scalar = jk.parameter(positive=True)  # [kg]
-        moments: Array = jk.parameter([0.1, 0.2, 0.2], positive=True)  # [kg m^2]
+        mass: Scalar = jk.parameter(positive=True, unit="kg")
+        moments: Array = jk.parameter([0.1, 0.2, 0.2], positive=True, unit="kg m^2")
 
     **Arguments:**
 
@@ -29,21 +33,23 @@ def parameter(
     - `positive`: refuse zero and negative values, and let a fit move it on a logarithmic scale.
     - `shape`: of the array, by default that of `default`, or `()` for a number. A value with leading axes more is a
         batch.
+    - `unit`: as tables and pictures show it; no number is converted.
     """
     if default is dataclasses.MISSING:
-        return eqx.field(converter=to_float, metadata={"jaxkane": ParameterInfo(positive, shape or ())})
+        return eqx.field(converter=to_float, metadata={"jaxkane": ParameterInfo(positive, shape or (), unit)})
     # A copy, as NumPy: a list that is changed later must not change the default, and JAX must not start yet.
     default = default if isinstance(default, jax.Array) or np.ndim(default) == 0 else np.array(default)
-    metadata = {"jaxkane": ParameterInfo(positive, np.shape(default) if shape is None else shape)}
+    metadata = {"jaxkane": ParameterInfo(positive, np.shape(default) if shape is None else shape, unit)}
     return eqx.field(converter=to_float, metadata=metadata, default_factory=lambda: default)
 
 
 @dataclasses.dataclass(frozen=True)
 class ParameterInfo:
-    """What `parameter` was told: whether the value must be positive, and the shape of one value."""
+    """What `parameter` was told: whether the value must be positive, the shape of one value, and its unit."""
 
     positive: bool
     shape: tuple[int, ...]
+    unit: str = ""
 
 
 def parameter_info(system: System | type[System]) -> dict[str, ParameterInfo]:

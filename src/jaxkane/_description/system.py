@@ -56,7 +56,7 @@ class System(eqx.Module):
     """Names of the coordinates that `assemble` finds from the configuration constraints; the others are held."""
     inputs: ClassVar[tuple[str, ...]] = ()
     """Names of the inputs that `loads` reads."""
-    units: ClassVar[Mapping[str, str]] = {}
+    units: ClassVar[Mapping[Any, str]] = {}
     """Units of coordinates, speeds and inputs by name, for pictures: `{"q0": "rad", "push": "N"}`. Those of usual
     names, as "roll", "x" or "steer_torque", are known without."""
     check_inertia: ClassVar[bool] = True

@@ -1,38 +1,21 @@
-"""Units of coordinates, speeds and inputs, for pictures: as declared, or as a usual name tells. Converts no number."""
+"""Units of coordinates, speeds and inputs, as a system declares them, for tables and pictures. Converts no number."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Mapping
 
 from .._common.lookup import refuse_unknown
 from .system import System
 
-# The unit that a name tells: of the coordinate, before "_rate" or "_dot".
-_USUAL = {
-    r"roll|pitch|yaw|steer|lean|heading|spin|.*angle\d*|theta\d*|phi\d*|psi\d*|alpha\d*|beta\d*": "rad",
-    r"[xyz]\d*|.*(position|distance|displacement|height)\d*": "m",
-    r"omega\d*": "rad/s",
-    r"v\d*|.*_speed": "m/s",
-    r".*_?torque\d*": "N m",
-    r".*_?force\d*": "N",
-    r"e\d": "",
-}
 
+def unit_of(name: str, declared: Mapping[str, str]) -> str:
+    """The declared unit of a name, or "".
 
-def unit_of(name: str, declared: Mapping[str, str] | None = None) -> str:
-    """The unit of a name: the declared one, or what a usual name tells; "" where neither is known.
-
-    "roll" rad, "yaw_rate" rad/s, "x" m, "steer_torque" N m; "q0_dot" rad/s where "q0" is declared in rad.
+    A name with `_rate` or `_dot` behind one that was declared has its unit by the second: "q0_dot" rad/s where "q0" is
+    declared in rad.
     """
-    declared = declared or {}
-    if name in declared:
-        return declared[name]
-    base, rate = re.fullmatch(r"(.*?)((?:_rate|_dot)?)", name).groups()  # type: ignore[union-attr]
-    unit = declared.get(base) or next((unit for pattern, unit in _USUAL.items() if re.fullmatch(pattern, base)), "")
-    if base.endswith("wheel") and rate:
-        unit = "rad"
-    return _rate_of(unit) if rate else unit
+    base = name.removesuffix("_rate").removesuffix("_dot")
+    return declared.get(name) or (_rate_of(declared.get(base, "")) if base != name else "")
 
 
 def units_of(system: System) -> dict[str, str]:
@@ -61,7 +44,7 @@ def refuse_no_angle(names: Iterable[str], units: Iterable[str]) -> None:
     names = tuple(names)
     if not any(in_degrees(unit) for unit in units):
         raise ValueError(
-            f"degrees=True: none of {', '.join(names)} is known to be an angle. Say so where they are named, in the "
+            f"degrees=True: none of {', '.join(names)} is declared to be an angle. Say so where they are named, in the "
             f'system: `units = {{{names[0]!r}: "rad"}}`; or here, by `units={{{names[0]!r}: "rad"}}`.'
         )
 

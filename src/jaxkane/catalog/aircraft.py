@@ -25,24 +25,30 @@ _ENGINES = {
 
 class _Aircraft(System):
     # How the airframe is oriented is left to the two classes below: `_airframe` and `_orientation_rates`.
-    airframe_mass: Scalar = parameter(6000.0, positive=True)  # [kg]
-    airframe_Ixx: Scalar = parameter(12000.0, positive=True)  # [kg m^2]
-    airframe_Iyy: Scalar = parameter(30000.0, positive=True)  # [kg m^2]
-    airframe_Izz: Scalar = parameter(38000.0, positive=True)  # [kg m^2]
-    airframe_Ixz: Scalar = parameter(-1500.0)  # [kg m^2]
-    engine_mass: Scalar = parameter(300.0, positive=True)  # [kg]
-    engine_axial_inertia: Scalar = parameter(20.0, positive=True)  # [kg m^2]
-    engine_transverse_inertia: Scalar = parameter(60.0, positive=True)  # [kg m^2]
-    engine_x: Scalar = parameter(0.5)  # [m]
-    engine_y: Scalar = parameter(2.5)  # [m]
-    engine_z: Scalar = parameter(0.4)  # [m]
-    engine1_speed: Scalar = parameter(400.0)  # [rad/s]
-    engine1_acceleration: Scalar = parameter(0.0)  # [rad/s^2]
-    engine2_speed: Scalar = parameter(400.0)  # [rad/s]
-    engine2_acceleration: Scalar = parameter(0.0)  # [rad/s^2]
+    airframe_mass: Scalar = parameter(6000.0, positive=True, unit="kg")
+    airframe_Ixx: Scalar = parameter(12000.0, positive=True, unit="kg m^2")
+    airframe_Iyy: Scalar = parameter(30000.0, positive=True, unit="kg m^2")
+    airframe_Izz: Scalar = parameter(38000.0, positive=True, unit="kg m^2")
+    airframe_Ixz: Scalar = parameter(-1500.0, unit="kg m^2")
+    engine_mass: Scalar = parameter(300.0, positive=True, unit="kg")
+    engine_axial_inertia: Scalar = parameter(20.0, positive=True, unit="kg m^2")
+    engine_transverse_inertia: Scalar = parameter(60.0, positive=True, unit="kg m^2")
+    engine_x: Scalar = parameter(0.5, unit="m")
+    engine_y: Scalar = parameter(2.5, unit="m")
+    engine_z: Scalar = parameter(0.4, unit="m")
+    engine1_speed: Scalar = parameter(400.0, unit="rad/s")
+    engine1_acceleration: Scalar = parameter(0.0, unit="rad/s^2")
+    engine2_speed: Scalar = parameter(400.0, unit="rad/s")
+    engine2_acceleration: Scalar = parameter(0.0, unit="rad/s^2")
 
     speeds = ("v1", "v2", "v3", "omega1", "omega2", "omega3")
     inputs = ("force1", "force2", "force3", "torque1", "torque2", "torque3")
+    units = {
+        **dict.fromkeys(speeds[:3], "m/s"),
+        **dict.fromkeys(speeds[3:], "rad/s"),
+        **dict.fromkeys(inputs[:3], "N"),
+        **dict.fromkeys(inputs[3:], "N m"),
+    }
 
     def _airframe(self, N: Frame, q, u) -> Frame:
         raise NotImplementedError
@@ -120,6 +126,7 @@ class Aircraft(_Aircraft):
     """
 
     coordinates = ("x", "y", "z", "psi", "theta", "phi")
+    units = {**_Aircraft.units, **dict.fromkeys(coordinates[:3], "m")} | dict.fromkeys(coordinates[3:], "rad")
 
     def _airframe(self, N, q, u):
         return N.rotate_sequence("3-2-1", q[3:], angular_velocity=u[3:], name="A")
@@ -148,6 +155,7 @@ class AircraftEulerParameters(_Aircraft):
 
     coordinates = ("x", "y", "z", "e1", "e2", "e3", "e4")
     dependent_coordinates = ("e4",)
+    units = {**_Aircraft.units, **dict.fromkeys(coordinates[:3], "m")}
 
     def configuration_constraints(self, t, q):
         return (q["e1"] ** 2 + q["e2"] ** 2 + q["e3"] ** 2 + q["e4"] ** 2 - 1.0,)

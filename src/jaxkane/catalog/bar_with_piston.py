@@ -39,17 +39,18 @@ class BarWithPiston(System):
       walls' on piston and slider [N] (`constraint_forces`).
     """
 
-    mass: Scalar = parameter(1.0, positive=True)  # [kg]
-    length: Scalar = parameter(0.5, positive=True)  # [m]
-    piston_mass: Scalar = parameter(2.0, positive=True)  # [kg]
-    stiffness: Scalar = parameter(200.0)  # [N/m]
-    damping: Scalar = parameter(5.0)  # [N s/m]
-    gravity: Scalar = parameter(9.81)  # [m/s^2]
+    mass: Scalar = parameter(1.0, positive=True, unit="kg")
+    length: Scalar = parameter(0.5, positive=True, unit="m")
+    piston_mass: Scalar = parameter(2.0, positive=True, unit="kg")
+    stiffness: Scalar = parameter(200.0, unit="N/m")
+    damping: Scalar = parameter(5.0, unit="N s/m")
+    gravity: Scalar = parameter(9.81, unit="m/s^2")
 
     coordinates = ("theta",)
     speeds = ("theta_dot",)
     auxiliary_speeds = ("piston_guide", "slider_guide")
     inputs = ("force",)
+    units = {"theta": "rad", "force": "N", **dict.fromkeys(auxiliary_speeds, "m/s")}
 
     def motion(self, t, q, u):
         m, l = self.mass, self.length

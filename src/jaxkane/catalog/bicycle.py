@@ -65,39 +65,41 @@ class WhippleBicycle(System):
     and `steer_torque` on the fork, the last two with their reactions on the frame.
     """
 
-    w: Scalar = parameter(positive=True)  # [m]
-    c: Scalar = parameter()  # [m]
-    lam: Scalar = parameter()  # [rad]
-    rR: Scalar = parameter(positive=True)  # [m]
-    mR: Scalar = parameter(positive=True)  # [kg]
-    IRxx: Scalar = parameter(positive=True)  # [kg m^2]
-    IRyy: Scalar = parameter(positive=True)  # [kg m^2]
-    xB: Scalar = parameter()  # [m]
-    zB: Scalar = parameter()  # [m]
-    mB: Scalar = parameter(positive=True)  # [kg]
-    IBxx: Scalar = parameter(positive=True)  # [kg m^2]
-    IByy: Scalar = parameter(positive=True)  # [kg m^2]
-    IBzz: Scalar = parameter(positive=True)  # [kg m^2]
-    IBxz: Scalar = parameter()  # [kg m^2]
-    xH: Scalar = parameter()  # [m]
-    zH: Scalar = parameter()  # [m]
-    mH: Scalar = parameter(positive=True)  # [kg]
-    IHxx: Scalar = parameter(positive=True)  # [kg m^2]
-    IHyy: Scalar = parameter(positive=True)  # [kg m^2]
-    IHzz: Scalar = parameter(positive=True)  # [kg m^2]
-    IHxz: Scalar = parameter()  # [kg m^2]
-    rF: Scalar = parameter(positive=True)  # [m]
-    mF: Scalar = parameter(positive=True)  # [kg]
-    IFxx: Scalar = parameter(positive=True)  # [kg m^2]
-    IFyy: Scalar = parameter(positive=True)  # [kg m^2]
-    g: Scalar = parameter(9.81)  # [m/s^2]
-    steer_damping: Scalar = parameter(0.0)  # [N m s/rad]
+    w: Scalar = parameter(positive=True, unit="m")
+    c: Scalar = parameter(unit="m")
+    lam: Scalar = parameter(unit="rad")
+    rR: Scalar = parameter(positive=True, unit="m")
+    mR: Scalar = parameter(positive=True, unit="kg")
+    IRxx: Scalar = parameter(positive=True, unit="kg m^2")
+    IRyy: Scalar = parameter(positive=True, unit="kg m^2")
+    xB: Scalar = parameter(unit="m")
+    zB: Scalar = parameter(unit="m")
+    mB: Scalar = parameter(positive=True, unit="kg")
+    IBxx: Scalar = parameter(positive=True, unit="kg m^2")
+    IByy: Scalar = parameter(positive=True, unit="kg m^2")
+    IBzz: Scalar = parameter(positive=True, unit="kg m^2")
+    IBxz: Scalar = parameter(unit="kg m^2")
+    xH: Scalar = parameter(unit="m")
+    zH: Scalar = parameter(unit="m")
+    mH: Scalar = parameter(positive=True, unit="kg")
+    IHxx: Scalar = parameter(positive=True, unit="kg m^2")
+    IHyy: Scalar = parameter(positive=True, unit="kg m^2")
+    IHzz: Scalar = parameter(positive=True, unit="kg m^2")
+    IHxz: Scalar = parameter(unit="kg m^2")
+    rF: Scalar = parameter(positive=True, unit="m")
+    mF: Scalar = parameter(positive=True, unit="kg")
+    IFxx: Scalar = parameter(positive=True, unit="kg m^2")
+    IFyy: Scalar = parameter(positive=True, unit="kg m^2")
+    g: Scalar = parameter(9.81, unit="m/s^2")
+    steer_damping: Scalar = parameter(0.0, unit="N m s/rad")
 
     coordinates = ("roll", "rear_wheel_angle", "steer", "yaw", "pitch", "front_wheel_angle", "x", "y")
     speeds = ("roll_rate", "rear_wheel_rate", "steer_rate")
     dependent_speeds = ("yaw_rate", "pitch_rate", "front_wheel_rate")
     dependent_coordinates = ("pitch",)
     inputs = ("roll_torque", "drive_torque", "steer_torque")
+    units = dict.fromkeys(coordinates[:6], "rad") | {"x": "m", "y": "m"}
+    units |= dict.fromkeys((*speeds, *dependent_speeds), "rad/s") | dict.fromkeys(inputs, "N m")
 
     @classmethod
     def benchmark(cls) -> WhippleBicycle:

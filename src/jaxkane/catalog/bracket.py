@@ -38,13 +38,14 @@ class Bracket(System):
       axis 3) [N].
     """
 
-    mass: Scalar = parameter(1.0, positive=True)  # [kg]
-    length: Scalar = parameter(1.0, positive=True)  # [m]
-    gravity: Scalar = parameter(9.81)  # [m/s^2]
+    mass: Scalar = parameter(1.0, positive=True, unit="kg")
+    length: Scalar = parameter(1.0, positive=True, unit="m")
+    gravity: Scalar = parameter(9.81, unit="m/s^2")
 
     coordinates = ("theta1", "theta2", "theta3")
     speeds = ("omega1", "omega2", "omega3")
     inputs = ("tip_force1", "tip_force3", "arm_force")
+    units = dict.fromkeys(coordinates, "rad") | dict.fromkeys(speeds, "rad/s") | dict.fromkeys(inputs, "N")
 
     def q_dot(self, t, q, u):
         return rotations.angle_rates("1-2-3", q, u)

@@ -38,18 +38,19 @@ class ColumnFrameAndDisk(System):
       (T_psi, frame on disk) [N m].
     """
 
-    frame_mass: Scalar = parameter(3.0, positive=True)  # [kg]
-    disk_mass: Scalar = parameter(2.0, positive=True)  # [kg]
-    distance: Scalar = parameter(0.4, positive=True)  # [m]
-    frame_I11: Scalar = parameter(0.22, positive=True)  # [kg m^2]
-    frame_I22: Scalar = parameter(0.05, positive=True)  # [kg m^2]
-    frame_I33: Scalar = parameter(0.20, positive=True)  # [kg m^2]
-    disk_transverse_inertia: Scalar = parameter(0.02, positive=True)  # [kg m^2]
-    disk_axial_inertia: Scalar = parameter(0.04, positive=True)  # [kg m^2]
+    frame_mass: Scalar = parameter(3.0, positive=True, unit="kg")
+    disk_mass: Scalar = parameter(2.0, positive=True, unit="kg")
+    distance: Scalar = parameter(0.4, positive=True, unit="m")
+    frame_I11: Scalar = parameter(0.22, positive=True, unit="kg m^2")
+    frame_I22: Scalar = parameter(0.05, positive=True, unit="kg m^2")
+    frame_I33: Scalar = parameter(0.20, positive=True, unit="kg m^2")
+    disk_transverse_inertia: Scalar = parameter(0.02, positive=True, unit="kg m^2")
+    disk_axial_inertia: Scalar = parameter(0.04, positive=True, unit="kg m^2")
 
     coordinates = ("phi", "theta", "psi")
     speeds = ("omega1", "omega2", "omega_disk")
     inputs = ("column_torque", "frame_torque", "disk_torque")
+    units = dict.fromkeys(coordinates, "rad") | dict.fromkeys(speeds, "rad/s") | dict.fromkeys(inputs, "N m")
 
     def q_dot(self, t, q, u):
         return -u["omega1"] / jnp.sin(q["theta"]), u["omega2"], u["omega_disk"]

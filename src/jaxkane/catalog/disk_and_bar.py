@@ -36,18 +36,19 @@ class DiskAndBar(System):
     - Inputs `disk_torque` (M_phi, ground on disk), `bar_torque` (M_theta, disk on bar) [N m].
     """
 
-    disk_mass: Scalar = parameter(4.0, positive=True)  # [kg]
-    disk_radius: Scalar = parameter(0.5, positive=True)  # [m]
-    mass: Scalar = parameter(1.0, positive=True)  # [kg]
-    length: Scalar = parameter(0.6, positive=True)  # [m]
-    pin_radius: Scalar = parameter(0.4)  # [m]
-    stiffness: Scalar = parameter(2.0)  # [N m/rad]
-    damping: Scalar = parameter(0.1)  # [N m s/rad]
-    gravity: Scalar = parameter(9.81)  # [m/s^2]
+    disk_mass: Scalar = parameter(4.0, positive=True, unit="kg")
+    disk_radius: Scalar = parameter(0.5, positive=True, unit="m")
+    mass: Scalar = parameter(1.0, positive=True, unit="kg")
+    length: Scalar = parameter(0.6, positive=True, unit="m")
+    pin_radius: Scalar = parameter(0.4, unit="m")
+    stiffness: Scalar = parameter(2.0, unit="N m/rad")
+    damping: Scalar = parameter(0.1, unit="N m s/rad")
+    gravity: Scalar = parameter(9.81, unit="m/s^2")
 
     coordinates = ("phi", "theta")
     speeds = ("phi_dot", "theta_dot")
     inputs = ("disk_torque", "bar_torque")
+    units = dict.fromkeys(coordinates, "rad") | dict.fromkeys(inputs, "N m")
 
     def motion(self, t, q, u):
         m, l = self.mass, self.length

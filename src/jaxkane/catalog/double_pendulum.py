@@ -31,13 +31,14 @@ class DoublePendulum(System):
     - Inputs `shoulder_torque` (M1, ground on first link), `elbow_torque` (M2, first link on second) [N m].
     """
 
-    mass: Scalar = parameter(1.0, positive=True)  # [kg]
-    length: Scalar = parameter(1.0, positive=True)  # [m]
-    gravity: Scalar = parameter(9.81)  # [m/s^2]
+    mass: Scalar = parameter(1.0, positive=True, unit="kg")
+    length: Scalar = parameter(1.0, positive=True, unit="m")
+    gravity: Scalar = parameter(9.81, unit="m/s^2")
 
     coordinates = ("theta1", "theta2")
     speeds = ("theta1_dot", "theta2_dot")
     inputs = ("shoulder_torque", "elbow_torque")
+    units = dict.fromkeys(coordinates, "rad") | dict.fromkeys(inputs, "N m")
 
     def motion(self, t, q, u):
         m, l = self.mass, self.length

@@ -32,15 +32,17 @@ class RigidBody(System):
     - Inputs `force1`, `force2`, `force3` at G [N], `torque1`, `torque2`, `torque3` [N m]: along the body's axes.
     """
 
-    mass: Scalar = parameter(1.0, positive=True)  # [kg]
-    I11: Scalar = parameter(1.0, positive=True)  # [kg m^2]
-    I22: Scalar = parameter(2.0, positive=True)  # [kg m^2]
-    I33: Scalar = parameter(2.5, positive=True)  # [kg m^2]
+    mass: Scalar = parameter(1.0, positive=True, unit="kg")
+    I11: Scalar = parameter(1.0, positive=True, unit="kg m^2")
+    I22: Scalar = parameter(2.0, positive=True, unit="kg m^2")
+    I33: Scalar = parameter(2.5, positive=True, unit="kg m^2")
 
     coordinates = ("x", "y", "z", "e1", "e2", "e3", "e4")
     speeds = ("v1", "v2", "v3", "omega1", "omega2", "omega3")
     dependent_coordinates = ("e4",)
     inputs = ("force1", "force2", "force3", "torque1", "torque2", "torque3")
+    units = dict.fromkeys(coordinates[:3], "m") | dict.fromkeys(speeds[:3], "m/s") | dict.fromkeys(speeds[3:], "rad/s")
+    units |= dict.fromkeys(inputs[:3], "N") | dict.fromkeys(inputs[3:], "N m")
 
     def q_dot(self, t, q, u):
         G = self.motion(t, q, u)["body"].center

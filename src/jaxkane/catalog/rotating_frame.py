@@ -12,12 +12,13 @@ from ._entry import entry
 
 class _FrameAndBar(System):
     # The mechanism of both examples; what the speeds are is said by `q_dot` alone.
-    mass: Scalar = parameter(2.0, positive=True)  # [kg]
-    length: Scalar = parameter(0.8, positive=True)  # [m]
-    distance: Scalar = parameter(0.5, positive=True)  # [m]
+    mass: Scalar = parameter(2.0, positive=True, unit="kg")
+    length: Scalar = parameter(0.8, positive=True, unit="m")
+    distance: Scalar = parameter(0.5, positive=True, unit="m")
 
     coordinates = ("phi", "theta")
     inputs = ("frame_torque", "bar_torque")
+    units = dict.fromkeys(coordinates, "rad") | dict.fromkeys(inputs, "N m")
 
     def motion(self, t, q, u):
         m, l, d = self.mass, self.length, self.distance
@@ -77,6 +78,7 @@ class RotatingFrameAndBarChosenSpeeds(_FrameAndBar):
     """
 
     speeds = ("center_speed", "omega2")
+    units = {**_FrameAndBar.units, "center_speed": "m/s", "omega2": "rad/s"}
 
     def q_dot(self, t, q, u):
         return u["center_speed"] / self.distance, u["omega2"]

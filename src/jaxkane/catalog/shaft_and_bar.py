@@ -49,14 +49,15 @@ class ShaftAndBar(System):
     - Inputs `shaft_torque` (M_phi, ground on shaft), `bar_torque` (M_theta, shaft on bar) [N m].
     """
 
-    mass: Scalar = parameter(1.0, positive=True)  # [kg]
-    length: Scalar = parameter(1.0, positive=True)  # [m]
-    shaft_mass: Scalar = parameter(2.0, positive=True)  # [kg]
-    shaft_radius: Scalar = parameter(0.1, positive=True)  # [m]
+    mass: Scalar = parameter(1.0, positive=True, unit="kg")
+    length: Scalar = parameter(1.0, positive=True, unit="m")
+    shaft_mass: Scalar = parameter(2.0, positive=True, unit="kg")
+    shaft_radius: Scalar = parameter(0.1, positive=True, unit="m")
 
     coordinates = ("phi", "theta")
     speeds = ("phi_dot", "theta_dot")
     inputs = ("shaft_torque", "bar_torque")
+    units = dict.fromkeys(coordinates, "rad") | dict.fromkeys(inputs, "N m")
 
     def motion(self, t, q, u):
         O, S, bar = _shaft_and_bar(self.mass, self.length, q, u)
@@ -88,12 +89,13 @@ class LightShaftAndBar(System):
     - Inputs `shaft_torque` (M_phi, ground on shaft), `bar_torque` (M_theta, shaft on bar) [N m].
     """
 
-    mass: Scalar = parameter(1.0, positive=True)  # [kg]
-    length: Scalar = parameter(1.0, positive=True)  # [m]
+    mass: Scalar = parameter(1.0, positive=True, unit="kg")
+    length: Scalar = parameter(1.0, positive=True, unit="m")
 
     coordinates = ("phi", "theta")
     speeds = ("omega1", "omega2")
     inputs = ("shaft_torque", "bar_torque")
+    units = dict.fromkeys(coordinates, "rad") | dict.fromkeys(speeds, "rad/s") | dict.fromkeys(inputs, "N m")
 
     def q_dot(self, t, q, u):
         return -u["omega1"] / jnp.sin(q["theta"]), u["omega2"]

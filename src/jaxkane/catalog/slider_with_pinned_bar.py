@@ -35,16 +35,17 @@ class SliderWithPinnedBar(System):
     - Input `force` (F): on the slider along N.x [N].
     """
 
-    slider_mass: Scalar = parameter(2.0, positive=True)  # [kg]
-    bar_mass: Scalar = parameter(1.0, positive=True)  # [kg]
-    length: Scalar = parameter(1.0, positive=True)  # [m]
-    stiffness: Scalar = parameter(50.0)  # [N/m]
-    damping: Scalar = parameter(1.0)  # [N s/m]
-    gravity: Scalar = parameter(9.81)  # [m/s^2]
+    slider_mass: Scalar = parameter(2.0, positive=True, unit="kg")
+    bar_mass: Scalar = parameter(1.0, positive=True, unit="kg")
+    length: Scalar = parameter(1.0, positive=True, unit="m")
+    stiffness: Scalar = parameter(50.0, unit="N/m")
+    damping: Scalar = parameter(1.0, unit="N s/m")
+    gravity: Scalar = parameter(9.81, unit="m/s^2")
 
     coordinates = ("x", "theta")
     speeds = ("x_dot", "theta_dot")
     inputs = ("force",)
+    units = {"x": "m", "theta": "rad", "force": "N"}
 
     def motion(self, t, q, u):
         l, m2 = self.length, self.bar_mass

@@ -38,20 +38,21 @@ class SpatialDoublePendulum(System):
     - Speeds `omega11` ... `omega13`, `omega21` ... `omega23`: angular velocities along the links' own axes [rad/s].
     """
 
-    mass1: Scalar = parameter(1.2, positive=True)  # [kg]
-    mass2: Scalar = parameter(0.8, positive=True)  # [kg]
-    length1: Scalar = parameter(1.0, positive=True)  # [m]
-    length2: Scalar = parameter(0.75, positive=True)  # [m]
-    I11_1: Scalar = parameter(0.1, positive=True)  # [kg m^2]
-    I22_1: Scalar = parameter(0.002)  # [kg m^2]
-    I33_1: Scalar = parameter(0.1, positive=True)  # [kg m^2]
-    I11_2: Scalar = parameter(0.0375, positive=True)  # [kg m^2]
-    I22_2: Scalar = parameter(0.001)  # [kg m^2]
-    I33_2: Scalar = parameter(0.0375, positive=True)  # [kg m^2]
-    gravity: Scalar = parameter(9.81)  # [m/s^2]
+    mass1: Scalar = parameter(1.2, positive=True, unit="kg")
+    mass2: Scalar = parameter(0.8, positive=True, unit="kg")
+    length1: Scalar = parameter(1.0, positive=True, unit="m")
+    length2: Scalar = parameter(0.75, positive=True, unit="m")
+    I11_1: Scalar = parameter(0.1, positive=True, unit="kg m^2")
+    I22_1: Scalar = parameter(0.002, unit="kg m^2")
+    I33_1: Scalar = parameter(0.1, positive=True, unit="kg m^2")
+    I11_2: Scalar = parameter(0.0375, positive=True, unit="kg m^2")
+    I22_2: Scalar = parameter(0.001, unit="kg m^2")
+    I33_2: Scalar = parameter(0.0375, positive=True, unit="kg m^2")
+    gravity: Scalar = parameter(9.81, unit="m/s^2")
 
     coordinates = ("theta11", "theta12", "theta13", "theta21", "theta22", "theta23")
     speeds = ("omega11", "omega12", "omega13", "omega21", "omega22", "omega23")
+    units = dict.fromkeys(coordinates, "rad") | dict.fromkeys(speeds, "rad/s")
 
     def q_dot(self, t, q, u):
         return (*rotations.angle_rates("3-1-3", q[:3], u[:3]), *rotations.angle_rates("3-1-3", q[3:], u[3:]))

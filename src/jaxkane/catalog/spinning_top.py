@@ -33,14 +33,15 @@ class SpinningTop(System):
     - Speeds `omega1`, `omega2`, `omega3`: angular velocity along the top's axes, the third its axis [rad/s].
     """
 
-    mass: Scalar = parameter(0.5, positive=True)  # [kg]
-    distance: Scalar = parameter(0.1, positive=True)  # [m]
-    transverse_inertia: Scalar = parameter(0.001, positive=True)  # [kg m^2]
-    axial_inertia: Scalar = parameter(0.0008, positive=True)  # [kg m^2]
-    gravity: Scalar = parameter(9.81)  # [m/s^2]
+    mass: Scalar = parameter(0.5, positive=True, unit="kg")
+    distance: Scalar = parameter(0.1, positive=True, unit="m")
+    transverse_inertia: Scalar = parameter(0.001, positive=True, unit="kg m^2")
+    axial_inertia: Scalar = parameter(0.0008, positive=True, unit="kg m^2")
+    gravity: Scalar = parameter(9.81, unit="m/s^2")
 
     coordinates = ("e1", "e2", "e3", "e4")
     speeds = ("omega1", "omega2", "omega3")
+    units = dict.fromkeys(speeds, "rad/s")
     dependent_coordinates = ("e4",)
 
     def q_dot(self, t, q, u):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -13,7 +12,7 @@ from ..catalog import WhippleBicycle
 from ..catalog._bicycle_file import read_bicycle_file
 from ._data.trial import Trial
 from ._fit import fit
-from ._problem.parameters import Delay, Free, Gain, Inertia, Prior, parameters_of
+from ._problem.parameters import Inertia, Prior, parameters_of
 from ._result.result import Fit
 
 WHEEL = "rear_wheel_rate"
@@ -54,7 +53,6 @@ def fit_bicycle(
     **Raises:** `ValueError` for a ride without a speed, and what `fit` raises.
     """
     rides = (rides,) if isinstance(rides, Trial) else tuple(rides)
-    free = _with_units(bicycle, free)
     names = parameters_of(bicycle, free).names
     if isinstance(priors, (str, os.PathLike)):
         priors = bicycle_priors(priors)
@@ -98,20 +96,6 @@ def frame_inertia(part: str, **more: Any) -> Inertia:
     moments, center = (f"I{part}xx", f"I{part}yy", f"I{part}zz"), (f"x{part}", None, f"z{part}")
     products = (None, f"I{part}xz", None)
     return Inertia(moments, products, mass=f"m{part}", center=center, **{"fixed": (f"m{part}",), **more})
-
-
-def _with_units(bicycle: WhippleBicycle, free: Any) -> list[Any]:
-    """The same, with units where Meijaard's names tell them."""
-    units = {"lam": "rad", "g": "m/s^2", "steer_damping": "N m s/rad", "w": "m", "c": "m"}
-    first = {"m": "kg", "I": "kg m^2", "x": "m", "z": "m", "r": "m"}
-    free = [free] if isinstance(free, (str, Free, Gain, Delay, Inertia)) or callable(free) else list(free)
-    found = []
-    for item in free:
-        item = Free(item) if isinstance(item, str) else item
-        if isinstance(item, Free) and isinstance(item.where, str) and not item.unit and hasattr(bicycle, item.where):
-            item = dataclasses.replace(item, unit=units.get(item.where, first.get(item.where[:1], "")))
-        found.append(item)
-    return found
 
 
 def _with_wheel_rate(ride: Trial, bicycle: WhippleBicycle) -> Trial:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..._common.lookup import hint
+from ..._description.parameters import ParameterInfo
 from ..._description.system import System
 from .bijections import Interval, PossibleBody
 
@@ -38,7 +39,7 @@ class Free:
     - `prior`: (mean, standard deviation) of what was measured elsewhere.
     - `tied`: other parameters that follow it: their name and factor, `Free("rR", tied={"rF": 1.0})`. All entries of
         one with axes follow.
-    - `name`, `unit`: for tables.
+    - `name`, `unit`: for tables; by default those of the parameter.
     """
 
     where: str | Callable[[Any], Any]
@@ -269,8 +270,9 @@ def _of_leaves(system: System, item: Free):
             label = item.name if item.name and not many else _path_name(path)
             label += str(list(index)) if leaf.ndim else ""
             start = float(leaf[index]) if item.start is None else float(item.start)
-            entry = _Entry(label, item.unit, ((i, place, 1.0), *followers))
-            parts.append(_scalar(entry, item, start, _declared_positive(system, path)))
+            declared = _declared(system, path)
+            entry = _Entry(label, item.unit or declared.unit, ((i, place, 1.0), *followers))
+            parts.append(_scalar(entry, item, start, declared.positive))
     return parts
 
 
@@ -278,7 +280,7 @@ def _followers(system: System, name: str, factor: float) -> list[tuple[int, int,
     """(leaf, place, factor) of every entry of what is tied."""
     chosen, leaves = _find(system, name)
     for path in (leaves[i][0] for i in chosen):
-        if not math.isfinite(factor) or (factor <= 0 and _declared_positive(system, path)):
+        if not math.isfinite(factor) or (factor <= 0 and _declared(system, path).positive):
             must = "positive, as the parameter is declared" if math.isfinite(factor) else "a finite number"
             raise ValueError(f"`tied`: the factor of {_path_name(path)} must be {must}; got {factor}.")
     return [(i, place, float(factor)) for i in chosen for place in range(leaves[i][1].size)]
@@ -402,16 +404,19 @@ def _path_name(path: tuple[Any, ...]) -> str:
     return jax.tree_util.keystr(path).lstrip(".")
 
 
-def _declared_positive(system: Any, path: tuple[Any, ...]) -> bool:
-    """Whether the field that holds this leaf was declared by `parameter(positive=True)`."""
-    positive = False
+def _declared(system: Any, path: tuple[Any, ...]) -> ParameterInfo:
+    """What `parameter` was told of the field that holds this leaf."""
+    found = _UNDECLARED
     for key in path:
         if isinstance(key, jax.tree_util.GetAttrKey):
             field = {f.name: f for f in dataclasses.fields(system)}.get(key.name)
-            positive = bool(field and "jaxkane" in field.metadata and field.metadata["jaxkane"].positive)
+            found = field.metadata.get("jaxkane", _UNDECLARED) if field else _UNDECLARED
             system = getattr(system, key.name)
         elif isinstance(key, jax.tree_util.SequenceKey):
             system = system[key.idx]
         elif isinstance(key, jax.tree_util.DictKey):
             system = system[key.key]
-    return positive
+    return found
+
+
+_UNDECLARED = ParameterInfo(False, ())
