@@ -46,6 +46,7 @@ class CrankRocker(jk.System):
     dependent_speeds = ("coupler_rate", "rocker_rate")
     dependent_coordinates = ("coupler", "rocker")
     inputs = ("torque",)
+    units = dict.fromkeys(coordinates, "rad") | {"torque": "N m"}
 
     def motion(self, t, q, u):
         N, A = jk.inertial()

@@ -38,6 +38,7 @@ class TopWithAngles(SpinningTop):
     coordinates = ("precession", "nutation", "spin")
     speeds = ("precession_rate", "nutation_rate", "spin_rate")
     dependent_coordinates = ()
+    units = dict.fromkeys(coordinates, "rad")
 
     def q_dot(self, t, q, u):
         return u

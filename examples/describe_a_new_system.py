@@ -46,6 +46,7 @@ class RotaryPendulum(jk.System):
     coordinates = ("arm", "rod")
     speeds = ("arm_rate", "rod_rate")
     inputs = ("torque",)
+    units = {"arm": "rad", "rod": "rad", "torque": "N m"}
 
     def motion(self, t, q, u):
         N, O = jk.inertial()

@@ -203,6 +203,9 @@ def test_audits(style, audited):
     np.testing.assert_allclose(axes[0, 0].lines[0].get_ydata(), audited.kinetic_energy)
 
 
+BIKE = jk.catalog.WhippleBicycle.benchmark()
+
+
 def fitted(n):
     """As much of a `Fit` as is drawn: n trials, "roll" in all, "yaw_rate" in all but the first."""
     t = np.linspace(0.0, 1.0, 21)
@@ -211,7 +214,7 @@ def fitted(n):
     names = tuple(f"ride {k}" for k in range(n))
     trials = [types.SimpleNamespace(t=t, measured=m, name=name) for m, name in zip(measured, names)]
     return types.SimpleNamespace(
-        problem=types.SimpleNamespace(trials=trials, channels=("roll", "yaw_rate"), system=jk.catalog.DoublePendulum()),
+        problem=types.SimpleNamespace(trials=trials, channels=("roll", "yaw_rate"), system=BIKE),
         trial_names=names,
         fitted=dict(zip(names, simulated)),
         residuals=dict(zip(names, [{name: np.full(21, 0.5) for name in trial} for trial in measured])),

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
+from jaxkane._description.units import units_of
 from jaxkane._description.values import Values
 
 
@@ -151,6 +152,7 @@ def test_degrees_go_by_the_units_that_were_declared():
     assert dict(several.trajectory.units) == {"q0": "rad", "push": "N", "u0": "rad/s"}
     with pytest.raises(ValueError, match=r"Wrong\.units names what is no coordinate, speed or input: q9"):
         jk.simulate(type("Wrong", (Cart,), {"units": {"q9": "m"}})(), jk.State([0.0, 0.0], [0.0, 0.0]), [0.0, 1.0])
+    assert units_of(type("Renamed", (Cart,), {"coordinates": ("angle", "q1")})()) == {"push": "N"}
     plt.close("all")
 
 

@@ -25,8 +25,10 @@ def units_of(system: System) -> dict[str, str]:
     """
     speeds = (*system.speeds, *system.dependent_speeds)
     names = (*system.coordinates, *speeds, *system.auxiliary_speeds, *system.inputs)
-    refuse_unknown(system.units, names, f"{type(system).__name__}.units names what is no coordinate, speed or input:")
-    units = dict(system.units)
+    if "units" in vars(type(system)):  # those that are inherited may name what this class has not
+        wrong = f"{type(system).__name__}.units names what is no coordinate, speed or input:"
+        refuse_unknown(system.units, names, wrong)
+    units = {name: unit for name, unit in system.units.items() if name in names}
     if type(system).q_dot is System.q_dot:
         for coordinate, speed in zip(system.coordinates, speeds, strict=False):
             if coordinate in units:

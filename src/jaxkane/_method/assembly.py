@@ -24,8 +24,8 @@ def assemble(
     system: System,
     q: Any,
     u: Any = None,
-    t: Component = 0.0,
     *,
+    t: Component = 0.0,
     free: Sequence[str] | None = None,
 ) -> State:
     """A state that satisfies the constraints: coordinates found by Newton's method, speeds checked.

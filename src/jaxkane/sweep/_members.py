@@ -94,7 +94,7 @@ def _start(system: Any, state: Any, row: Row, t: Any) -> State:
     q, u = ({n: dict.__getitem__(row, n) for n in names if n in row} for names in (system.coordinates, system.speeds))
     state = State(_set(state.q, q, system.coordinates), _set(state.u, u, system.speeds))
     if system.dependent_coordinates and (q or parameters):  # they follow from the others
-        state = assemble(system, state.q, state.u, t)
+        state = assemble(system, state.q, state.u, t=t)
     return state
 
 

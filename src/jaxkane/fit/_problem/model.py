@@ -95,7 +95,7 @@ class Model(eqx.Module):
         system, _ = self.parameters.apply(self.system, x)
         start = window.start.at[self.unknown_places].add(z)
         n_q = len(system.coordinates)
-        state = assemble(system, start[:n_q], start[n_q:], window.t[0])
+        state = assemble(system, start[:n_q], start[n_q:], t=window.t[0])
         return jnp.concatenate([state.q, state.u])
 
     def simulate(self, window: Windows, start: Array, b: Array, x: Array) -> Trajectory:
