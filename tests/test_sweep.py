@@ -31,6 +31,9 @@ def test_members_move_as_if_alone(rides):
         alone = jk.simulate(BIKE, jk.State(state.q, state.u[i]), TS)
         np.testing.assert_allclose(rides.q[i], alone.q, atol=1e-12)
         assert int(rides.stats["steps"][i]) == int(alone.stats["steps"])
+        for end in (rides.trajectory.end, rides.member(i).end):
+            q = end.q if end.q.ndim == 1 else end.q[i]
+            np.testing.assert_allclose(q, alone.end.q, atol=1e-12)
 
 
 @pytest.mark.slow

@@ -101,13 +101,21 @@ def sweep(
         return Sweep.of(job.solve(members, n), found, ts, reduce is not None)
 
     size = n if n <= GROUP else GROUP * -(-min(chunk, n) // GROUP)
-    members = jax.tree.map(np.asarray, members)
-    members_at = lambda start: jax.tree.map(lambda x: x[start : start + size], members)  # noqa: E731
     kept = like = None
     if folder is not None:
         layout = {"members": n, "chunk": size}
         program, like = traced(job, own)
         kept = Folder(folder, manifest_of(program, system, state, inputs, table, ts, settings, reduce, layout))
+    part = _in_chunks(job, jax.tree.map(np.asarray, members), n, size, kept, like, client, progress)
+    return Sweep.of(part, found, ts, reduce is not None)
+
+
+def _in_chunks(
+    job: Job, members: Any, n: int, size: int, kept: Folder | None, like: Part | None, client: Any, progress: bool
+) -> Part:
+    """The results of n members, `size` at a time: those that stand in the folder, then the others, here or on a
+    cluster. What is missing after Ctrl-C has the status `INTERRUPTED`."""
+    members_at = lambda start: jax.tree.map(lambda x: x[start : start + size], members)  # noqa: E731
     result = _Result(n)
     with tqdm(total=n, disable=not progress, unit="member", file=sys.stderr) as bar:
         try:
@@ -130,7 +138,7 @@ def sweep(
                 raise
     if kept is not None and result.reached.all():
         kept.tidy()
-    return Sweep.of(result.filled(), found, ts, reduce is not None)
+    return result.filled()
 
 
 def _finished(
