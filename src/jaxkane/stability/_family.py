@@ -101,37 +101,14 @@ def family(
     y = np.asarray(problem.unknowns(q, start.u, inputs)) / scale
     tangent = curve.tangent(y, None)
     tangent = tangent * _side(problem, system, towards, tangent, curve, y)
-    found, arc, reason, h = [y], [0.0], f"{steps} steps", step
     max_step = 4 * step if max_step is None else max_step
-    while len(found) <= steps:
-        attempt = curve.correct(y + h * tangent, tangent)
-        new = None if attempt is None else curve.tangent(attempt[0], tangent)
-        if attempt is None or new is None or new @ tangent < 0.9:
-            h /= 2
-            if h < 1e-4 * step:
-                reason = "no further motion was found: equations or coordinates become singular"
-                break
-            continue
-        z, quick = attempt
-        before, after = evaluate(y)[2], evaluate(z)[2]
-        passed = np.nonzero((before < 0) != (after < 0))[0]
-        passed = [i for i in passed if abs(before[i]) > 1e-9]
-        if passed:
-            ends = [(curve.land(y, z, tangent, i), i) for i in passed]
-            ends = [(end, i) for end, i in ends if end is not None]
-            if not ends:  # nearer
-                h /= 2
-                continue
-            z, i = min(ends, key=lambda end: np.linalg.norm(end[0] - y))
-            found.append(z)
-            arc.append(arc[-1] + float(np.linalg.norm(z - y)))
-            name, value = list((until or {}).items())[i]
-            reason = f"{name} = {value:g}"
-            break
-        arc.append(arc[-1] + float(np.linalg.norm(z - y)))
-        y, tangent = z, new
-        found.append(y)
-        h = min(max_step, 1.5 * h) if quick else h
+    found, arc, met = curve.follow(y, tangent, step, max_step, steps)
+    reason = f"{steps} steps"
+    if met is not None:
+        name, value = list((until or {}).items())[met]
+        reason = f"{name} = {value:g}"
+    elif len(found) <= steps:
+        reason = "no further motion was found: equations or coordinates become singular"
     return _as_family(problem, system, t, q, inputs, values, np.array(found) * scale, arc, reason)
 
 
@@ -153,6 +130,35 @@ class _Curve:
         null = Vt[-1:] if len(null) == 0 else null
         ahead = null.T @ (null @ before)
         return ahead / np.linalg.norm(ahead)
+
+    def follow(self, y, tangent, step: float, max_step: float, steps: int):
+        """Points from y on, their arclengths, and which limit was met, or None."""
+        found, arc, h = [y], [0.0], step
+        while len(found) <= steps and h >= 1e-4 * step:
+            attempt = self.correct(y + h * tangent, tangent)
+            new = None if attempt is None else self.tangent(attempt[0], tangent)
+            if attempt is None or new is None or new @ tangent < 0.9:
+                h /= 2
+                continue
+            z, quick = attempt
+            passed = self._passed(y, z)
+            ends = [(end, i) for i in passed if (end := self.land(y, z, tangent, i)) is not None]
+            if passed and not ends:  # nearer
+                h /= 2
+                continue
+            if ends:
+                z, met = min(ends, key=lambda end: np.linalg.norm(end[0] - y))
+                return [*found, z], [*arc, arc[-1] + float(np.linalg.norm(z - y))], met
+            arc.append(arc[-1] + float(np.linalg.norm(z - y)))
+            y, tangent = z, new
+            found.append(y)
+            h = min(max_step, 1.5 * h) if quick else h
+        return found, arc, None
+
+    def _passed(self, y, z) -> list[int]:
+        """The limits that lie between two points of the curve; one that stands at the first was met before."""
+        before, after = self.evaluate(y)[2], self.evaluate(z)[2]
+        return [int(i) for i in np.nonzero((before < 0) != (after < 0))[0] if abs(before[i]) > 1e-9]
 
     def correct(self, y, tangent, tries: int = 12):
         start = y
