@@ -10,7 +10,7 @@ from ._process import Setting, configure
 from ._timing import timed
 
 NAMES = ("simulate", "batch", "sensitivities", "reverse", "fit")
-OFF = {"IBxx": 1.2, "zB": 0.8, "c": 1.2, "IFyy": 0.8}  # the first guess of a fit, as a part of the truth
+OFF = {"IBxx": 1.2, "zB": 0.8, "c": 1.2, "IFyy": 0.8}  # the initial guess of a fit, as a part of the truth
 
 
 def main() -> None:

@@ -1,8 +1,8 @@
 """Can identification be trusted? Figures on simulated and measured bicycles, with the time that they take.
 
     unstable   the benchmark bicycle at 3 m/s, which falls over by itself, kept up by a rider for 10 s; noise and
-               offsets on roll rate, steer and steer rate; three parameters up to 30 % off, ten random first guesses; by
-               multiple shooting, and by a single shoot
+               offsets on roll rate, steer and steer rate; three parameters up to 30 % off, ten random initial guesses;
+               by multiple shooting, and by a single shoot
     coverage   at 1, 3, 5 and 7 m/s jointly, eight parameters: how often 95 % intervals hold the truth in repetitions
     measured   31 rides of a steer-by-wire bicycle (`--data FOLDER`): damping alone, four parameters, trials left out
 
@@ -24,11 +24,12 @@ import jaxkane as jk
 from jaxkane.catalog import WhippleBicycle
 from jaxkane.fit import (
     Gain,
+    LeastSquares,
     Problem,
     Trial,
     cross_validate,
     fit_bicycle,
-    least_squares,
+    minimize,
     multi_start,
     read_trials,
     report,
@@ -110,7 +111,7 @@ def coverage(repetitions):
         trials = [noisy(*r, rng, f"{speed:g} m/s", speed) for r, speed in rides]
         problem = Problem.of(guess, trials, EIGHT, window=1.0, **options)
         # What matters is where it ends: after the first time it starts there.
-        result = first = least_squares(problem, start=first.point if first else None)
+        result = first = minimize(problem, LeastSquares(), start=first.point if first else None)
         assert result.status == "converged", result
         intervals, errors = result.intervals(0.95), result.standard_errors
         hits += [low <= float(getattr(truth, n)) <= high for n, (low, high) in intervals.items()]
@@ -138,7 +139,7 @@ def measured(folder):
         by="segment",
     )
     rides, bicycle = [r.between(0.0, 0.995) for r in rides], WhippleBicycle.from_parameters(values)
-    options = {"input_bias": ("roll_torque", "steer_torque"), "hold": ("steer_torque",), "method": "least_squares"}
+    options = {"input_bias": ("roll_torque", "steer_torque"), "hold": ("steer_torque",), "optimizer": LeastSquares()}
     four = (Gain("steer_torque"), "steer_damping", "IHzz", "c")
     for free in (("steer_damping",), four, four, (*four, "IBxx")):
         began = time.perf_counter()

@@ -26,7 +26,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 from jaxkane.catalog import WhippleBicycle
-from jaxkane.fit import Problem, Trial, design, identifiability
+from jaxkane.fit import Problem, Simulation, Trial, design, identifiability
 
 jax.config.update("jax_enable_x64", True)
 
@@ -64,10 +64,10 @@ def errors_by_speed_and_sensors(bicycle, coefficients):
             rest = {c: np.zeros(TIMES.shape) for c in SIGMA}
             wheel = {"rear_wheel_rate": -speed / float(bicycle.rR)}
             plan = Trial(TIMES, rest, samples, sigma=sigma, initial=wheel)
-            problem = Problem.of(bicycle, plan, NAMES, step=0.02, **OPTIONS)
+            problem = Problem.of(bicycle, plan, NAMES, simulation=Simulation(step=0.02), **OPTIONS)
             ride = problem.trajectories(problem.start)[0]
             plan = Trial(TIMES, {c: np.asarray(ride[c]) for c in SIGMA}, samples, sigma=sigma, initial=wheel)
-            seen = identifiability(Problem.of(bicycle, plan, NAMES, step=0.02, **OPTIONS))
+            seen = identifiability(Problem.of(bicycle, plan, NAMES, simulation=Simulation(step=0.02), **OPTIONS))
             C = np.linalg.pinv(seen.information)
             found[i, j] = np.sqrt(C.diagonal())
     return found

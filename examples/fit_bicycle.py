@@ -2,7 +2,7 @@
 
 Three rides of the benchmark bicycle are simulated at 4.4, 5.2 and 6 m/s. Known torques push steer and roll; roll, steer
 and their rates are measured with noise, 100 times a second. Four parameters start 20 % off and are found again. So
-that the first guess does not fall over, the rides are cut into windows of 2.5 s, each with its own unknown start.
+that the initial guess does not fall over, the rides are cut into windows of 2.5 s, each with its own unknown start.
 
     variable    meaning                                                              unit
     IBxx        roll inertia of the rear frame with its rider                        kg m^2
@@ -35,7 +35,7 @@ from jaxkane.fit import Trial, fit_bicycle
 jax.config.update("jax_enable_x64", True)
 
 NOISE = {"roll": 0.005, "steer": 0.005, "roll_rate": 0.03, "steer_rate": 0.05}  # [rad, rad/s]
-OFF = {"IBxx": 1.2, "zB": 0.8, "c": 1.2, "IFyy": 0.8}  # the first guess, as a part of the truth
+OFF = {"IBxx": 1.2, "zB": 0.8, "c": 1.2, "IFyy": 0.8}  # the initial guess, as a part of the truth
 LABELS = {
     "roll": "roll [deg]",
     "steer": "steer [deg]",

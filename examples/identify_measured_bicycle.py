@@ -29,7 +29,17 @@ import numpy as np
 
 import jaxkane as jk
 from jaxkane.catalog import WhippleBicycle
-from jaxkane.fit import Gain, Trial, cross_validate, fit_bicycle, frame_inertia, profile, read_trials, save_report
+from jaxkane.fit import (
+    Gain,
+    LeastSquares,
+    Trial,
+    cross_validate,
+    fit_bicycle,
+    frame_inertia,
+    profile,
+    read_trials,
+    save_report,
+)
 
 jax.config.update("jax_enable_x64", True)
 
@@ -86,7 +96,7 @@ def main():
     hold = ("steer_torque",) if arguments.data else ()  # a command, kept until the next
     fits = {}
     for what, free in FREE.items():
-        fits[what] = fit_bicycle(rides, bicycle, free, input_bias=biases, hold=hold, method="least_squares")
+        fits[what] = fit_bicycle(rides, bicycle, free, input_bias=biases, hold=hold, optimizer=LeastSquares())
         print(f"\n{what[0].upper()}{what[1:]}\n{fits[what]}")
     first = fits["the damping alone"]
     left_out = cross_validate(first)

@@ -245,7 +245,7 @@ def real():
     ride = jk.simulate(system, jk.State(jnp.array([0.6]), jnp.array([-0.9])), jnp.asarray(t))
     (name,), (speed,) = system.coordinates, system.speeds
     trial = jk.fit.Trial(t, {name: np.asarray(ride[name])}, sigma=0.01, initial={name: 0.6, speed: -0.9})
-    return jk.fit.fit(system, [trial], ("damping",), method="least_squares", steps=1)
+    return jk.fit.fit(system, [trial], ("damping",), optimizer=jk.fit.LeastSquares(), steps=1)
 
 
 def test_a_real_fit_is_drawn(real):

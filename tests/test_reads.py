@@ -239,7 +239,7 @@ class Holder(eqx.Module):
 def test_sweeps_fits_models_and_forces_follow(monkeypatch):
     table = {"mass": np.array([1.0, 2.0])}
     trial = jk.fit.Trial(TS, {"x": fall(1.62) * (TS / TS[-1]) ** 2}, sigma=1.0)
-    problem = jk.fit.Problem.of(Drop(), trial, ["mass"], **SHORT)
+    problem = jk.fit.Problem.of(Drop(), trial, ["mass"], simulation=jk.fit.Simulation(**SHORT))
 
     def now():
         rides = jk.sweep.sweep(Drop(), REST, TS, table=table, reduce=lambda ride: ride["x"][-1], **SHORT)

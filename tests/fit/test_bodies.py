@@ -7,7 +7,7 @@ import pytest
 
 import jaxkane as jk
 from jaxkane.catalog import RigidBody, WhippleBicycle
-from jaxkane.fit import Free, Inertia, PossibleBody, Problem, Trial, frame_inertia, least_squares
+from jaxkane.fit import Free, Inertia, LeastSquares, PossibleBody, Problem, Trial, frame_inertia, minimize
 from jaxkane.fit._problem.parameters import parameters_of
 
 BICYCLE = WhippleBicycle.benchmark()
@@ -97,7 +97,7 @@ def test_a_free_rotation_is_identified_by_possible_bodies_only():
         return lambda point, cost: seen.append(problem.parameters.apply(guess, point.x)[0])
 
     problem = Problem.of(guess, trials, Inertia(MOMENTS, mass="mass", fixed=("mass",)), **options)
-    result = least_squares(problem, callback=watch(problem))
+    result = minimize(problem, LeastSquares(), callback=watch(problem))
     assert result.status == "converged"
     assert len(seen) > 3
     assert all(is_possible([1.0, 0, 0, 0, s.I11, s.I22, s.I33, 0, 0, 0]) for s in seen)
@@ -106,5 +106,5 @@ def test_a_free_rotation_is_identified_by_possible_bodies_only():
     # Each moment by itself, positive as it is, leads to what no body can be.
     seen.clear()
     problem = Problem.of(guess, trials, MOMENTS, **options)
-    least_squares(problem, callback=watch(problem))
+    minimize(problem, LeastSquares(), callback=watch(problem))
     assert not all(is_possible([1.0, 0, 0, 0, s.I11, s.I22, s.I33, 0, 0, 0]) for s in seen)

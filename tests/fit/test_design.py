@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from systems import Track
 
-from jaxkane.fit import Problem, Trial, design, least_squares
+from jaxkane.fit import LeastSquares, Problem, Trial, design, minimize
 from jaxkane.fit._analysis.design import _covariance, goal_of
 
 t = np.arange(0.0, 4.0, 0.1)
@@ -56,7 +56,7 @@ def test_a_designed_push_tells_more_and_as_much_as_it_says():
     assert list(plan.standard_errors.values()) == pytest.approx(after, rel=1e-4)
     # The plan is one motion through all windows, and what a fit of such a trial finds.
     np.testing.assert_allclose(plan.trial.measured["x"], 0.1 + motion, atol=1e-9)
-    seen = least_squares(Problem.of(Track(), plan.trial, names, **CHAIN))
+    seen = minimize(Problem.of(Track(), plan.trial, names, **CHAIN), LeastSquares())
     assert seen.cost < 1e-12
     of_fit = np.sqrt(np.diag(np.linalg.inv(seen.identifiability.information)))
     assert list(plan.standard_errors.values()) == pytest.approx(of_fit, rel=1e-4)

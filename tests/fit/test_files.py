@@ -8,7 +8,18 @@ import pytest
 from systems import Track
 
 import jaxkane.fit._problem.problem as posing
-from jaxkane.fit import Problem, Trial, gradient_descent, least_squares, multi_start, profile, read_trials
+from jaxkane.fit import (
+    BFGS,
+    GradientDescent,
+    LeastSquares,
+    Problem,
+    Simulation,
+    Trial,
+    minimize,
+    multi_start,
+    profile,
+    read_trials,
+)
 from jaxkane.fit._problem.problem import cost, linearize
 from jaxkane.sweep import grid
 
@@ -24,7 +35,7 @@ def pose(**options):
 
 @pytest.fixture(scope="module")
 def problem():
-    return pose(step=0.1)
+    return pose(simulation=Simulation(step=0.1))
 
 
 def after(n):
@@ -39,8 +50,9 @@ def after(n):
     return callback
 
 
-def kept(problem, path, method=gradient_descent, **options):
-    assert method(problem, steps=5, checkpoint=path, callback=after(1), **options).status == "interrupted"
+def kept(problem, path, method=None):
+    method = GradientDescent() if method is None else method
+    assert minimize(problem, method, steps=5, checkpoint=path, callback=after(1)).status == "interrupted"
     return path
 
 
@@ -53,30 +65,34 @@ OPTIMIZERS = {
 
 @pytest.mark.parametrize("name", OPTIMIZERS)
 def test_a_descent_goes_on_with_its_own_optimizer_only(name, problem, tmp_path):
-    path = kept(problem, tmp_path / "fit.npz", optimizer=OPTIMIZERS[name]())
+    path = kept(problem, tmp_path / "fit.npz", GradientDescent(OPTIMIZERS[name]()))
     for other in OPTIMIZERS.values():
         for optimizer in (other(0.2), *([other()] if other is not OPTIMIZERS[name] else [None])):
             with pytest.raises(ValueError, match=r"fit.npz is the state of another fit. It differs in optimizer \("):
-                gradient_descent(problem, steps=5, checkpoint=path, optimizer=optimizer)
-    resumed = gradient_descent(problem, steps=5, checkpoint=path, optimizer=OPTIMIZERS[name]())
-    whole = gradient_descent(problem, steps=5, optimizer=OPTIMIZERS[name]())
+                minimize(problem, GradientDescent(optimizer), steps=5, checkpoint=path)
+    resumed = minimize(problem, GradientDescent(OPTIMIZERS[name]()), steps=5, checkpoint=path)
+    whole = minimize(problem, GradientDescent(OPTIMIZERS[name]()), steps=5)
     assert resumed.history == pytest.approx(whole.history, rel=1e-12)
 
 
 def test_a_checkpoint_says_in_what_another_fit_differs(problem, tmp_path):
     path = kept(problem, tmp_path / "fit.npz")
     others = {
-        r"method \(gradient descent there, Levenberg-Marquardt here\)": lambda: least_squares(problem, checkpoint=path),
-        r"refresh \(10 there, 3 here\)": lambda: gradient_descent(problem, refresh=3, checkpoint=path),
-        r"free parameters \(gain, drift there, gain here\)": lambda: gradient_descent(
-            Problem.of(Track(), problem.trials, ["gain"], step=0.1), checkpoint=path
+        r"method \(gradient descent there, Levenberg-Marquardt here\)": lambda: minimize(
+            problem, LeastSquares(), checkpoint=path
         ),
-        r"rtol \(": lambda: gradient_descent(pose(rtol=1e-9), checkpoint=path),
-        r"first guesses, priors \(": lambda: gradient_descent(
-            problem.with_priors({"gain": (1.0, 0.1)}), checkpoint=path
+        r"refresh \(10 there, 3 here\)": lambda: minimize(problem, GradientDescent(refresh=3), checkpoint=path),
+        r"free parameters \(gain, drift there, gain here\)": lambda: minimize(
+            Problem.of(Track(), problem.trials, ["gain"], simulation=Simulation(step=0.1)),
+            GradientDescent(),
+            checkpoint=path,
         ),
-        r"unknown starts \(none there, x here\)": lambda: gradient_descent(
-            pose(step=0.1, unknown=["x"]), checkpoint=path
+        r"rtol \(": lambda: minimize(pose(simulation=Simulation(rtol=1e-9)), GradientDescent(), checkpoint=path),
+        r"initial guesses, priors \(": lambda: minimize(
+            problem.with_priors({"gain": (1.0, 0.1)}), GradientDescent(), checkpoint=path
+        ),
+        r"unknown starts \(none there, x here\)": lambda: minimize(
+            pose(unknown=["x"], simulation=Simulation(step=0.1)), GradientDescent(), checkpoint=path
         ),
     }
     before = path.read_bytes()
@@ -88,13 +104,13 @@ def test_a_checkpoint_says_in_what_another_fit_differs(problem, tmp_path):
 
 @pytest.mark.parametrize("how", ["empty", "zeros", "cut", "text", "older"])
 def test_a_checkpoint_that_cannot_be_read_is_named(how, problem, tmp_path):
-    path = kept(problem, tmp_path / "fit.npz", least_squares)
+    path = kept(problem, tmp_path / "fit.npz", LeastSquares())
     data = path.read_bytes()
     path.write_bytes({"empty": b"", "zeros": bytes(500), "cut": data[:-40], "text": b"thesis"}.get(how, data))
     if how == "older":
         np.savez(path, key=np.array("3f" * 32), damping=np.ones(()))
     with pytest.raises(ValueError, match=r"fit.npz cannot be read as the state of a fit .*Delete it, or name another"):
-        least_squares(problem, checkpoint=path)
+        minimize(problem, LeastSquares(), checkpoint=path)
     assert [p.name for p in tmp_path.iterdir()] == ["fit.npz"]
 
 
@@ -102,9 +118,9 @@ def test_a_checkpoint_that_cannot_be_read_is_named(how, problem, tmp_path):
 def test_bfgs_keeps_the_best_when_it_is_interrupted(problem, monkeypatch):
     from jaxkane.fit._optimize import bfgs
 
-    whole = bfgs(problem)
+    whole = minimize(problem, BFGS())
     assert whole.status == "converged"
-    assert bfgs(problem, steps=2).status == "steps"
+    assert minimize(problem, BFGS(), steps=2).status == "steps"
     step, calls = bfgs._step, []
 
     def interrupted(*args):
@@ -114,32 +130,32 @@ def test_bfgs_keeps_the_best_when_it_is_interrupted(problem, monkeypatch):
         return step(*args)
 
     monkeypatch.setattr(bfgs, "_step", interrupted)
-    best = bfgs(problem)
+    best = minimize(problem, BFGS())
     assert best.status == "interrupted"
     assert whole.cost <= best.cost < best.history[0]
     assert best.cost == pytest.approx(cost(problem, best.point), rel=1e-10)
     assert len(best.history) == 7
     calls += [1] * 10
-    at_once = bfgs(problem)
+    at_once = minimize(problem, BFGS())
     assert at_once.status == "interrupted"
     assert at_once.cost == at_once.history[0]
 
 
 def test_many_starts_end_with_ctrl_c(problem):
     once = after(3)
-    found = multi_start(problem, 4, method=least_squares, callback=once, steps=20)
+    found = multi_start(problem, 4, callback=once, steps=20)
     assert [f.status for f in found.fits].count("interrupted") == 1
     assert len(found.fits) + found.untried == 4
     assert found.untried > 0
-    assert f"Interrupted: {found.untried} more first guesses were not tried" in str(found)
+    assert f"Interrupted: {found.untried} more initial guesses were not tried" in str(found)
 
 
 def test_studies_of_fits_end_with_ctrl_c(problem, monkeypatch):
     import jaxkane.fit._analysis.profile as module
 
-    fit = least_squares(problem)
-    stopped = lambda *args, **options: least_squares(*args, **{**options, "callback": after(0)})  # noqa: E731
-    monkeypatch.setattr(module, "least_squares", stopped)
+    fit = minimize(problem, LeastSquares())
+    stopped = lambda *args, **options: minimize(*args, **{**options, "callback": after(0)})  # noqa: E731
+    monkeypatch.setattr(module, "minimize", stopped)
     with pytest.raises(KeyboardInterrupt):
         profile(fit, "gain")
 

@@ -9,7 +9,18 @@ import pytest
 
 import jaxkane as jk
 from jaxkane.catalog import DoublePendulum
-from jaxkane.fit import Free, Gain, Problem, Trial, fit, gradient_descent, identifiability, least_squares
+from jaxkane.fit import (
+    Free,
+    Gain,
+    GradientDescent,
+    LeastSquares,
+    Problem,
+    Simulation,
+    Trial,
+    fit,
+    identifiability,
+    minimize,
+)
 from jaxkane.fit._problem.blocks import Blocks, eliminate
 from jaxkane.fit._problem.problem import linearize
 
@@ -111,22 +122,22 @@ def check(result):
 
 
 def test_least_squares(problem):
-    check(least_squares(problem))
+    check(minimize(problem, LeastSquares()))
 
 
 def test_gradient_descent(problem):
-    result = gradient_descent(problem)
+    result = minimize(problem, GradientDescent())
     check(result)
     assert len(result.history) < 60
     assert result.history[-1] < 0.2 * result.history[0]
 
 
 def test_any_optax_optimizer(problem):
-    check(gradient_descent(problem, optimizer=optax.adam(optax.cosine_decay_schedule(0.2, 100)), rtol=1e-4))
+    check(minimize(problem, GradientDescent(optax.adam(optax.cosine_decay_schedule(0.2, 100)), rtol=1e-4)))
 
 
 def test_plain_coordinates_go_down(problem):
-    result = gradient_descent(problem, refresh=None, steps=5)
+    result = minimize(problem, GradientDescent(refresh=None), steps=5)
     assert result.status == "steps"
     assert result.cost < result.history[0]
 
@@ -143,7 +154,7 @@ def test_an_interrupted_fit_keeps_the_best(problem, monkeypatch):
         return linearize(*arguments)
 
     monkeypatch.setattr(module, "linearize", interrupted)
-    result = gradient_descent(problem)
+    result = minimize(problem, GradientDescent())
     assert result.status == "interrupted"
     assert "best so far" in result.message
     assert len(result.history) == 5
@@ -152,7 +163,7 @@ def test_an_interrupted_fit_keeps_the_best(problem, monkeypatch):
 
 def test_steps_into_nowhere_are_halved(problem):
     leap = optax.sgd(1e6)
-    result = gradient_descent(problem, optimizer=leap, steps=2)
+    result = minimize(problem, GradientDescent(leap), steps=2)
     assert np.all(np.isfinite(result.history))
     assert np.isfinite(result.cost)
 
@@ -166,7 +177,7 @@ def test_a_parameter_without_influence_is_named(swings):
     assert any("mass has no influence" in text for text in seen.messages)
     assert any("length, gravity trade off" in t or "gravity, length trade off" in t for t in seen.messages)
     assert seen.singular_values[-1] == 0.0
-    result = fit(GUESS, quiet, ("mass", "length"), method="least_squares", **OPTIONS)
+    result = fit(GUESS, quiet, ("mass", "length"), optimizer=LeastSquares(), **OPTIONS)
     assert not result.ok
     assert result.estimates["mass"] == 1.0
     assert np.isinf(result.standard_errors["mass"])
@@ -175,5 +186,5 @@ def test_a_parameter_without_influence_is_named(swings):
 
 
 def test_a_start_that_cannot_be_simulated_is_named(swings):
-    with pytest.raises(ValueError, match=r"1\.5 s: from 0 to 0\.68 s the first guess gives no finite residuals"):
-        fit(GUESS, swings, "mass", max_steps=1, **OPTIONS)
+    with pytest.raises(ValueError, match=r"1\.5 s: from 0 to 0\.68 s the initial guess gives no finite residuals"):
+        fit(GUESS, swings, "mass", simulation=Simulation(max_steps=1), **OPTIONS)

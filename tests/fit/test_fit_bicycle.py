@@ -12,13 +12,15 @@ import jaxkane as jk
 from jaxkane.catalog import WhippleBicycle
 from jaxkane.fit import (
     Gain,
+    GradientDescent,
+    LeastSquares,
     Problem,
     Trial,
     bicycle_priors,
     cross_validate,
     fit_bicycle,
     frame_inertia,
-    least_squares,
+    minimize,
     multi_start,
     read_trials,
 )
@@ -102,7 +104,7 @@ def test_an_unstable_bicycle_from_ten_first_guesses(unstable):
 def test_bodies_of_a_bicycle_stay_possible(unstable):
     truth, trial, options = unstable
     rear = frame_inertia("B", fixed=("mB", "xB"))
-    result = least_squares(Problem.of(truth, trial, rear, window=1.0, **options), steps=6)
+    result = minimize(Problem.of(truth, trial, rear, window=1.0, **options), LeastSquares(), steps=6)
     assert set(result.names) == {"zB", "IBxx", "IByy", "IBzz", "IBxz"}
     assert not any("Not a possible body" in note for note in result.notes)
     assert abs(result.estimates["zB"] + 0.9) < 4.0 * result.standard_errors["zB"]
@@ -135,10 +137,10 @@ OPTIONS = {"input_bias": ("roll_torque", "steer_torque"), "hold": ("steer_torque
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("method", ["gradient_descent", "least_squares"])
+@pytest.mark.parametrize("method", [GradientDescent(), LeastSquares()], ids=lambda m: m.name)
 def test_steer_damping_of_a_measured_bicycle(measured, method):
     rides, bicycle = measured
-    result = fit_bicycle(rides, bicycle, "steer_damping", method=method, **OPTIONS)
+    result = fit_bicycle(rides, bicycle, "steer_damping", optimizer=method, **OPTIONS)
     assert result.ok, result.message
     assert len(rides) == 31
     assert result.history[0] > 20000
@@ -151,13 +153,13 @@ def test_steer_damping_of_a_measured_bicycle(measured, method):
 def test_four_parameters_of_a_measured_bicycle(measured):
     rides, bicycle = measured
     free = (Gain("steer_torque"), "steer_damping", "IHzz", "c")
-    result = fit_bicycle(rides, bicycle, free, method="least_squares", **OPTIONS)
+    result = fit_bicycle(rides, bicycle, free, optimizer=LeastSquares(), **OPTIONS)
     assert result.status == "converged"
     assert result.cost < 2730
     # What no fork can be is said, and what no such bicycle has.
     assert any("Not a possible body" in note and "fork" in note for note in result.notes)
     assert any(note.startswith("c went to 0.26 times") and "implausible" in note for note in result.notes)
-    more = fit_bicycle(rides, bicycle, (*free, "IBxx"), method="least_squares", **OPTIONS)
+    more = fit_bicycle(rides, bicycle, (*free, "IBxx"), optimizer=LeastSquares(), **OPTIONS)
     assert any(note.startswith("IBxx went to") and "implausible" in note for note in more.notes)
     # Rides left out are fitted almost as well.
     assert cross_validate(result).score > 0.85

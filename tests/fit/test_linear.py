@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from systems import Track
 
-from jaxkane.fit import Free, Problem, Trial, cross_validate, laplace, least_squares, profile
+from jaxkane.fit import Free, LeastSquares, Problem, Trial, cross_validate, laplace, minimize, profile
 
 TIGHT = 1e-6
 t = np.arange(0.0, 4.0, 0.1)
@@ -94,7 +94,7 @@ OPTIONS = {"unknown": ("x", "x_dot"), "sensor_bias": {"x": BIAS}}
 
 def fitted(records, *free, start=None, **options):
     problem = Problem.of(Track() if start is None else start, trials_of(records), free, **(OPTIONS | options))
-    return least_squares(problem, rtol=1e-14, damping=1e-7)
+    return minimize(problem, LeastSquares(rtol=1e-14, damping=1e-7))
 
 
 @pytest.fixture(scope="module", params=[0.0, 0.2], ids=["noise", "wander"])
@@ -181,7 +181,9 @@ def test_the_evidence_is_the_density_of_the_data():
     at_rest = trials_of(records, initial={"x": 0.0, "x_dot": 0.0})
     free = (Free("gain", prior=(1.0, 0.5), scale=7.0), Free("drift", prior=(0.0, 2.0)))
     starts = {"x": 0.4, "x_dot": 0.3}
-    gaussian = laplace(least_squares(Problem.of(Track(), at_rest, free, **(OPTIONS | {"unknown": starts})), rtol=1e-14))
+    gaussian = laplace(
+        minimize(Problem.of(Track(), at_rest, free, **(OPTIONS | {"unknown": starts})), LeastSquares(rtol=1e-14))
+    )
     y, sigma = np.concatenate(records), np.tile(SIGMA, N)
     y, sigma = y[np.isfinite(y)], sigma[np.isfinite(y)]
     A = dense(records)[0][: -N - 1] * sigma[:, None]
@@ -259,7 +261,7 @@ def test_the_verdict_does_not_know_units():
         for trial in trials:
             trial.inputs["push"] = trial.inputs["push"] * unit
         problem = Problem.of(Track(gain=1.1 / unit, drift=0.2), trials, ("gain", "drift"), **OPTIONS)
-        return least_squares(problem, rtol=1e-12)
+        return minimize(problem, LeastSquares(rtol=1e-12))
 
     for noise in (0.0, 300.0):
         one, other = told(1.0, noise), told(1e-3, noise)

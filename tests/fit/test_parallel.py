@@ -51,8 +51,8 @@ model.each = lambda f, args: (windows.append(jax.tree.leaves(args)[0].shape[0]),
 def fitted(given):
     return jk.fit.fit(
         Pendulum(mass=1.5, length=1.0), given, ("mass", "length"),
-        unknown=("angle", "rate"), window=0.5, step=0.0625, sensor_bias=("rate",),
-        method="least_squares", processes=True)
+        unknown=("angle", "rate"), window=0.5, simulation=jk.fit.Simulation(step=0.0625), sensor_bias=("rate",),
+        optimizer=jk.fit.LeastSquares(), processes=True)
 
 found = fitted(trials)
 values = {"estimates": found.estimates, "errors": found.standard_errors, "cost": found.cost,

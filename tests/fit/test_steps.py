@@ -8,7 +8,18 @@ import scipy.special
 from scipy import stats
 from systems import Cart
 
-from jaxkane.fit import Free, Problem, Trial, bfgs, fit, gradient_descent, laplace, least_squares
+from jaxkane.fit import (
+    BFGS,
+    Free,
+    GradientDescent,
+    LeastSquares,
+    Problem,
+    Simulation,
+    Trial,
+    fit,
+    laplace,
+    minimize,
+)
 
 H, SIGMA = 0.25, 0.001
 t = np.arange(0.0, 10.0, H)
@@ -53,7 +64,7 @@ def by_exact_motion(trial):
 
 def test_few_samples_a_period_have_no_bias(trial, by_exact_motion):
     best, errors = by_exact_motion
-    found = fit(GUESS, trial, NAMES, method="least_squares")
+    found = fit(GUESS, trial, NAMES, optimizer=LeastSquares())
     assert found.ok, found.message
     assert found.step_error < found.problem.step_tolerance
     # The tolerance bounds what the steps do to the estimates.
@@ -64,8 +75,8 @@ def test_steps_too_coarse_are_told_or_halved(trial):
     # Slow where it starts: the steps that are chosen there are too coarse where it ends.
     slow = Cart(mass=1.0, stiffness=350.0, damping=40.0)
     problem = Problem.of(slow, trial, NAMES)
-    direct = least_squares(problem)
-    told = fit(GUESS, trial, NAMES, method="least_squares", step=H / 4)
+    direct = minimize(problem, LeastSquares())
+    told = fit(GUESS, trial, NAMES, optimizer=LeastSquares(), simulation=Simulation(step=H / 4))
     assert float(told.problem.windows.step[0]) == H / 4
     for one in (told, direct):
         assert one.status == "converged"
@@ -73,15 +84,15 @@ def test_steps_too_coarse_are_told_or_halved(trial):
         assert not one.ok
         assert "is too coarse where the fit ended" in one.message
         assert one.message.split("; ")[-1] + "." in str(one)
-    finer = fit(slow, trial, NAMES, method="least_squares")
+    finer = fit(slow, trial, NAMES, optimizer=LeastSquares())
     assert finer.ok
     assert finer.problem.windows.step[0] < problem.windows.step[0]
     assert len(finer.history) > len(direct.history)
 
 
 def test_what_says_how_to_integrate(trial):
-    assert Problem.of(GUESS, trial, NAMES, atol=1e-9).model.settings.step is None
-    assert Problem.of(GUESS, trial, NAMES, step=1e-3).model.settings.max_steps is None
+    assert Problem.of(GUESS, trial, NAMES, simulation=Simulation(atol=1e-9)).model.settings.step is None
+    assert Problem.of(GUESS, trial, NAMES, simulation=Simulation(step=1e-3)).model.settings.max_steps is None
     for options, message in (
         ({"step": 0.1, "rtol": 1e-6}, "`step` fixes the step of integration"),
         ({"step": float("nan")}, "`step` must be positive and finite"),
@@ -89,20 +100,23 @@ def test_what_says_how_to_integrate(trial):
         ({"max_steps": 0}, "`max_steps` must be positive"),
     ):
         with pytest.raises(ValueError, match=message):
-            Problem.of(GUESS, trial, NAMES, **options)
+            Simulation(**options)
 
 
 def test_more_fixed_steps_than_any_default_allows(trial):
     # 10 s by steps of 1 ms are more than 4096.
-    found = least_squares(Problem.of(GUESS, trial, NAMES, step=1e-3))
+    found = minimize(Problem.of(GUESS, trial, NAMES, simulation=Simulation(step=1e-3)), LeastSquares())
     assert found.ok, found.message
 
 
 def test_the_evidence_by_quadrature(trial, by_exact_motion):
     (k, c), errors = by_exact_motion
     priors = {"stiffness": (395.0, 4.0), "damping": (2.0, 0.5)}
-    found = least_squares(
-        Problem.of(GUESS, trial, [Free(name, prior=prior) for name, prior in priors.items()], step=1e-3)
+    found = minimize(
+        Problem.of(
+            GUESS, trial, [Free(name, prior=prior) for name, prior in priors.items()], simulation=Simulation(step=1e-3)
+        ),
+        LeastSquares(),
     )
     grid = np.linspace(-6.0, 6.0, 25)
     K, C = np.meshgrid(k + errors[0] * grid, c + errors[1] * grid, indexing="ij")
@@ -117,12 +131,12 @@ def beyond():
     """Data of a spring that pushes: the minimum lies where a stiffness, declared positive, cannot be simulated."""
     pushed = Trial(t, {"x": exact(-0.05, 2.0)}, {"push": PUSH}, sigma=SIGMA, initial={"x": 0.1, "x_dot": 0.0})
     guess = Cart(mass=1.0, stiffness=0.5, damping=2.0)
-    return Problem.of(guess, pushed, Free("stiffness", bounds=(None, None)), step=0.05)
+    return Problem.of(guess, pushed, Free("stiffness", bounds=(None, None)), simulation=Simulation(step=0.05))
 
 
-@pytest.mark.parametrize("method", [least_squares, gradient_descent, bfgs])
+@pytest.mark.parametrize("method", [LeastSquares(), GradientDescent(), BFGS()], ids=lambda m: m.name)
 def test_no_method_converges_where_nothing_can_be_simulated(beyond, method):
-    found = method(beyond)
+    found = minimize(beyond, method)
     assert found.status in ("stuck", "steps"), found
     assert not found.ok
     assert np.isfinite(found.cost)

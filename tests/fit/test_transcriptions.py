@@ -7,8 +7,19 @@ import scipy.linalg
 from systems import Cart
 
 import jaxkane as jk
-from jaxkane.fit import Delay, Free, Gain, Problem, Trial, bfgs, gauss_newton, gradient_descent, least_squares
-from jaxkane.fit._optimize.steps import settle
+from jaxkane.fit import (
+    BFGS,
+    Delay,
+    Free,
+    Gain,
+    GradientDescent,
+    LeastSquares,
+    Problem,
+    Simulation,
+    Trial,
+    minimize,
+)
+from jaxkane.fit._optimize.steps import solve_nuisance
 from jaxkane.fit._problem.blocks import Blocks, eliminate
 
 TRUTH = Cart(mass=1.3, stiffness=5.0, damping=0.4)
@@ -70,9 +81,15 @@ def test_short_chained_windows_are_a_kalman_filter():
     jump = {"x": 0.01, "x_dot": 0.05}
     start = {"x": 0.5, "x_dot": 1.0}
     problem = Problem.of(
-        TRUTH, trial, "mass", unknown=start, window=0.05, continuity=jump, rtol=1e-10, atol=1e-10, solver=None
+        TRUTH,
+        trial,
+        "mass",
+        unknown=start,
+        window=0.05,
+        continuity=jump,
+        simulation=Simulation(rtol=1e-10, atol=1e-10, solver=None),
     )
-    least = settle(problem, problem.start, rtol=1e-12)[1].cost  # over all starts, the mass held
+    least = solve_nuisance(problem, problem.start, rtol=1e-12)[1].cost  # over all starts, the mass held
 
     # The same motion by a Kalman filter: x_dot = F x + G push, push linear between samples.
     m, k, c = (float(getattr(TRUTH, name)) for name in ("mass", "stiffness", "damping"))
@@ -117,7 +134,7 @@ def problem(runs):
 
 @pytest.fixture(scope="module")
 def result(problem):
-    return least_squares(problem)
+    return minimize(problem, LeastSquares())
 
 
 @pytest.mark.slow
@@ -138,22 +155,22 @@ def test_other_data_and_guesses_compile_nothing(result, runs, problem):
     before = model.blocks_of.compiled._cached._cache_size()
     again = [Trial(r.t, r.measured, r.inputs, sigma=0.02, name="again") for r in runs]
     other = Problem.of(TRUTH, again, FREE, sensor_gain={"x": 0.2}, **UNKNOWN)
-    near(least_squares(other))
+    near(minimize(other, LeastSquares()))
     assert model.blocks_of.compiled._cached._cache_size() == before
 
 
-@pytest.mark.parametrize("method", [gauss_newton, bfgs])
+@pytest.mark.parametrize("method", [LeastSquares(damping=0.0), BFGS()], ids=lambda m: m.name)
 def test_other_methods_find_the_same(problem, result, method):
-    found = method(problem)
+    found = minimize(problem, method)
     assert found.status == "converged"
     assert found.cost == pytest.approx(result.cost, rel=1e-4)
     for name, value in result.estimates.items():
         assert found.estimates[name] == pytest.approx(value, abs=0.3 * result.standard_errors[name])
 
 
-@pytest.mark.parametrize("method", [least_squares, gradient_descent])
+@pytest.mark.parametrize("method", [LeastSquares(), GradientDescent(), BFGS()], ids=lambda m: m.name)
 def test_an_interrupted_fit_goes_on_from_its_file(problem, method, tmp_path):
-    whole = method(problem, steps=6)
+    whole = minimize(problem, method, steps=6)
     calls = []
 
     def interrupt(point, cost):
@@ -162,12 +179,12 @@ def test_an_interrupted_fit_goes_on_from_its_file(problem, method, tmp_path):
             raise KeyboardInterrupt
 
     path = tmp_path / "fit.npz"
-    assert method(problem, steps=6, checkpoint=path, callback=interrupt).status == "interrupted"
-    resumed = method(problem, steps=6, checkpoint=path)
+    assert minimize(problem, method, steps=6, checkpoint=path, callback=interrupt).status == "interrupted"
+    resumed = minimize(problem, method, steps=6, checkpoint=path)
     assert resumed.history == pytest.approx(whole.history, rel=1e-12)
     np.testing.assert_allclose(resumed.point.x, whole.point.x, rtol=1e-12)
     with pytest.raises(ValueError, match="is the state of another fit"):
-        method(problem.only([0]), checkpoint=path)
+        minimize(problem.only([0]), method, checkpoint=path)
 
 
 @pytest.mark.slow
@@ -176,10 +193,10 @@ def test_a_start_from_which_the_end_is_out_of_reach():
     t = np.arange(0.0, 8.0, 0.05)
     far = Cart(mass=1.3, stiffness=80.0, damping=0.4)
     problem = Problem.of(far, record(t, 3), ("stiffness", "damping"), unknown=("x", "x_dot"))
-    grown = least_squares(problem, horizons=(0.1, 0.3))
+    grown = minimize(problem, LeastSquares(horizons=(0.1, 0.3)))
     near(grown, names=("stiffness", "damping"))
     assert grown.cost < 1.3 * t.size
-    assert least_squares(problem).cost > 10 * grown.cost
+    assert minimize(problem, LeastSquares()).cost > 10 * grown.cost
 
 
 @pytest.mark.slow
@@ -198,7 +215,7 @@ def test_process_noise_is_taken_for_what_it_is():
     options = {"unknown": ("x", "x_dot"), "window": 0.25}
     jump = {"x": 0.005, "x_dot": 0.05}
     names = ("mass", "stiffness", "damping")
-    chained = least_squares(Problem.of(GUESS, trials, names, continuity=jump, **options))
+    chained = minimize(Problem.of(GUESS, trials, names, continuity=jump, **options), LeastSquares())
     near(chained)
     assert 0.5 < chained.variance < 2.0
 
@@ -215,6 +232,6 @@ def test_tied_parameters_and_gains():
     problem = Problem.of(TRUTH, twice, free, unknown=("x", "x_dot"))
     system, _ = problem.parameters.apply(TRUTH, jnp.array([0.1, 0.0]))
     assert float(system.damping) == pytest.approx(0.08 * float(system.stiffness))
-    result = least_squares(problem)
+    result = minimize(problem, LeastSquares())
     assert result.estimates["gain of push"] == pytest.approx(2.0, abs=0.05)
     assert float(result.system.damping) == pytest.approx(0.4, abs=0.02)

@@ -13,20 +13,22 @@ import jaxkane.fit._analysis.signs as signs
 from jaxkane.fit import (
     Fit,
     Free,
+    LeastSquares,
     Problem,
+    Simulation,
     Trial,
     applied_to,
     contrary_signs,
     cross_validate,
     laplace,
-    least_squares,
     log_density,
+    minimize,
     multi_start,
     profile,
     report,
     save_report,
 )
-from jaxkane.fit._optimize.steps import settle
+from jaxkane.fit._optimize.steps import solve_nuisance
 from jaxkane.fit._result.notes import contrary_rates, doubled_trials, empty_columns
 from jaxkane.fit._result.residuals import residual_test
 
@@ -47,13 +49,13 @@ def problem(trials):
 
 @pytest.fixture(scope="module")
 def result(problem) -> Fit:
-    return least_squares(problem)
+    return minimize(problem, LeastSquares())
 
 
 def again(problem, trials):
     """The same fit of other data of the same shape."""
     other = Problem.of(GUESS, trials, problem.parameters.names, **UNKNOWN)
-    return least_squares(other)
+    return minimize(other, LeastSquares())
 
 
 def test_intervals_hold_the_truth_as_often_as_they_say(problem):
@@ -64,7 +66,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(problem):
     for _ in range(n):
         noisy = [Trial(T, {"x": c.measured["x"] + rng.normal(0, 0.01, T.size)}, c.inputs, sigma=0.02) for c in clean]
         other = Problem.of(GUESS, noisy, NAMES, **UNKNOWN)
-        found = least_squares(other, start=start)
+        found = minimize(other, LeastSquares(), start=start)
         start = start or found.point
         hits += [low <= float(getattr(TRUTH, name)) <= high for name, (low, high) in found.intervals(level).items()]
     # 32 of 40 are expected; a binomial count is outside 24 to 38 once in a hundred.
@@ -143,7 +145,7 @@ def test_many_first_guesses(problem, result):
     assert len(found.fits) == found.agreeing == 4
     assert found.best.cost == pytest.approx(result.cost, rel=1e-4)
     assert all(spread < 0.1 * result.standard_errors[name] for name, spread in found.spread.items())
-    assert "4 of 4 first guesses end at the best" in str(found)
+    assert "4 of 4 initial guesses end at the best" in str(found)
 
 
 def test_the_density_is_that_of_the_residuals(problem, result):
@@ -178,11 +180,11 @@ def test_laplace_has_the_errors_of_given_sigma(problem, result):
     evidence = []
     for width in (20.0, 10.0):
         known = {name: (value, width * abs(value)) for name, value in result.estimates.items()}
-        evidence.append(laplace(least_squares(problem.with_priors(known), start=result.point)).log_evidence)
+        evidence.append(laplace(minimize(problem.with_priors(known), LeastSquares(), start=result.point)).log_evidence)
     # Half of each of the two that are positive is cut off, a little less of the narrower.
     assert evidence[1] - evidence[0] == pytest.approx(3 * np.log(2.0), abs=0.1)
     with pytest.raises(ValueError, match="This is no minimum"):
-        laplace(least_squares(problem, steps=1))
+        laplace(minimize(problem, LeastSquares(), steps=1))
 
 
 @pytest.mark.slow
@@ -190,7 +192,7 @@ def test_laplace_has_the_errors_of_given_sigma(problem, result):
 def test_samplers_find_the_laplace_approximation(package):
     sampler, key = pytest.importorskip(package), jax.random.key(0)
     begun = record(T, 0, initial={"x": 0.2, "x_dot": 0.0})
-    mode = least_squares(Problem.of(GUESS, begun, ("mass", "stiffness"), step=0.1))
+    mode = minimize(Problem.of(GUESS, begun, ("mass", "stiffness"), simulation=Simulation(step=0.1)), LeastSquares())
     density = jax.jit(log_density(mode.problem, over="x"))
     with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
         if package == "numpyro":
@@ -212,7 +214,7 @@ def test_samplers_find_the_laplace_approximation(package):
 
 
 def test_priors_are_weighed_and_told(problem, result):
-    told = least_squares(problem.with_priors({"mass": (1.0, 1e-4), "other": (0.0, 1.0)}), start=result.point)
+    told = minimize(problem.with_priors({"mass": (1.0, 1e-4), "other": (0.0, 1.0)}), LeastSquares(), start=result.point)
     assert told.estimates["mass"] == pytest.approx(1.0, abs=5e-4)
     assert told.standard_errors["mass"] == pytest.approx(1e-4 * told.variance**0.5, rel=0.01)
     # By trial, a prior is a measurement of its own, of the deviation that it was given.
@@ -226,7 +228,7 @@ def test_priors_are_weighed_and_told(problem, result):
 def test_a_wrong_sign_of_an_input(problem, trials, monkeypatch):
     wrong = [Trial(t.t, t.measured, {"push": -t.inputs["push"]}, sigma=0.01, name=t.name) for t in trials]
     found, fits = again(problem, wrong), []
-    monkeypatch.setattr(signs, "settle", lambda *a, **k: fits.append(1) or settle(*a, **k))
+    monkeypatch.setattr(signs, "solve_nuisance", lambda *a, **k: fits.append(1) or solve_nuisance(*a, **k))
     # To print a fit starts no other one.
     assert "`jaxkane.fit.contrary_signs(fit)` tries whether a sign is wrong" in str(found)
     assert not fits
@@ -244,7 +246,7 @@ def test_a_rate_against_its_coordinate_and_a_column_of_zeros(trials):
         for t in trials[:2]
     ]
     rated[1].measured["x_dot"] = np.zeros(T.shape)
-    posed = Problem.of(GUESS, [*rated, rated[1]], NAMES, step=0.1, **UNKNOWN)
+    posed = Problem.of(GUESS, [*rated, rated[1]], NAMES, simulation=Simulation(step=0.1), **UNKNOWN)
     (note,) = contrary_rates(posed)
     assert "run 0: x_dot runs against the change of x" in note
     assert "run 1: x_dot is 0 throughout" in empty_columns(posed)[0]
@@ -253,7 +255,7 @@ def test_a_rate_against_its_coordinate_and_a_column_of_zeros(trials):
 
 def test_what_runs_to_its_bound_is_told_so(trials):
     bounds = (Free("damping", start=1.0, bounds=(0.8, None)), "stiffness")  # it is 0.4
-    found = least_squares(Problem.of(GUESS, trials, bounds, **UNKNOWN))
+    found = minimize(Problem.of(GUESS, trials, bounds, **UNKNOWN), LeastSquares())
     assert found.estimates["damping"] == pytest.approx(0.8, abs=1e-3)
     assert not found.ok
     assert any("damping has gone to its bound" in note for note in found.notes)
@@ -268,7 +270,7 @@ def test_what_trades_off_is_told_in_units(trials):
     # Without a push only the ratios of mass, stiffness and damping show.
     quiet = [Trial(t.t, t.measured, sigma=0.01, name=t.name) for t in trials]
     free = (Free("mass", unit="kg"), Free("stiffness", unit="N/m"), Free("damping", unit="N s/m"))
-    found = least_squares(Problem.of(GUESS, quiet, free, **UNKNOWN))
+    found = minimize(Problem.of(GUESS, quiet, free, **UNKNOWN), LeastSquares())
     assert not found.ok
     (note,) = found.identifiability.messages
     assert "trade off" in note

@@ -3,30 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any
 
-import diffrax
 import numpy as np
 from jaxtyping import Array
 
 from .._description.system import System
 from .._simulation.trajectory import Trajectory
 from ._data.trial import Trial
-from ._optimize.bfgs import bfgs
-from ._optimize.gradient_descent import gradient_descent
-from ._optimize.least_squares import gauss_newton, least_squares
+from ._optimize.gradient_descent import GradientDescent
+from ._optimize.minimize import minimize
+from ._optimize.optimizer import Optimizer
+from ._problem.model import Unknowns
 from ._problem.names import Names
 from ._problem.parameters import Prior
 from ._problem.problem import Problem
+from ._problem.simulation import Simulation
 from ._result.result import Fit
-
-METHODS = {
-    "gradient_descent": gradient_descent,
-    "least_squares": least_squares,
-    "gauss_newton": gauss_newton,
-    "bfgs": bfgs,
-}
 
 
 def fit(
@@ -45,14 +40,14 @@ def fit(
     window: float | None = None,
     continuity: Mapping[str, float] | None = None,
     outputs: Mapping[str, Callable[[Trajectory], Array]] | None = None,
-    method: Literal["gradient_descent", "least_squares", "gauss_newton", "bfgs"] = "gradient_descent",
-    rtol: float | None = None,
-    atol: float | None = None,
-    step: float | None = None,
-    solver: diffrax.AbstractSolver | None = None,
-    max_steps: int | None = None,
     processes: bool = False,
-    **options: Any,
+    simulation: Simulation | None = None,
+    optimizer: Optimizer | None = None,
+    steps: int | None = None,
+    start: Unknowns | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    callback: Callable[[Unknowns, float], None] | None = None,
+    progress: bool = False,
 ) -> Fit:
     """The parameters of a system with which its motion is nearest to what was measured.
 
@@ -60,14 +55,14 @@ def fit(
 
     **Arguments:**
 
-    - `system`: with first guesses of its parameters. `trials`: one `Trial` or several.
+    - `system`: with initial guesses of its parameters. `trials`: one `Trial` or several.
     - `free`: what to find: names, paths, functions to leaves, `Free`, `Gain`, `Delay` and `Inertia`.
     - `unknown`: coordinates and independent speeds whose value at the start of every window is to be found too;
         dependent ones follow from them (`assemble`).
     - `sensor_bias`, `sensor_gain`: channels with an unknown constant offset and factor in every trial. `input_bias`,
         `input_gain`, `input_delay` [s]: inputs with an offset, a factor and a delay of every trial's own.
-    - These are names, or a dict from names to the standard deviation of a Gaussian prior around the first guess (None:
-        no prior).
+    - These are names, or a dict from names to the standard deviation of a Gaussian prior around the initial guess
+        (None: no prior).
     - `priors`: (mean, standard deviation) by name, of parameters that were measured elsewhere; names that are not free
         are passed over.
     - `hold`: inputs that keep each sample until the next, as a digital controller's commands do; the others are linear
@@ -78,23 +73,18 @@ def fit(
         `unknown`; names left out jump freely. Small ones ask for one motion through all windows; with windows as short
         as the samples they are a process noise, and the sum of squares is that of a Kalman filter's prediction errors.
     - `outputs`: channels that are functions of the `Trajectory`, by name: values (n_t,).
-    - `method`: "gradient_descent", "least_squares" (Levenberg-Marquardt), "gauss_newton" or "bfgs"; `options` go to it
-        (`steps`, `start`, `checkpoint`, `progress`, ...).
-    - `rtol`, `atol`, `step`, `solver`, `max_steps`: of the simulation. By default, where inputs vary and neither
-        tolerances nor a step are given, one step of Bosh3 between neighbouring samples, halved until that changes what
-        is simulated by less than a share of the noise, at the first guess and again where the fit ended; elsewhere
-        Tsit5 with a tolerance of 1e-6. `Fit.step_error` says what is left. `max_steps`: by default as many as fixed
-        steps take, and 4096 with tolerances.
     - `processes`: let all processes of `jax.distributed` simulate together. Each is started with the same script,
         calls `jax.distributed.initialize(...)` before anything else, and this with all trials; each simulates a share
         of the windows, all take the same steps and return the same `Fit`, that of one process alone.
+    - `simulation`: how motions are integrated: `Simulation(rtol=1e-8)`, `Simulation(step=0.01)`.
+    - `optimizer`: `GradientDescent()`, `LeastSquares()` (Levenberg-Marquardt; with `damping=0` Gauss-Newton) or
+        `BFGS()`, with their options; by default the first.
+    - `steps`, `start`, `checkpoint`, `callback`, `progress`: of its run, as in `minimize`.
 
     **Returns:** a `Fit`.
 
     **Raises:** `ValueError` that names what is wrong with a trial, a channel, a parameter or a window.
     """
-    if method not in METHODS:
-        raise ValueError(f"`method` is one of {', '.join(METHODS)}; got {method!r}.")
     problem = Problem.of(
         system,
         trials,
@@ -110,28 +100,32 @@ def fit(
         window=window,
         continuity=continuity,
         outputs=outputs,
-        rtol=rtol,
-        atol=atol,
-        step=step,
-        solver=solver,
-        max_steps=max_steps,
+        simulation=simulation,
         processes=processes,
     )
-    return _with_fine_steps(METHODS[method](problem, **options), METHODS[method], options)
+    return solve(problem, optimizer, steps, start, checkpoint, callback, progress)
 
 
-def _with_fine_steps(result: Fit, method: Callable[..., Fit], options: Mapping[str, Any]) -> Fit:
-    """The fit gone on with from where it ended, as long as the steps of integration are too coarse there."""
-    if result.problem.posed["step"] is not None:
-        return result
+def solve(
+    problem: Problem,
+    optimizer: Optimizer | None,
+    steps: int | None,
+    start: Unknowns | None,
+    checkpoint: str | os.PathLike[str] | None,
+    callback: Callable[[Unknowns, float], None] | None,
+    progress: bool,
+) -> Fit:
+    """`minimize`, gone on with from where it ended, as long as the steps of integration are too coarse there."""
+    optimizer = GradientDescent() if optimizer is None else optimizer
+    run: Any = {"steps": steps, "callback": callback, "progress": progress}
+    result = minimize(problem, optimizer, start=start, checkpoint=checkpoint, **run)
     # The file is that of the first steps: what follows begins near its end.
-    options = {key: value for key, value in options.items() if key not in ("start", "checkpoint", "horizons")}
     for _ in range(3):
-        if result.status != "converged" or not result.too_coarse:
+        if not result.problem.chooses_steps or result.status != "converged" or not result.too_coarse:
             break
         problem = result.problem.finer(result.point)
         if np.array_equal(problem.windows.step, result.problem.windows.step):
             break
-        again = method(problem, start=result.point, **options)
+        again = minimize(problem, optimizer.without_preparation(), start=result.point, **run)
         result = dataclasses.replace(again, history=(*result.history, *again.history[1:]))
     return result

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,8 +11,11 @@ import numpy as np
 from ..catalog import WhippleBicycle
 from ..catalog._bicycle_file import read_bicycle_file
 from ._data.trial import Trial
-from ._fit import fit
+from ._fit import solve
+from ._optimize.optimizer import Optimizer
+from ._problem.model import Unknowns
 from ._problem.parameters import Inertia, Prior, parameters_of
+from ._problem.problem import Problem
 from ._result.result import Fit
 
 WHEEL = "rear_wheel_rate"
@@ -25,30 +28,56 @@ def fit_bicycle(
     bicycle: WhippleBicycle,
     free: Any,
     *,
-    unknown: Sequence[str] | Mapping[str, float | None] | None = None,
-    window: float | None = None,
-    input_bias: Sequence[str] | Mapping[str, float | None] = (),
-    priors: Mapping[str, Prior] | str | os.PathLike[str] | None = None,
+    optimizer: Optimizer | None = None,
+    steps: int | None = None,
+    start: Unknowns | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    callback: Callable[[Unknowns, float], None] | None = None,
+    progress: bool = False,
     **options: Any,
 ) -> Fit:
     """The parameters of a bicycle from rides.
 
         fit_bicycle(rides, bicycle, free=("steer_damping",), input_bias=("roll_torque", "steer_torque"), window=1.0)
 
+    **Arguments:** `rides`, `bicycle`, `free` and `options` as in `bicycle_problem`, of which the most used are
+    `unknown`, `window`, `input_bias`, `sensor_bias`, `priors`, `hold` and `simulation`; the rest as in `fit`.
+
+    **Returns:** a `Fit`.
+
+    **Raises:** `ValueError` for a ride without a speed, and what `fit` raises.
+    """
+    problem = bicycle_problem(rides, bicycle, free, **options)
+    return solve(problem, optimizer, steps, start, checkpoint, callback, progress)
+
+
+def bicycle_problem(
+    rides: Sequence[Trial] | Trial,
+    bicycle: WhippleBicycle,
+    free: Any,
+    *,
+    unknown: Sequence[str] | Mapping[str, float | None] | None = None,
+    window: float | None = None,
+    input_bias: Sequence[str] | Mapping[str, float | None] = (),
+    priors: Mapping[str, Prior] | str | os.PathLike[str] | None = None,
+    **options: Any,
+) -> Problem:
+    """What `fit_bicycle` solves: for `identifiability` before rides are measured, or to `load` what was found.
+
     **Arguments:**
 
     - `rides`: `Trial`s with channels such as roll, steer, roll_rate and steer_rate [rad, rad/s], inputs such as
         steer_torque [N m], and `initial={"speed": v}` [m/s] (a number or samples; rear_wheel_rate serves too).
-    - `bicycle`: with first guesses of its parameters. `free`: what to find, as in `fit`.
+    - `bicycle`: with initial guesses of its parameters. `free`: what to find, as in `fit`.
     - `unknown`: what every window starts with besides; by default roll, steer and their rates, and in a ride cut into
         windows the rear wheel's rate, near what is known of the speed (5 %): it changes as the bicycle rolls. Yaw and
         the place start at zero, pitch follows.
     - `input_bias`: inputs with a constant offset in every ride, as of a motor's calibration or a tilted road.
     - `priors`: (mean, standard deviation) by name, or a text file of BicycleParameters, of which those count that were
         measured with a deviation.
-    - `window` and `options`: as in `fit`: `method`, `sensor_bias`, `steps`, `progress`, ...
+    - `window` and `options`: as in `fit`: `sensor_bias`, `simulation`, ...
 
-    **Returns:** a `Fit`.
+    **Returns:** a `Problem`.
 
     **Raises:** `ValueError` for a ride without a speed, and what `fit` raises.
     """
@@ -66,7 +95,8 @@ def fit_bicycle(
         if window is not None:
             known = [np.abs(ride.initial[WHEEL]).max() for ride in rides if WHEEL in ride.initial]
             unknown[WHEEL] = 0.05 * max(known) if known else None
-    return fit(bicycle, rides, free, unknown=unknown, input_bias=input_bias, window=window, priors=priors, **options)
+    posed = {"unknown": unknown, "input_bias": input_bias, "window": window, "priors": priors}
+    return Problem.of(bicycle, rides, free, **posed, **options)
 
 
 def bicycle_rides(rides: Sequence[Trial] | Trial, bicycle: WhippleBicycle) -> tuple[Trial, ...]:

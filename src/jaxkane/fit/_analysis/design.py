@@ -18,7 +18,7 @@ from tqdm import tqdm
 from ..._description.system import System
 from .._data.trial import Trial
 from .._data.windows import Windows
-from .._problem.model import Model, Point, by_next, each, jacobian_of, starts_of
+from .._problem.model import Model, Unknowns, by_next, each, jacobian_of, starts_of
 from .._problem.parameters import parameters_of
 from .._problem.problem import Problem
 
@@ -214,7 +214,7 @@ def goal_of(
     return goal
 
 
-def _one_motion(model: Model, windows: Windows, point: Point) -> Windows:
+def _one_motion(model: Model, windows: Windows, point: Unknowns) -> Windows:
     """Windows that each begin where the one before ends."""
     first = jax.tree.map(lambda x: x[0], windows)
 
@@ -226,7 +226,9 @@ def _one_motion(model: Model, windows: Windows, point: Point) -> Windows:
     return eqx.tree_at(lambda w: (w.start, w.next_start), windows, (starts, jnp.append(starts[1:], end[None], axis=0)))
 
 
-def _information(model: Model, windows: Windows, point: Point, starts: Array, starts_dot: Array) -> tuple[Array, Array]:
+def _information(
+    model: Model, windows: Windows, point: Unknowns, starts: Array, starts_dot: Array
+) -> tuple[Array, Array]:
     """About the scaled parameters (p, p), the others eliminated, and what would be measured (W, n_c, n_t).
 
     By normal equations, whose derivatives, unlike a QR decomposition's, always exist.

@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._data.trial import Trial
-from .._optimize.least_squares import least_squares
-from .._optimize.steps import settle, uninterrupted
-from .._problem.model import Point
-from .._problem.problem import Problem
+from .._optimize.least_squares import LeastSquares
+from .._optimize.minimize import minimize
+from .._optimize.steps import solve_nuisance, uninterrupted
+from .._problem.model import Unknowns
+from .._problem.problem import Problem, refuse_other
 from .._result.result import Fit
 
 
@@ -27,12 +28,13 @@ def applied_to(fit: Fit, trials: Sequence[Trial] | Trial) -> Fit:
 
     **Raises:** `ValueError` as `fit` does, for trials that do not suit the system or cannot be simulated.
     """
+    refuse_other(fit, Fit, "applied_to", "applied_to(fit(...), trials)")
     problem = fit.problem.with_trials(trials)
     first = dataclasses.replace(problem.start, x=fit.point.x)
-    if problem.posed["step"] is None and problem.model.settings.step is not None:
+    if problem.chooses_steps:
         problem = problem.finer(first)
-    before = settle(problem, problem.start)[1].cost
-    point, at = settle(problem, first, steps=20, rtol=1e-6)
+    before = solve_nuisance(problem, problem.start)[1].cost
+    point, at = solve_nuisance(problem, first, steps=20, rtol=1e-6)
     return Fit.of(problem, point, at, (before, at.cost), "applied", fit.method)
 
 
@@ -75,6 +77,7 @@ def cross_validate(fit: Fit, folds: int | Sequence[Sequence[int]] | None = None)
 
     **Raises:** `ValueError` with fewer than two trials.
     """
+    refuse_other(fit, Fit, "cross_validate", "cross_validate(fit(...))")
     T = len(fit.problem.trials)
     if T < 2:
         raise ValueError("Leaving trials out needs two at least: cut a long one with `Trial.between`.")
@@ -84,7 +87,7 @@ def cross_validate(fit: Fit, folds: int | Sequence[Sequence[int]] | None = None)
     held, estimates = np.full(T, np.nan), {name: [] for name in fit.names}
     for group in groups:
         others = fit.problem.only(set(range(T)) - set(group))
-        found = uninterrupted(least_squares(others, start=fit.point))
+        found = uninterrupted(minimize(others, LeastSquares(), start=fit.point))
         held[group] = costs_by_trial(fit.problem, found.point)[group]
         for name, value in found.estimates.items():
             estimates[name].append(value)
@@ -111,13 +114,13 @@ def _folds(folds: int | Sequence[Sequence[int]], T: int) -> list[list[int]]:
     return groups
 
 
-def costs_by_trial(problem: Problem, point: Point) -> np.ndarray:
+def costs_by_trial(problem: Problem, point: Unknowns) -> np.ndarray:
     """Sums of squares (T,) with these parameters, starts and biases found for them.
 
     With the priors of a trial's starts and biases, and without those of the parameters, which belong to no trial.
     """
     windows = eqx.tree_at(lambda w: w.very_first, problem.windows, jnp.zeros_like(problem.windows.very_first))
     problem = dataclasses.replace(problem, windows=windows)
-    _, at = settle(problem, point, rtol=1e-5)
+    _, at = solve_nuisance(problem, point, rtol=1e-5)
     costs = np.sum(np.asarray(at.blocks.R)[:, :, -1] ** 2, axis=1)
     return np.bincount(np.asarray(problem.windows.trial), costs, minlength=len(problem.trials))

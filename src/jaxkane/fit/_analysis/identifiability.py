@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from .._optimize.steps import settle
-from .._problem.model import Point
-from .._problem.problem import Problem
+from .._optimize.steps import solve_nuisance
+from .._problem.model import Unknowns
+from .._problem.problem import Problem, refuse_other
 from .._result.identifiability import Identifiability, identifiability_at
 
 
-def identifiability(problem: Problem, *, flat: float = 0.5, at: Point | None = None) -> Identifiability:
+def identifiability(problem: Problem, *, flat: float = 0.5, at: Unknowns | None = None) -> Identifiability:
     """Which parameters, or combinations of them, the data can tell; of a `Fit`, `fit.identifiability` says it.
 
         identifiability(Problem.of(system, trials, free, unknown=("roll",)))
@@ -26,5 +26,6 @@ def identifiability(problem: Problem, *, flat: float = 0.5, at: Point | None = N
 
     **Raises:** `ValueError` that names a window which cannot be simulated to its end.
     """
-    point, linearization = settle(problem, problem.start if at is None else at)
+    refuse_other(problem, Problem, "identifiability", "identifiability(fit.problem), or fit.identifiability")
+    point, linearization = solve_nuisance(problem, problem.start if at is None else at)
     return identifiability_at(problem, point, linearization, flat)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._problem.blocks import Eliminated, eliminate
-from .._problem.problem import Problem
+from .._problem.problem import Problem, refuse_other
 from .._result.result import Fit
 
 LOG_2PI = math.log(2 * math.pi)
@@ -56,6 +56,7 @@ def laplace(fit: Fit) -> Laplace:
     **Raises:** `ValueError` that names the parameters that the data do not tell (nothing bounds their posterior), and
     for a fit that is not at a minimum.
     """
+    refuse_other(fit, Fit, "laplace", "laplace(fit(...))")
     untold = [name for name, error in fit.standard_errors.items() if np.isinf(error)]
     if untold:
         raise ValueError(f"These data do not tell {', '.join(untold)}: give a prior, or leave something out.")
@@ -64,7 +65,7 @@ def laplace(fit: Fit) -> Laplace:
     if fit.status == "applied" or not to_gain < 0.1:
         raise ValueError(
             f"This is no minimum ({fit.status}): a step would lower the sum of squares by {to_gain:.3g}. Go on with "
-            "`least_squares(problem, start=fit.point)`."
+            "`minimize(fit.problem, LeastSquares(), start=fit.point)`."
         )
     A = np.asarray(eliminated.rows[0], float)
     _, s, V = np.linalg.svd(A, full_matrices=False)

@@ -7,8 +7,10 @@ import dataclasses
 import numpy as np
 
 from ..._common.lookup import hint
-from .._optimize.least_squares import least_squares
+from .._optimize.least_squares import LeastSquares
+from .._optimize.minimize import minimize
 from .._optimize.steps import uninterrupted
+from .._problem.problem import refuse_other
 from .._result.result import Fit
 
 
@@ -37,6 +39,7 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
 
     **Raises:** `ValueError` for a name that is not free, or a parameter that the data do not tell.
     """
+    refuse_other(fit, Fit, "profile", "profile(fit(...), name)")
     if name not in fit.names:
         raise ValueError(f"{name} is not free; {hint(name, fit.names, 'free are')}")
     if n < 3 or not (span is None or 0 < span < np.inf):
@@ -56,7 +59,7 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
             pinned = fit.problem.with_priors({name: (float(value), 1e-4 * error)})
             try:
                 start = pinned.at({name: float(value)}, point)
-                there = uninterrupted(least_squares(pinned, start=start, rtol=1e-5))
+                there = uninterrupted(minimize(pinned, LeastSquares(rtol=1e-5), start=start))
             except ValueError:  # outside its bounds, or nothing that can be simulated
                 break
             if there.status != "converged":

@@ -7,8 +7,9 @@ import dataclasses
 import equinox as eqx
 
 from .._data.windows import Windows
-from .._optimize.least_squares import least_squares
-from .._optimize.steps import settle, uninterrupted
+from .._optimize.least_squares import LeastSquares
+from .._optimize.minimize import minimize
+from .._optimize.steps import solve_nuisance, uninterrupted
 from .._result.notes import bad_channels
 from .._result.result import Fit
 
@@ -37,9 +38,9 @@ def _if_better(fit: Fit, windows: Windows, what: str) -> list[str]:
     problem = dataclasses.replace(fit.problem, windows=windows)
     try:
         # From both ends: a fit to the wrong sign may have led the parameters far away.
-        costs = [settle(problem, point, steps=4)[1].cost for point in (fit.point, problem.start)]
+        costs = [solve_nuisance(problem, point, steps=4)[1].cost for point in (fit.point, problem.start)]
         if min(costs) > 0.5 * fit.cost:
-            costs = [uninterrupted(least_squares(problem, steps=4, rtol=1e-2)).cost]
+            costs = [uninterrupted(minimize(problem, LeastSquares(rtol=1e-2), steps=4)).cost]
     except ValueError:
         return []
     if min(costs) < 0.5 * fit.cost:

@@ -2,38 +2,37 @@
 
 from __future__ import annotations
 
-import os
+import dataclasses
+import functools
 from collections.abc import Callable
+from typing import Any, ClassVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
-from jaxtyping import Array
-from tqdm import tqdm
+from jaxtyping import Array, Float
 
 from ..._common.digest import digest
 from .._problem.blocks import Eliminated, eliminate
-from .._problem.model import Point
+from .._problem.model import Unknowns
 from .._problem.problem import Linearization, Problem, linearize
-from .._result.result import Fit
-from .checkpoint import Checkpoint
-from .steps import moved, settle, usable
+from .optimizer import Iterate, Optimizer
+from .steps import moved, solve_nuisance, usable
 
 
-def gradient_descent(
-    problem: Problem,
-    *,
-    steps: int = 100,
-    optimizer: optax.GradientTransformation | None = None,
-    refresh: int | None = 10,
-    rtol: float = 1e-6,
-    start: Point | None = None,
-    checkpoint: str | os.PathLike[str] | None = None,
-    callback: Callable[[Point, float], None] | None = None,
-    progress: bool = False,
-) -> Fit:
-    """Minimize half the sum of squares by gradient descent.
+class Memory(eqx.Module):
+    """Between two steps: the way gone in the round coordinates, those coordinates, their unit, and optax's state."""
+
+    y: Float[Array, " p"]
+    directions: Float[Array, "p p"]
+    unit: Float[Array, ""]
+    of_optax: Any
+
+
+@dataclasses.dataclass(frozen=True)
+class GradientDescent(Optimizer):
+    """Gradient descent on half the sum of squares.
 
         minimize over x  1/2 min over z, b of |residual(x, z, b)|^2
 
@@ -41,93 +40,82 @@ def gradient_descent(
     gradient is that of the best fit with given parameters. The descent runs in coordinates y in which the sensitivity A
     is round, x = x0 + (A^T A)^(-1/2) y: a step means the same for every parameter, however well it is known.
 
-    **Arguments:**
-
-    - `steps`: at most. `rtol`: stop when the linearized problem promises less than this part of the cost.
-    - `optimizer`: any optax optimizer, with its schedule; by default Nesterov's descent at a rate of 0.3 that falls
-        along a cosine. The unit of y is the way that there seems to be to go, so rates about 0.1 suit Adam.
-    - `refresh`: how many steps until the coordinates are made round anew; None for the plainly scaled
-        parameters (`Free.scale`) throughout.
-    - `start`: a `Point` to go on from, such as `fit.point`.
-    - `checkpoint`: a file in which the state is kept after every step; where it exists the fit goes on from there.
-    - `callback`: called with the point and its cost at the start and after every step. `progress`: a progress bar.
-
     A step whose simulation fails, or which multiplies the cost, is halved until it does not.
 
-    **Returns:** a `Fit` at the best point seen, with the history of the cost; after an interruption (Ctrl-C) too, and
-    `status` says so.
+    **Arguments:**
 
-    **Raises:** `ValueError` where a window cannot be simulated with the first guess, or a checkpoint is of another fit.
+    - `transform`: any optax optimizer, with its schedule; by default Nesterov's descent at a rate of 0.3 that falls
+        along a cosine over all steps. The unit of y is the way that there seems to be to go, so rates about 0.1 suit
+        Adam.
+    - `refresh`: how many steps until the coordinates are made round anew; None for the plainly scaled parameters
+        (`Free.scale`) throughout.
+    - `rtol`: stop when the linearized problem promises less than this part of the cost.
     """
-    start = problem.start if start is None else start
-    descent = optimizer
-    if descent is None:
-        descent = optax.sgd(optax.cosine_decay_schedule(0.3, max(steps, 1), 0.1), momentum=0.6, nesterov=True)
+
+    steps: ClassVar[int] = 100
+    transform: optax.GradientTransformation | None = None
+    refresh: int | None = 10
+    rtol: float = 1e-6
+
+    @property
+    def name(self) -> str:
+        return "gradient descent"
+
+    def depends_on(self, problem: Problem, steps: int) -> dict[str, Any]:
+        found: dict[str, Any] = {"refresh": self.refresh}
+        if self.transform is None:
+            return {**found, "optimizer": "default", "steps of its schedule": steps}
+        y = jnp.zeros_like(problem.start.x)
+        with jax.numpy_dtype_promotion("standard"):
+            program = jax.make_jaxpr(self.transform.update)(y, self.transform.init(y), y)
+        return {**found, "optimizer": digest(program)}
+
+    def for_steps(self, steps: int) -> GradientDescent:
+        if self.transform is not None:
+            return self
+        rate = optax.cosine_decay_schedule(0.3, max(steps, 1), 0.1)
+        return dataclasses.replace(self, transform=optax.sgd(rate, momentum=0.6, nesterov=True))
+
+    def begin(self, problem: Problem, point: Unknowns, at: Linearization) -> Memory:
+        assert self.transform is not None
+        y, p = jnp.zeros_like(point.x), point.x.shape[0]
+        return Memory(y, jnp.eye(p, dtype=y.dtype), jnp.zeros((), y.dtype), self.transform.init(y))
+
+    def step(self, problem: Problem, now: Iterate, taken: int) -> Iterate | str:
+        at, memory = now.at, now.memory
+        assert at is not None
+        assert self.transform is not None
+        eliminated = eliminate(at.blocks, 0.0)
+        if _is_minimum(at, eliminated, self.rtol):
+            return "converged"
+        directions, unit, gradient = memory.directions, memory.unit, _gradient(eliminated)
+        if taken == 0 or (self.refresh and taken % self.refresh == 0):
+            directions = _directions(eliminated, at.cost / problem.size[0] if self.refresh else None)
+        unit = unit if unit > 0 else jnp.linalg.norm(directions.T @ gradient)
+        step, y, of_optax = _descend(self.transform)(directions, unit, gradient, memory.of_optax, memory.y)
+        after = _guarded(problem, now.point, at, step, eliminated)
+        if after is None:
+            return "stuck"
+        point, there = after
+        return Iterate(point, there.cost, there, Memory(y, directions, unit, of_optax))
+
+    def after(self, problem: Problem, best: Iterate, status: str) -> tuple[Iterate, str]:
+        point, at = solve_nuisance(problem, best.point, steps=3, rtol=1e-9)
+        return (Iterate(point, at.cost, at, best.memory) if at.cost <= best.cost else best), status
+
+
+@functools.lru_cache(maxsize=16)
+def _descend(transform: optax.GradientTransformation) -> Callable[..., tuple[Array, Array, Any]]:
+    """optax's step: of the parameters, of the round coordinates, and its next state."""
 
     @jax.jit
-    def descend(directions, unit, gradient, memory, y):
+    def descend(directions, unit, gradient, of_optax, y):
         # optax's schedules mix integers and floats, which a strict user's settings would refuse.
         with jax.numpy_dtype_promotion("standard"):
-            updates, memory = descent.update(directions.T @ gradient / unit, memory, y)
-        return unit * directions @ updates, y + updates, memory
+            updates, of_optax = transform.update(directions.T @ gradient / unit, of_optax, y)
+        return unit * directions @ updates, y + updates, of_optax
 
-    p = start.x.shape[0]
-    # What one step hands to the next: the way gone in the round coordinates, those coordinates, and their unit.
-    y, directions, unit = jnp.zeros_like(start.x), jnp.eye(p, dtype=start.x.dtype), jnp.zeros((), start.x.dtype)
-    memory = descent.init(y)
-    chosen = "default"
-    if checkpoint is not None and optimizer is not None:
-        with jax.numpy_dtype_promotion("standard"):
-            chosen = digest(jax.make_jaxpr(optimizer.update)(y, memory, y))
-    file = Checkpoint(checkpoint, problem, method="gradient descent", optimizer=chosen, refresh=refresh)
-    like = {"y": y, "directions": directions, "unit": unit, "memory": memory, "best": start}
-    saved = file.read(point=start, history=0.0, **like)
-    if saved is None:
-        point, at = settle(problem, start)
-        history, best = [at.cost], (point, at)
-    else:
-        point, (y, directions, unit, memory, _) = saved["point"], (saved[name] for name in like)
-        history = [float(c) for c in saved["history"]]
-        at, at_best = linearize(problem, point), linearize(problem, saved["best"])
-        if at is None or at_best is None:
-            raise ValueError(f"{checkpoint}: the residuals are not finite where this fit was left; delete the file.")
-        best = saved["best"], at_best
-    status = "steps"
-    bar = tqdm(total=steps, initial=len(history) - 1, disable=not progress, desc="gradient descent")
-    try:
-        if callback:
-            callback(point, at.cost)
-        for i in range(len(history) - 1, steps):
-            eliminated = eliminate(at.blocks, 0.0)
-            if _is_minimum(at, eliminated, rtol):
-                status = "converged"
-                break
-            if i % (refresh or steps) == 0:
-                directions = _directions(eliminated, at.cost / problem.size[0] if refresh else None)
-            gradient = _gradient(eliminated)
-            unit = unit if unit > 0 else jnp.linalg.norm(directions.T @ gradient)
-            step, y, memory = descend(directions, unit, gradient, memory, y)
-            after = _guarded(problem, point, at, step, eliminated)
-            if after is None:
-                status = "stuck"
-                break
-            point, at = after
-            history.append(at.cost)
-            if at.cost < best[1].cost:
-                best = point, at
-            now = {"point": point, "y": y, "directions": directions, "unit": unit, "memory": memory, "best": best[0]}
-            file.write(**now, history=np.array(history))
-            if callback:
-                callback(point, at.cost)
-            bar.update()
-            bar.set_postfix(cost=f"{at.cost:.6g}")
-        settled = settle(problem, best[0], steps=3, rtol=1e-9)
-        best = settled if settled[1].cost <= best[1].cost else best
-    except KeyboardInterrupt:
-        status = "interrupted"
-    finally:
-        bar.close()
-    return Fit.of(problem, *best, history, status, "gradient descent")
+    return descend
 
 
 def _gradient(eliminated: Eliminated) -> Array:
@@ -152,7 +140,7 @@ def _is_minimum(at: Linearization, eliminated: Eliminated, rtol: float) -> bool:
     return at.cost - float(eliminated.step(1e-9)[1]) <= max(rtol * at.cost, 1e-12)
 
 
-def _guarded(problem: Problem, point: Point, at: Linearization, step: Array, eliminated: Eliminated):
+def _guarded(problem: Problem, point: Unknowns, at: Linearization, step: Array, eliminated: Eliminated):
     """Where a step leads, halved until it can be simulated; None where even a thousandth cannot."""
     for _ in range(12):
         tried = moved(point, step, eliminated)

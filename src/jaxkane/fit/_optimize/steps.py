@@ -1,4 +1,4 @@
-"""What every optimizer of a fit shares: first guesses of the nuisance values, and steps that may fail."""
+"""What every optimizer of a fit shares: initial guesses of the nuisance values, and steps that may fail."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from jaxtyping import Array
 
 from ..._simulation.trajectory import Status, reason
 from .._problem.blocks import Eliminated, eliminate
-from .._problem.model import Point
+from .._problem.model import Unknowns
 from .._problem.problem import Linearization, Problem, linearize
 
 
-def moved(point: Point, x: Array, eliminated: Eliminated) -> Point:
+def moved(point: Unknowns, x: Array, eliminated: Eliminated) -> Unknowns:
     """The point after a step x of the parameters, with the nuisance values that go with it."""
     z, b = eliminated.others(x)
-    return Point(point.x + x, point.b + b, point.z + z)
+    return Unknowns(point.x + x, point.b + b, point.z + z)
 
 
 def usable(at: Linearization | None) -> bool:
@@ -33,25 +33,27 @@ def uninterrupted(fit: Any) -> Any:
     return fit
 
 
-def settle(problem: Problem, point: Point, steps: int = 8, rtol: float = 1e-2) -> tuple[Point, Linearization]:
+def solve_nuisance(
+    problem: Problem, point: Unknowns, steps: int = 8, rtol: float = 1e-2
+) -> tuple[Unknowns, Linearization]:
     """The nuisance values that fit best with the parameters held: Gauss-Newton, damped where that fails.
 
-    Windows that cannot be simulated to their end with the first guess (an unstable ride falls over) begin with a
+    Windows that cannot be simulated to their end with the initial guess (an unstable ride falls over) begin with a
     shorter horizon, which is doubled as soon as it fits. Where that fails for windows that are chained, each is first
     settled by itself.
 
     **Raises:** `ValueError` that names a window which does not reach its end.
     """
     try:
-        return _settle(problem, point, steps, rtol)
+        return _solved(problem, point, steps, rtol)
     except ValueError:
         if not problem.model.nuisance.chained:
             raise
-    point, _ = _settle(problem.unchained(), point, steps, rtol)
-    return _settle(problem, point, steps, rtol)
+    point, _ = _solved(problem.unchained(), point, steps, rtol)
+    return _solved(problem, point, steps, rtol)
 
 
-def _settle(problem: Problem, point: Point, steps: int, rtol: float) -> tuple[Point, Linearization]:
+def _solved(problem: Problem, point: Unknowns, steps: int, rtol: float) -> tuple[Unknowns, Linearization]:
     whole = np.array([n for _, _, n in problem.places])
     samples = whole.copy()
     at = linearize(problem.shortened(samples), point)
@@ -82,7 +84,7 @@ def _settle(problem: Problem, point: Point, steps: int, rtol: float) -> tuple[Po
         assert at is not None
 
 
-def _nuisance_steps(problem: Problem, point: Point, at: Linearization, steps: int, rtol: float):
+def _nuisance_steps(problem: Problem, point: Unknowns, at: Linearization, steps: int, rtol: float):
     still = jnp.zeros_like(point.x)
     damping = 0.0
     for _ in range(steps):
@@ -109,7 +111,7 @@ def _cannot_start(problem: Problem, at: Linearization | None, bad: np.ndarray) -
         status = int(at.status[i])
         why = "not finite" if status == Status.COMPLETED else reason(status, _event_names(problem))
     return (
-        f"{trial.name}: from {trial.t[first]:g} to {trial.t[first + n - 1]:g} s the first guess gives no finite "
+        f"{trial.name}: from {trial.t[first]:g} to {trial.t[first + n - 1]:g} s the initial guess gives no finite "
         f"residuals ({why}; {int(bad.sum())} of {len(bad)} windows). Choose shorter windows or other starting values, "
         "or leave this stretch out."
     )

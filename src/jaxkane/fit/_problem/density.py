@@ -3,29 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .model import Point, blocks_of, starts_of
-from .problem import Problem
+from .._data.windows import Windows
+from .model import Model, Unknowns, blocks_of, starts_of
+from .problem import Problem, refuse_other
 
 
-def half_cost(problem: Problem) -> Callable[[Point], Array]:
-    """Half the sum of squares as a function of a `Point` that JAX can differentiate, once, in either mode.
+def half_cost(model: Model, windows: Windows, by_trial: Array) -> Callable[[Unknowns], Array]:
+    """Half a problem's sum of squares as a function of `Unknowns` that JAX can differentiate, once, in either mode.
 
     The derivatives are those of `linearize`: forward through the simulation, a few directions a window, which is
     cheaper than one reverse pass and needs none of its memory.
     """
-    model, windows, by_trial = problem.model, problem.windows, problem.by_trial
 
     @jax.custom_jvp
-    def f(point: Point) -> Array:
+    def f(point: Unknowns) -> Array:
         return linearized(point).cost / 2
 
-    def linearized(point: Point):
+    def linearized(point: Unknowns):
         return blocks_of(model, windows, by_trial, point, *starts_of(model, windows, point))[0]
 
     @f.defjvp
@@ -38,33 +37,33 @@ def half_cost(problem: Problem) -> Callable[[Point], Array]:
     return f
 
 
-def log_density(problem: Any, *, over: str = "values") -> Callable[[Point], Array]:
-    """The logarithm of the posterior density, up to a constant, as a function of a `Point`.
+def log_density(problem: Problem, *, over: str = "values") -> Callable[[Unknowns], Array]:
+    """The logarithm of the posterior density, up to a constant, as a function of `Unknowns`.
 
         log p = -1/2 sum of squares + log |det d values / d x|
 
-    A `Point` holds unconstrained numbers only, so a sampler may go anywhere: parameters stay inside their bounds, and
+    `Unknowns` are unconstrained numbers only, so a sampler may go anywhere: parameters stay inside their bounds, and
     bodies possible. Priors are among the residuals; `sigma` is taken as it was given. It may be differentiated once, in
     either mode (`jax.grad`, `jax.jvp`).
 
-        density = log_density(fit)
+        density = log_density(fit.problem)
         blackjax.nuts(density, ...)                                       # starts from fit.point
         numpyro.infer.NUTS(potential_fn=lambda point: -density(point))    # init_params=fit.point
 
     **Arguments:**
 
-    - `problem`: a `Fit` or a `Problem`.
+    - `problem`: a `Problem`, such as `fit.problem`.
     - `over`: "values": where there is no prior, all values of a parameter are as likely; "x": all its free numbers are,
         as all orders of magnitude of a positive one.
 
-    **Returns:** a function of a `Point`; minus infinity where nothing can be simulated.
+    **Returns:** a function of `Unknowns`; minus infinity where nothing can be simulated.
     """
     if over not in ("values", "x"):
         raise ValueError(f"`over` is 'values' or 'x', got {over!r}.")
-    problem = getattr(problem, "problem", problem)
-    cost = half_cost(problem)
+    refuse_other(problem, Problem, "log_density", "log_density(fit.problem)")
+    cost = half_cost(problem.model, problem.windows, problem.by_trial)
 
-    def density(point: Point) -> Array:
+    def density(point: Unknowns) -> Array:
         log_p = -cost(point)
         if over == "values":
             log_p = log_p + problem.parameters.log_determinant(point.x)

@@ -1,6 +1,6 @@
 """What is compiled: the residuals of one window and their exact linearization. Knows `simulate`; knows no trials.
 
-Nothing in a `Model` that is a number is fixed when it is compiled, so that other data, other first guesses and other
+Nothing in a `Model` that is a number is fixed when it is compiled, so that other data, other initial guesses and other
 priors of the same shapes run the same program.
 """
 
@@ -28,7 +28,7 @@ from .blocks import Blocks
 from .parameters import Parameters
 
 
-class Point(eqx.Module):
+class Unknowns(eqx.Module):
     """Where a fit stands: `x` (p,) the free parameters (see `Parameters`); `b` (T, n_b) what is unknown of every trial,
     its sensors and inputs; `z` (W, n_z) unknown starts of every window."""
 
@@ -142,7 +142,7 @@ class Model(eqx.Module):
 
 
 @compiled
-def starts_of(model: Model, windows: Windows, point: Point) -> tuple[Array, Array]:
+def starts_of(model: Model, windows: Windows, point: Unknowns) -> tuple[Array, Array]:
     """Starts (W, n) and their derivatives (W, n, n_z + n_b + p) by z, b and x."""
     # A program of its own: inside that of the simulation Newton's method would be differentiated a tangent at a time.
     n_b = point.b.shape[1]
@@ -170,7 +170,7 @@ def jacobian_of(model: Model, window: Windows, start: Array, start_dot: Array, z
 
 
 @compiled
-def blocks_of(model: Model, windows: Windows, by_trial: Array, point: Point, starts: Array, starts_dot: Array):
+def blocks_of(model: Model, windows: Windows, by_trial: Array, point: Unknowns, starts: Array, starts_dot: Array):
     """Blocks, what was simulated (W, n_c, n_t) and the status of every window (W,)."""
     n_z, n_b = point.z.shape[1], point.b.shape[1]
     n_next = n_z if model.nuisance.chained else 0
@@ -190,7 +190,7 @@ def blocks_of(model: Model, windows: Windows, by_trial: Array, point: Point, sta
 
 
 @compiled
-def costs_of(model: Model, windows: Windows, point: Point, starts: Array) -> tuple[Array, Array]:
+def costs_of(model: Model, windows: Windows, point: Unknowns, starts: Array) -> tuple[Array, Array]:
     """Sums of squares (W,), and what was simulated (W, n_c, n_t): `blocks_of` without derivatives."""
 
     def window_cost(arguments):
@@ -204,12 +204,12 @@ def costs_of(model: Model, windows: Windows, point: Point, starts: Array) -> tup
 
 
 @compiled
-def rides_of(model: Model, windows: Windows, point: Point, starts: Array) -> Trajectory:
+def rides_of(model: Model, windows: Windows, point: Unknowns, starts: Array) -> Trajectory:
     """The motion of every window, stacked."""
     return each(lambda now: model.simulate(now[0], now[4], now[3], point.x), _arguments(windows, point, starts))
 
 
-def _arguments(windows: Windows, point: Point, *more: Array) -> tuple[Any, ...]:
+def _arguments(windows: Windows, point: Unknowns, *more: Array) -> tuple[Any, ...]:
     z_next = jnp.concatenate([point.z[1:], point.z[:1]])
     return windows, point.z, z_next, point.b[windows.trial], *more
 

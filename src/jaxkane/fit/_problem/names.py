@@ -14,7 +14,7 @@ from .._data.trial import Trial
 from .model import Nuisance
 
 Names = Sequence[str] | Mapping[str, float | None]
-"""Names, or names with the standard deviation of a Gaussian prior around the first guess (None: no prior)."""
+"""Names, or names with the standard deviation of a Gaussian prior around the initial guess (None: no prior)."""
 
 
 def checked_trials(system: System, trials: Sequence[Trial], outputs: Mapping[str, Any]) -> tuple[str, ...]:

@@ -19,11 +19,11 @@ from jaxtyping import Array
 from ..._scalars.jax_internals import process_allgather
 from .._data.windows import Windows
 from .blocks import Blocks
-from .model import Model, Point, blocks_of, costs_of
+from .model import Model, Unknowns, blocks_of, costs_of
 
 
 def blocks_of_all(
-    model: Model, windows: Windows, by_trial: Array, point: Point, starts: Array, starts_dot: Array
+    model: Model, windows: Windows, by_trial: Array, point: Unknowns, starts: Array, starts_dot: Array
 ) -> tuple[Blocks, Array, Array]:
     """`blocks_of`, by all processes together."""
 
@@ -36,7 +36,7 @@ def blocks_of_all(
     return Blocks(R, by_trial, n_z, n_z if model.nuisance.chained else 0, n_b), simulated, status
 
 
-def costs_of_all(model: Model, windows: Windows, point: Point, starts: Array) -> tuple[Array, Array]:
+def costs_of_all(model: Model, windows: Windows, point: Unknowns, starts: Array) -> tuple[Array, Array]:
     """`costs_of`, by all processes together."""
     return _by_all(lambda *share: costs_of(model, *share), windows, point, starts)
 
@@ -54,17 +54,17 @@ def check_same(model: Model, windows: Windows) -> None:
     if not np.all(np.asarray(process_allgather(own)) == own):
         raise ValueError(
             "fit(..., processes=True): the processes pose different problems. Give every process the same system, the "
-            "same first guesses and all trials, in the same order; each takes its share of them."
+            "same initial guesses and all trials, in the same order; each takes its share of them."
         )
 
 
-def _by_all(evaluate: Callable[..., Any], windows: Windows, point: Point, *more: Array) -> Any:
+def _by_all(evaluate: Callable[..., Any], windows: Windows, point: Unknowns, *more: Array) -> Any:
     """evaluate(windows, point, *more) -> arrays (W, ...), each process for a share of the windows."""
     W = windows.trial.shape[0]
     m = -(-W // jax.process_count())
     # One more than its share, since a window is compared with the start of the next.
     share = (jax.process_index() * m + np.arange(m + 1)) % W
     windows, z, more = jax.tree.map(lambda x: x[share], (windows, point.z, more))
-    found = evaluate(windows, Point(point.x, point.b, z), *more)
+    found = evaluate(windows, Unknowns(point.x, point.b, z), *more)
     found = process_allgather(jax.tree.map(lambda x: np.asarray(x)[:m], found), tiled=True)
     return jax.tree.map(lambda x: jnp.asarray(x[:W]), found)

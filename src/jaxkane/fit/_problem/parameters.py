@@ -31,7 +31,7 @@ class Free:
 
     - `where`: a name ("IBxx"), a path ("body.mass"), or a function from the system to a leaf as in `eqx.tree_at`. A
         leaf with axes counts as its entries.
-    - `start`: the first guess; by default the system's value.
+    - `start`: the initial guess; by default the system's value.
     - `bounds`: (lower, upper) of which either may be None; it never leaves them. By default (0, None), a logarithmic
         scale, where the parameter is declared positive, and none elsewhere.
     - `scale`: how much is a lot, in the parameter's unit; by default the start's magnitude; for a start at
@@ -392,6 +392,11 @@ def _find(system: System, where: str | Callable[[Any], Any]) -> tuple[list[int],
         if not (eqx.is_inexact_array(leaf) and not jnp.issubdtype(leaf.dtype, jnp.complexfloating)):
             raise ValueError(f"{title}.{_path_name(path)} is no real number and cannot be fitted.")
     return chosen, leaves
+
+
+def leaf_names(system: System) -> tuple[str, ...]:
+    """The names of all parameters of a system, by which they can be freed."""
+    return tuple(_path_name(path) for path, _ in jax.tree_util.tree_flatten_with_path(system)[0])
 
 
 def _follow(tree: Any, path: str) -> Any:

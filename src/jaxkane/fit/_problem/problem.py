@@ -6,7 +6,6 @@ import dataclasses
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,15 +14,15 @@ from jaxtyping import Array
 
 from ..._description.system import System
 from ..._method.checks import check_system
-from ..._simulation.settings import settings_for
 from ..._simulation.trajectory import Trajectory
 from .._data.trial import Trial
 from .._data.windows import Place, Windows, cut
 from .blocks import Blocks
-from .model import Model, Point, blocks_of, costs_of, rides_of, starts_of
+from .model import Model, Unknowns, blocks_of, costs_of, rides_of, starts_of
 from .names import Names, checked_names, checked_trials, nuisance_of
 from .parallel import blocks_of_all, check_same, costs_of_all
 from .parameters import Delay, Parameters, Prior, parameters_of
+from .simulation import Simulation
 
 STEP_TOLERANCE = 0.05, 0.25
 """By how much halving the step of integration may move all residuals together, of a window and of all windows: it
@@ -39,7 +38,7 @@ class Problem:
 
         residual = (gain * simulated + bias - measured) / sigma
 
-    Made by `Problem.of`; solved by `least_squares` and the other methods; looked at by `identifiability`.
+    Made by `Problem.of`; solved by `minimize`; looked at by `identifiability`.
     """
 
     model: Model
@@ -68,14 +67,11 @@ class Problem:
         window: float | None = None,
         continuity: Mapping[str, float] | None = None,
         outputs: Mapping[str, Callable[[Trajectory], Array]] | None = None,
-        rtol: float | None = None,
-        atol: float | None = None,
-        step: float | None = None,
-        solver: diffrax.AbstractSolver | None = None,
-        max_steps: int | None = None,
+        simulation: Simulation | None = None,
         processes: bool = False,
     ) -> Problem:
         """Pose a fit. The arguments are those of `jaxkane.fit.fit`."""
+        simulation = Simulation() if simulation is None else simulation
         posed = {key: value for key, value in locals().items() if key not in ("cls", "trials")}
         trials = (trials,) if isinstance(trials, Trial) else tuple(trials)
         outputs = dict(outputs or {})
@@ -84,7 +80,6 @@ class Problem:
             raise ValueError(f"`window` is a length of time [s], got {window}.")
         if continuity is not None and window is None:
             raise ValueError("`continuity` binds the windows of a trial together: give their length, `window` [s].")
-        _check_settings(rtol, atol, step, max_steps)
         driven = tuple(name for name in system.inputs if any(name in trial.inputs for trial in trials))
         per_trial = {
             "bias of sensor": checked_names(system, "sensor_bias", sensor_bias, channels),
@@ -103,35 +98,29 @@ class Problem:
         windows, places = cut(system, trials, window, channels, chained=continuity is not None, delayed=bool(late))
         check_system(system, windows.t[0, 0], jnp.nan_to_num(windows.start[0, : len(system.coordinates)]))
         varying = any(np.ptp(x) > 0 for t in trials for x in t.inputs.values())
-        fixed = step is not None or (rtol is None and atol is None and varying)
-        settings = settings_for(
-            windows.t[0],
-            rtol=1e-6 if rtol is None else rtol,
-            atol=atol,
-            solver=solver if solver is not None else diffrax.Bosh3() if fixed else diffrax.Tsit5(),
-            step=1.0 if fixed else None,  # every window has its own
-            adjoint="forward",
-            # A fixed step is taken as often as it fits into the time.
-            max_steps=max_steps if max_steps is not None or fixed else 4096,
-        )
         model = Model(
             system=system,
             parameters=parameters,
             nuisance=nuisance_of(system, unknown, per_trial, continuity),
-            settings=settings,
+            settings=simulation.settings(windows.t[0], varying),
             channels=channels,
             driven=driven,
             held=held,
             outputs=tuple(outputs.items()),
         )
-        if step is not None:  # one step in all windows
-            windows = eqx.tree_at(lambda w: w.step, windows, jnp.full_like(windows.step, step))
+        if simulation.step is not None:  # one step in all windows
+            windows = eqx.tree_at(lambda w: w.step, windows, jnp.full_like(windows.step, simulation.step))
         if processes:
             check_same(model, windows)
         problem = cls(model, windows, windows.by_trial, trials, places, posed, processes)
-        return problem.finer(problem.start) if fixed and step is None else problem
+        return problem.finer(problem.start) if problem.chooses_steps else problem
 
-    def finer(self, point: Point) -> Problem:
+    @property
+    def chooses_steps(self) -> bool:
+        """Whether fixed steps of integration are halved until they are fine enough: nobody has given any."""
+        return self.model.settings.step is not None and self.posed["simulation"].step is None
+
+    def finer(self, point: Unknowns) -> Problem:
         """With steps halved where that changes what is simulated at a point by more than a share of the noise.
 
         An input that is linear between its samples has a kink at every sample, on which error control spends ten
@@ -142,7 +131,7 @@ class Problem:
         going, last = np.full(len(self.places), True), np.full(len(self.places), np.inf)
         for halvings in range(HALVINGS):
             half = jnp.where(jnp.asarray(going), problem.windows.step / 2, problem.windows.step)
-            halved = problem._with_steps(half)
+            halved = problem.with_steps(half)
             after = simulated(halved, point)
             apart = problem._apart(before, after)
             going &= ~(apart <= self.step_tolerance)
@@ -150,10 +139,10 @@ class Problem:
             going &= (halvings < 2) | (np.isfinite(apart) & (apart <= last / 2))
             if not going.any():
                 break
-            problem = problem._with_steps(jnp.where(jnp.asarray(going), half, problem.windows.step))
+            problem = problem.with_steps(jnp.where(jnp.asarray(going), half, problem.windows.step))
             before, last = np.where(going[:, None, None], after, before), apart
         lost = ~np.all(np.isfinite(np.where(np.asarray(self.windows.weight) > 0, before, 0.0)), axis=(1, 2))
-        return problem._with_steps(jnp.where(jnp.asarray(lost), first, problem.windows.step))
+        return problem.with_steps(jnp.where(jnp.asarray(lost), first, problem.windows.step))
 
     @property
     def step_tolerance(self) -> float:
@@ -161,7 +150,7 @@ class Problem:
         one, together = STEP_TOLERANCE
         return min(one, together / len(self.places) ** 0.5)
 
-    def step_errors(self, point: Point, now: np.ndarray | None = None) -> np.ndarray:
+    def step_errors(self, point: Unknowns, now: np.ndarray | None = None) -> np.ndarray:
         """By how much halving the step moves all residuals of every window (W,) together, in standard deviations; NaN
         where a window is not simulated to its end, or where the step follows from tolerances.
 
@@ -170,9 +159,10 @@ class Problem:
         if self.model.settings.step is None:
             return np.full(len(self.places), np.nan)
         now = simulated(self, point) if now is None else now
-        return self._apart(now, simulated(self._with_steps(self.windows.step / 2), point))
+        return self._apart(now, simulated(self.with_steps(self.windows.step / 2), point))
 
-    def _with_steps(self, step: Array) -> Problem:
+    def with_steps(self, step: Array) -> Problem:
+        """The same problem with other steps of integration (W,) [s]; nothing is compiled anew."""
         return dataclasses.replace(self, windows=eqx.tree_at(lambda w: w.step, self.windows, step))
 
     def _apart(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -197,13 +187,13 @@ class Problem:
         return self.model.channels
 
     @property
-    def start(self) -> Point:
+    def start(self) -> Unknowns:
         """No parameter changed, no bias, every window starts as it was measured."""
         p, T, W = len(self.parameters.entries), len(self.trials), len(self.places)
         zeros = lambda *shape: jnp.zeros(shape, self.windows.t.dtype)  # noqa: E731
-        return Point(zeros(p), zeros(T, len(self.model.nuisance.trial)), zeros(W, len(self.model.nuisance.start)))
+        return Unknowns(zeros(p), zeros(T, len(self.model.nuisance.trial)), zeros(W, len(self.model.nuisance.start)))
 
-    def at(self, values: Mapping[str, float], point: Point | None = None) -> Point:
+    def at(self, values: Mapping[str, float], point: Unknowns | None = None) -> Unknowns:
         """The point with these values of parameters, by name; the rest as in `point`, by default as at the start.
 
         **Raises:** `ValueError` for a value outside its bounds, or that no body can have.
@@ -246,7 +236,7 @@ class Problem:
         unknowns = len(self.parameters.entries) + T * len(n.trial) + int(seen.sum()) * len(n.start)
         return residuals, unknowns
 
-    def trajectories(self, point: Point) -> list[Trajectory]:
+    def trajectories(self, point: Unknowns) -> list[Trajectory]:
         """The motion of every window, in the order of `places`."""
         rides = rides_of(self.model, self.windows, point, starts_of(self.model, self.windows, point)[0])
         return [
@@ -292,12 +282,13 @@ class Problem:
         )
 
 
-def _check_settings(rtol: float | None, atol: float | None, step: float | None, max_steps: int | None) -> None:
-    for name, value in (("rtol", rtol), ("atol", atol), ("step", step), ("max_steps", max_steps)):
-        if value is not None and not 0 < value < float("inf"):
-            raise ValueError(f"`{name}` must be positive and finite, got {value}.")
-    if step is not None and (rtol is not None or atol is not None):
-        raise ValueError("`step` fixes the step of integration, `rtol` and `atol` let it follow the error: give one.")
+def refuse_other(given: Any, wanted: type, name: str, instead: str) -> None:
+    """What is asked before a fit takes a `Problem`, what is asked after it takes a `Fit`.
+
+    **Raises:** `TypeError` for anything else.
+    """
+    if not isinstance(given, wanted):
+        raise TypeError(f"{name} takes a {wanted.__name__}, as in {instead}; got {type(given).__name__}.")
 
 
 class Linearization(eqx.Module):
@@ -318,7 +309,7 @@ class Linearization(eqx.Module):
         return np.all(np.isfinite(np.asarray(self.blocks.R)), axis=(1, 2))
 
 
-def linearize(problem: Problem, point: Point) -> Linearization | None:
+def linearize(problem: Problem, point: Unknowns) -> Linearization | None:
     """Residuals and their exact derivatives, by forward mode through the simulation; None where no start is found."""
     found = _starts(problem, point)
     if found is None:
@@ -327,7 +318,7 @@ def linearize(problem: Problem, point: Point) -> Linearization | None:
     return Linearization(*blocks(problem.model, problem.windows, problem.by_trial, point, *found))
 
 
-def cost(problem: Problem, point: Point) -> float:
+def cost(problem: Problem, point: Unknowns) -> float:
     """Sum of squares, without derivatives; NaN or infinite where a window could not be simulated."""
     found = _starts(problem, point)
     if found is None:
@@ -335,7 +326,7 @@ def cost(problem: Problem, point: Point) -> float:
     return float(jnp.sum(_costs(problem, point, found[0])[0]))
 
 
-def simulated(problem: Problem, point: Point) -> np.ndarray:
+def simulated(problem: Problem, point: Unknowns) -> np.ndarray:
     """What the sensors would have said (W, n_c, n_t); NaN where that cannot be simulated."""
     found = _starts(problem, point)
     if found is None:
@@ -343,11 +334,11 @@ def simulated(problem: Problem, point: Point) -> np.ndarray:
     return np.asarray(_costs(problem, point, found[0])[1])
 
 
-def _costs(problem: Problem, point: Point, starts: Array) -> tuple[Array, Array]:
+def _costs(problem: Problem, point: Unknowns, starts: Array) -> tuple[Array, Array]:
     return (costs_of_all if problem.processes else costs_of)(problem.model, problem.windows, point, starts)
 
 
-def _starts(problem: Problem, point: Point) -> tuple[Array, Array] | None:
+def _starts(problem: Problem, point: Unknowns) -> tuple[Array, Array] | None:
     try:
         return starts_of(problem.model, problem.windows, point)
     except eqx.EquinoxRuntimeError:  # Newton's linear solver raises on what is not finite

@@ -11,12 +11,12 @@ from scipy import stats
 
 from ..._scalars.reads import compiled
 from .._problem.blocks import eliminate
-from .._problem.model import Point
+from .._problem.model import Unknowns
 from .._problem.parameters import Parameters
 from .._problem.problem import Linearization, Problem
 
 
-def clustered_covariance(problem: Problem, point: Point, at: Linearization) -> np.ndarray:
+def clustered_covariance(problem: Problem, point: Unknowns, at: Linearization) -> np.ndarray:
     """Covariance (p, p) of the parameters in their units, robust to residuals that are correlated within a trial.
 
         B (T / (T - 1) sum_t (A_t^T r_t) (A_t^T r_t)^T + P) B,   B = (A^T A)^-1

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._problem.blocks import eliminate
-from .._problem.model import Point
+from .._problem.model import Unknowns
 from .._problem.problem import Linearization, Problem
 
 
@@ -81,7 +81,7 @@ def residual_variance(problem: Problem, cost: float) -> float:
     return cost / (n_r - n_unknown) if n_r > n_unknown else float("nan")
 
 
-def identifiability_at(problem: Problem, point: Point, at: Linearization, flat: float = 0.5) -> Identifiability:
+def identifiability_at(problem: Problem, point: Unknowns, at: Linearization, flat: float = 0.5) -> Identifiability:
     """Identifiability at a point where the problem has been linearized."""
     parameters = problem.parameters
     names, p = parameters.names, len(parameters.names)

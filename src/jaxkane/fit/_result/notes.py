@@ -187,7 +187,7 @@ def far_from_start(fit: Fit) -> list[str]:
         start, error = fit.start[name], fit.standard_errors[name]
         if start != 0 and not 0.4 <= value / start <= 2.5 and error < 0.2 * abs(value):
             notes.append(
-                f"{name} went to {value / start:.2g} times its first guess with a small formal error. Unless that "
+                f"{name} went to {value / start:.2g} times its initial guess with a small formal error. Unless that "
                 "guess was worth nothing, it is implausible: it may be making up for what the model lacks."
             )
     return notes

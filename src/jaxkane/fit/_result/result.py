@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import importlib.metadata
+import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..._common.lookup import refuse_unknown
 from ..._description.system import System
-from .._problem.model import Point
-from .._problem.parameters import Parameters
+from .._problem.model import Unknowns
+from .._problem.parameters import Parameters, leaf_names
 from .._problem.problem import STEP_TOLERANCE, Linearization, Problem
+from .._problem.state_file import described, write_state
 from . import covariance, notes, residuals
 from .identifiability import Identifiability, identifiability_at, residual_variance
 from .residuals import ByTrial, ResidualTest, residual_test
@@ -52,7 +57,7 @@ class Fit:
     """
 
     problem: Problem
-    point: Point
+    point: Unknowns
     linearization: Linearization
     step_errors: np.ndarray  # (W,), see `Problem.step_errors`
     history: tuple[float, ...]
@@ -61,7 +66,7 @@ class Fit:
 
     @classmethod
     def of(
-        cls, problem: Problem, point: Point, at: Linearization, history: Sequence[float], status: str, method: str
+        cls, problem: Problem, point: Unknowns, at: Linearization, history: Sequence[float], status: str, method: str
     ) -> Fit:
         """The result at a point where the problem has been linearized.
 
@@ -244,6 +249,22 @@ class Fit:
         """What a reader should know, in words."""
         return notes.notes_of(self)
 
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the numbers of this fit to one file, whole or not at all; `jaxkane.fit.load(path, problem)` reads it.
+
+        **Returns:** the path.
+        """
+        path, versions = Path(path).expanduser(), ("jaxkane", "jax", "diffrax")
+        key = {
+            "fit": {"status": self.status, "method": self.method},
+            "versions": ", ".join(f"{name} {importlib.metadata.version(name)}" for name in versions),
+            **described(self.problem),
+        }
+        at, step = self.linearization, self.problem.windows.step
+        numbers = {"R": at.blocks.R, "simulated": at.simulated, "status": at.status, "step_errors": self.step_errors}
+        write_state(path, key, {"point": self.point, "step": step, "history": np.array(self.history), **numbers})
+        return path
+
     def table(self, truth: Mapping[str, float] | System | None = None) -> str:
         """Name, start, estimate and standard error of every parameter; and the truth, where it is known."""
         known = known_values(self, truth)
@@ -274,10 +295,20 @@ class Fit:
     __repr__ = __str__
 
 
-def known_values(fit: Fit, truth: Any) -> dict[str, float]:
-    """The true values of free parameters, from a system that has them or by name."""
-    if truth is None or isinstance(truth, Mapping):
-        return dict(truth or {})
+def known_values(fit: Fit, truth: Mapping[str, float] | System | None) -> dict[str, float]:
+    """The true values of free parameters, from a system that has them or by name.
+
+    **Raises:** `ValueError` for a name that is neither free nor a parameter; `TypeError` for another kind of system.
+    """
+    if truth is None:
+        return {}
+    system = fit.problem.system
+    if isinstance(truth, Mapping):
+        refuse_unknown(truth, (*fit.names, *leaf_names(system)), "`truth` names")
+        return {name: float(truth[name]) for name in fit.names if name in truth}
+    if type(truth) is not type(system):
+        title = type(system).__name__
+        raise TypeError(f"`truth` is a {title}, or values by name; got {type(truth).__name__}.")
     leaves = jax.tree.leaves(truth)
     targets = {e.name: e.targets[0] for e in fit.parameters.entries if e.targets}
     return {name: float(jnp.ravel(leaves[leaf])[place]) for name, (leaf, place, _) in targets.items()}

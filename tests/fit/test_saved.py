@@ -1,0 +1,158 @@
+"""Fits in files; and one way of saying things: a `Problem` before a fit, a `Fit` after it, options where they go."""
+
+import numpy as np
+import pytest
+from systems import Cart, Track
+
+import jaxkane as jk
+from jaxkane.fit import (
+    GradientDescent,
+    LeastSquares,
+    Problem,
+    Simulation,
+    Trial,
+    cross_validate,
+    fit,
+    identifiability,
+    laplace,
+    load,
+    log_density,
+    minimize,
+    multi_start,
+    profile,
+    report,
+)
+
+t = np.linspace(0.0, 1.0, 11)
+PUSH = np.sin(3.0 * t)
+SEEN = 0.4 * t**2 + 0.02 * np.cos(40.0 * t)
+TRIALS = [Trial(t, {"x": SEEN + 0.01 * k}, {"push": PUSH}, sigma=0.1, initial={"x_dot": 0.0}) for k in (0, 1)]
+FREE = ["gain", "drift"]
+
+
+def pose(system=None, trials=TRIALS, free=FREE, unknown=("x",), **options):
+    return Problem.of(Track() if system is None else system, trials, free, unknown=unknown, **options)
+
+
+@pytest.fixture(scope="module")
+def result():
+    return fit(Track(), TRIALS, FREE, unknown=("x",), optimizer=LeastSquares())
+
+
+@pytest.fixture
+def path(result, tmp_path):
+    assert result.save(tmp_path / "fits" / "a.npz") == tmp_path / "fits" / "a.npz"
+    return tmp_path / "fits" / "a.npz"
+
+
+def test_a_fit_comes_back_as_it_was(result, path):
+    again = load(path, pose())
+    assert str(again) == str(result)
+    assert report(again).split("versions")[0] == report(result).split("versions")[0]
+    assert (again.status, again.method, again.history) == (result.status, result.method, result.history)
+    for name in ("covariance", "clustered_covariance", "correlation", "singular_values"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(result, name))
+    assert again.intervals() == result.intervals()
+    assert again.step_error == result.step_error > 0
+    np.testing.assert_array_equal(again.problem.windows.step, result.problem.windows.step)
+    # One can go on with it.
+    assert minimize(again.problem, LeastSquares(), start=again.point).cost == pytest.approx(result.cost, rel=1e-9)
+
+
+class Slow(Track):
+    """Other physics under the same parameters."""
+
+    def loads(self, t, q, u, motion, inputs):
+        return (jk.Force((self.gain * inputs["push"] + 0.9 * self.drift) * motion.N.x, motion["cart"]),)
+
+
+class Rewritten(Track):
+    """The same physics in other words."""
+
+    def loads(self, t, q, u, motion, inputs):
+        push, steady = self.gain * inputs["push"] * motion.N.x, self.drift * motion.N.x
+        return (jk.Force(push, motion["cart"]), jk.Force(steady, motion["cart"]))
+
+
+def test_a_fit_of_changed_code_comes_back_only_where_its_cost_is_the_same(result, path):
+    for kind in (Slow, Rewritten):
+        kind.__name__ = "Track"
+    assert load(path, pose(Rewritten())).estimates == result.estimates
+    with pytest.raises(ValueError, match=r"a.npz: the code has changed .* jax .*sum of squares .* then, .* now"):
+        load(path, pose(Slow()))
+
+
+def test_a_fit_of_another_problem_is_refused(path):
+    for other, message in (
+        (pose(free=["gain"]), r"free parameters \(gain, drift there, gain here\)"),
+        (pose(trials=TRIALS[:1]), r"windows \(2 there, 1 here\)"),
+        (pose(trials=[TRIALS[0], TRIALS[0]]), r"data \("),
+        (pose(unknown=()), r"unknown starts \(x there, none here\)"),
+        (pose(simulation=Simulation(step=0.05)), r"data \("),
+        (pose(simulation=Simulation(rtol=1e-7)), r"rtol \("),
+        (pose(Track(gain=2.0)), r"initial guesses, priors \("),
+    ):
+        with pytest.raises(ValueError, match=rf"a.npz is the fit of another problem. It differs in .*{message}"):
+            load(path, other)
+
+
+def test_a_file_that_is_no_fit_is_named(path, tmp_path):
+    problem, data = pose(), path.read_bytes()
+    for damaged in (b"", bytes(500), data[:-40], b"thesis"):
+        path.write_bytes(damaged)
+        with pytest.raises(ValueError, match=r"a.npz cannot be read as the state of a fit .*it is damaged"):
+            load(path, problem)
+    kept = tmp_path / "checkpoint.npz"
+    minimize(problem, LeastSquares(), steps=1, checkpoint=kept)
+    with pytest.raises(ValueError, match=r"checkpoint.npz is the checkpoint of a fit"):
+        load(kept, problem)
+    path.write_bytes(data)
+    with pytest.raises(ValueError, match=r"a.npz is the state of another fit. It differs in"):
+        minimize(problem, LeastSquares(), checkpoint=path)
+    with pytest.raises(FileNotFoundError):
+        load(tmp_path / "nothing.npz", problem)
+
+
+def test_a_problem_before_a_fit_and_a_fit_after_it(result):
+    for ask in (identifiability, log_density, multi_start):
+        with pytest.raises(TypeError, match=rf"{ask.__name__} takes a Problem, as in .*fit.problem"):
+            ask(result)
+    for ask in (laplace, cross_validate, lambda problem: profile(problem, "gain")):
+        with pytest.raises(TypeError, match=r"takes a Fit, as in .*got Problem"):
+            ask(result.problem)
+    seen = identifiability(result.problem, at=result.point)
+    np.testing.assert_allclose(seen.singular_values, result.singular_values, rtol=1e-9)
+
+
+def test_options_of_the_optimizer_and_of_the_simulation_are_two(result):
+    coarse = fit(Track(gain=3.0), TRIALS, FREE, unknown=("x",), optimizer=LeastSquares(rtol=0.5, damping=3.0))
+    assert coarse.status == "converged"
+    assert coarse.cost > 1.001 * result.cost
+    tight = fit(
+        Track(),
+        TRIALS,
+        FREE,
+        unknown=("x",),
+        optimizer=LeastSquares(rtol=1e-10),
+        simulation=Simulation(rtol=1e-9),
+        steps=7,
+    )
+    assert tight.problem.model.settings.rtol == 1e-9
+    assert np.isnan(tight.step_error)
+
+
+def test_a_descent_whose_rate_follows_from_its_steps_goes_on_for_as_many_only(result, tmp_path):
+    path, problem = tmp_path / "descent.npz", result.problem
+    begun = minimize(problem, GradientDescent(rtol=0.0), steps=2, checkpoint=path)
+    assert begun.status == "steps"
+    with pytest.raises(ValueError, match=r"It differs in steps of its schedule \(2 there, 4 here\)"):
+        minimize(problem, GradientDescent(rtol=0.0), steps=4, checkpoint=path)
+
+
+def test_true_values_are_known_by_name(result):
+    assert "truth" in result.table({"gain": 1.0})
+    assert "truth" in result.table(Track(gain=1.5))
+    with pytest.raises(ValueError, match=r"truth.* gian; did you mean 'gain'\?"):
+        result.table({"gian": 1.0})
+    with pytest.raises(TypeError, match="a Track, or values by name; got Cart"):
+        report(result, Cart())
