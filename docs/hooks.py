@@ -23,7 +23,7 @@ NOTEBOOKS = Path(os.environ.get("JAXKANE_NOTEBOOKS") or ROOT / "notebooks")
 def public_names(module):
     """What a module's `__init__.py` exports, `from ._x import y as y`, with the room it is from; no submodules."""
     tree = ast.parse((PACKAGE.joinpath(*module.split(".")[1:]) / "__init__.py").read_text(encoding="utf-8"))
-    imports = [node for node in tree.body if isinstance(node, ast.ImportFrom) and node.module]
+    imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module]
     names = [(alias, node.module.split(".")[0]) for node in imports for alias in node.names]
     return {alias.asname: room for alias, room in names if alias.asname == alias.name}
 

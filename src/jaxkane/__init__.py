@@ -56,6 +56,7 @@ __version__ = "0.1.0"
 # Rooms that a description and its motion do not need, and what they import (scipy, optax), are imported when named.
 if _typing.TYPE_CHECKING:
     from . import catalog as catalog
+    from . import data as data
     from . import fit as fit
     from . import plot as plot
     from . import stability as stability
@@ -64,7 +65,7 @@ if _typing.TYPE_CHECKING:
     from ._animate import Sketch as Sketch
     from ._animate import animate as animate
 
-_ROOMS = ("catalog", "fit", "plot", "stability", "sweep")
+_ROOMS = ("catalog", "data", "fit", "plot", "stability", "sweep")
 _OF_ANIMATE = ("Animation", "Sketch", "animate")
 
 

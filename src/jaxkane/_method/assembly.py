@@ -9,15 +9,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jax.core import Tracer
 
 from .._common.lookup import refuse_unknown
 from .._description.system import State, System
+from .._scalars.jax_internals import concretely
 from .._scalars.nan import nan_where
 from .._scalars.reads import compiled
 from .._scalars.types import Component
+from .check_description import MOST_REMEMBERED, structure_of, with_trial_numbers
 from .checks import check_system, configuration_residual, is_concrete
-from .kane import Instant, as_array
+from .equations import dependent_speeds
+from .kane import as_array
 
 
 def assemble(
@@ -64,7 +66,7 @@ def assemble(
     if is_concrete(system, q0, u0, t):
         check_system(system, t, q0)
         if given:
-            u_dep = dict(zip(system.dependent_speeds, Instant(system, t, q0, u0).u_dep, strict=True))
+            u_dep = dict(zip(system.dependent_speeds, dependent_speeds(system, t, q0, u0), strict=True))
             _check_dependent_speeds(name, given, u_dep)
     return State(q0, u0)
 
@@ -99,33 +101,31 @@ def _plan(system: System, q: Any, free: Sequence[str] | None) -> _Plan:
     return _Plan(tuple(c for c in names if c not in named and c not in still), named, guess, lenient=True)
 
 
-_EULER_PARAMETERS: dict[Any, list[tuple[int, ...]]] = {}
+_EULER_PARAMETERS: dict[Any, list[tuple[int, ...]]] = {}  # structures, the oldest first
 
 
 def _euler_parameters(system: System) -> list[tuple[int, ...]]:
     """Places of every four coordinates, one after the other, of which a constraint says that their norm is one."""
-    structure = jax.tree.structure(system)
-    if structure in _EULER_PARAMETERS:
-        return _EULER_PARAMETERS[structure]
-    probe = np.random.default_rng(0).uniform(0.2, 0.9, len(system.coordinates))
-    try:
-        # Exact numbers: what does not depend on parameters is known even under a trace.
-        residuals = system.configuration_constraints(0.0, probe.tolist())
-    except (AttributeError, TypeError):
-        residuals = ()  # a description that can be read with arrays only
-    values = [abs(float(h)) for h in residuals if not isinstance(h, Tracer)]
-    found = []
-    for i in range(len(probe) - 3):
-        square = float(np.sum(probe[i : i + 4] ** 2))
-        if any(abs(h - x) < 1e-5 for h in values for x in (abs(square - 1.0), abs(square**0.5 - 1.0))):
-            found.append((i, i + 1, i + 2, i + 3))
-    if len(values) == len(residuals):
-        _EULER_PARAMETERS[structure] = found
+    structure = structure_of(system)
+    found = _EULER_PARAMETERS.get(structure)
+    if found is None:
+        rng = np.random.default_rng(0)
+        probe = rng.uniform(0.2, 0.9, len(system.coordinates)).astype(jnp.result_type(float))
+        with concretely():
+            residuals = configuration_residual(*with_trial_numbers((system, np.zeros((), probe.dtype), probe), rng))
+        values = np.abs(np.asarray(residuals))
+        found = _EULER_PARAMETERS[structure] = [
+            (i, i + 1, i + 2, i + 3)
+            for i, square in enumerate(np.convolve(probe**2, np.ones(4), "valid") if len(probe) > 3 else ())
+            if any(np.any(np.abs(values - abs(x)) < 1e-5) for x in (square - 1.0, square**0.5 - 1.0))
+        ]
+        if len(_EULER_PARAMETERS) > MOST_REMEMBERED:
+            _EULER_PARAMETERS.pop(next(iter(_EULER_PARAMETERS)), None)
     return found
 
 
 def _solve_configuration(system: System, q0, t, plan: _Plan):
-    t = jnp.asarray(t, dtype=q0.dtype)
+    t = jnp.asarray(t if isinstance(t, jax.Array) else np.asarray(t, q0.dtype), dtype=q0.dtype)
     n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q0).shape[0]
     if n_h == 0:
         return q0
@@ -138,7 +138,7 @@ def _solve_configuration(system: System, q0, t, plan: _Plan):
     found = _newton(system, q0, t, places, plan.lenient)
     if is_concrete(system, found.q, t) and not bool(found.good):
         raise ValueError(_why_not(system, q0, plan, found))
-    return nan_where(~found.good, found.q, (system, q0, t))
+    return found.q
 
 
 def _met(residuals):
@@ -159,7 +159,7 @@ def _slopes(system: System, t, q, places: np.ndarray):
 
 
 class _Found(NamedTuple):
-    q: Any
+    q: Any  # NaN where it is not good
     good: Any  # the constraints are met, and determine what was moved
     remainder: Any  # largest residual
     slope: Any  # smallest singular value of the residuals' derivatives along what was moved
@@ -168,7 +168,7 @@ class _Found(NamedTuple):
 
 @compiled
 def _newton(system: System, q0, t, where: tuple[int, ...], lenient: bool) -> _Found:
-    places = np.array(where, int)
+    places, origin = np.array(where, int), (system, q0, t)
     # What is not finite must not enter the linear solver, which would raise for all members of a batch.
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((system, q0))]))
     system, q0 = jax.tree.map(lambda x: jnp.where(finite, x, jnp.ones_like(x)), (system, q0))
@@ -194,6 +194,7 @@ def _newton(system: System, q0, t, where: tuple[int, ...], lenient: bool) -> _Fo
     derivatives = jax.jacfwd(residual)(jax.lax.stop_gradient(solution.value), jax.lax.stop_gradient(args))
     slope = jnp.linalg.svd(derivatives, compute_uv=False)[-1]
     good = finite & jnp.all(_met(h)) & (slope > eps**0.6)
+    q = nan_where(~good, q, origin)
     return _Found(q, good, jnp.max(jnp.abs(h)), slope, solution.stats["num_steps"])
 
 

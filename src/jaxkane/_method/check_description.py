@@ -27,7 +27,7 @@ from .._scalars.types import Component
 from .kane import Reading
 
 _CHECKED: dict[Any, None] = {}  # structures, the oldest first
-_MOST_REMEMBERED = 1000
+MOST_REMEMBERED = 1000
 _SIZES = (-1.0, 1e-2, -20.0, 1e3)  # multiples of trial speeds of order 1
 
 Found = dict[tuple[Any, ...], Any]  # (number, kind, names ...) -> numbers; the number keeps the order of the reading
@@ -44,21 +44,26 @@ def check_description(system: System, t: Any, q: Any) -> None:
     the motion violates, a body whose inertia is not constant in its frame, a name that stands for two forces.
     `TypeError` for methods that return something else than they should, or ask for the value of what is traced.
     """
-    structure = (version_of(system), jax.tree.structure(system), *(np.shape(x) for x in jax.tree.leaves(system)))
+    structure = structure_of(system)
     if structure in _CHECKED:
         return
     if q is not None and not isinstance(q, Tracer) and not np.all(np.isfinite(q)):
         return
     rng = np.random.default_rng(0)
-    numbers = _with_trial_numbers((system, t, q), rng)
+    numbers = with_trial_numbers((system, t, q), rng)
     are_given = q is not None and not any(isinstance(x, Tracer) for x in jax.tree.leaves((system, t, q)))
     if _Description(*numbers, rng=rng).check(are_given):
         _CHECKED[structure] = None
-        if len(_CHECKED) > _MOST_REMEMBERED:
+        if len(_CHECKED) > MOST_REMEMBERED:
             _CHECKED.pop(next(iter(_CHECKED)), None)
 
 
-def _with_trial_numbers(tree: tuple[System, Any, Any], rng: np.random.Generator) -> tuple[System, Any, Any]:
+def structure_of(system: System) -> tuple[Any, ...]:
+    """What a description is, apart from the values of its parameters."""
+    return (version_of(system), jax.tree.structure(system), *(np.shape(x) for x in jax.tree.leaves(system)))
+
+
+def with_trial_numbers(tree: tuple[System, Any, Any], rng: np.random.Generator) -> tuple[System, Any, Any]:
     """Numbers for what is traced: positive parameters, small coordinates; arrays of length 1, as axes and quaternions
     are, and unit matrices."""
     system, t, q = tree

@@ -51,6 +51,8 @@ def check_system(system: System, t: Any, q: Any, *, bodies: bool = True) -> None
     if is_batch(system):
         return
     system, t, q = jax.tree.map(_value, (system, t, q))
+    # Of one type, whoever asks: a number of Python and an array would be two programs.
+    t = t if isinstance(t, Tracer) else np.asarray(t, jnp.result_type(float) if q is None else q.dtype)
     with concretely(), np.errstate(invalid="ignore", over="ignore"):
         check_description(system, t, q)
         if bodies and q is not None and is_concrete(system, t, q):

@@ -25,6 +25,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array
 
 from .._common.lookup import not_there, refuse_unknown
@@ -349,8 +350,12 @@ def _numbers(values: Any, names: Sequence[str], label: str) -> Array:
 def by_names(values: Mapping[str, Any], names: Sequence[str], label: str) -> Array:
     """Numbers by name as an array (*batch, len(names)); those not named are zero."""
     refuse_unknown(values, names, f"{label} has no", "it has")
-    columns = [jnp.asarray(values.get(name, 0.0), dtype=float) for name in names]
-    return jnp.stack(jnp.broadcast_arrays(*columns), axis=-1) if columns else jnp.zeros(0)
+    # What is known is put together by NumPy: operation by operation, JAX would compile a program for each.
+    is_traced = any(isinstance(x, Tracer) for value in values.values() for x in jax.tree.leaves(value))
+    xp: Any = jnp if is_traced else np
+    dtype = jnp.result_type(float)
+    columns = [xp.asarray(values.get(name, 0.0), dtype=dtype) for name in names]
+    return jnp.asarray(xp.stack(xp.broadcast_arrays(*columns), axis=-1) if columns else np.zeros(0, dtype), dtype=dtype)
 
 
 def refuse_incomplete(system: System, q: Any, u: Any) -> None:

@@ -19,7 +19,7 @@ from .._method.drift import correction, has_configuration_constraints, projected
 from .._method.equations import dependent_speeds
 from .._method.kane import Instant, checked_inputs
 from .._method.rates import state_rates
-from .._scalars.nan import derivative_free_where_not_finite, nan_derivative_where, nan_where
+from .._scalars.nan import all_finite, derivative_free_where_not_finite, nan_derivative_where, nan_where
 from .._scalars.reads import compiled
 from .._scalars.types import Component
 from .events import Events, at_zero, determinant_of_dependent_speeds, events_of, values_and_rates
@@ -199,13 +199,14 @@ def inputs_at(system: System, signals: Any, t: Component, q: Array, u: Array, al
 
 
 def _is_valid(system: System, state: State, ts: Array, signals: Any) -> Array:
-    finite = [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((system, state, ts)) if eqx.is_inexact_array(x)]
     positive = [jnp.all(getattr(system, name) > 0) for name, info in parameter_info(system).items() if info.positive]
     residual = configuration_residual(system, ts[0], state.q)
     consistent = jnp.all(jnp.abs(residual) <= configuration_tolerance(residual.dtype))
     # A window of a fit may stand still at its last time.
     rising = jnp.all(ts[1:] >= ts[:-1]) & (ts[-1] > ts[0])
-    return jnp.all(jnp.stack([*finite, *positive, consistent, rising, signals_are_sound(signals)]))
+    return jnp.all(
+        jnp.stack([all_finite((system, state, ts)), *positive, consistent, rising, signals_are_sound(signals)])
+    )
 
 
 def _status(solution: diffrax.Solution, which: Array, events: Events) -> Array:

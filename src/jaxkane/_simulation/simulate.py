@@ -6,6 +6,8 @@ import dataclasses
 from typing import Any, Literal
 
 import diffrax
+import numpy as np
+from jax.core import Tracer
 
 from .._description.system import State, System
 from .._method.checks import check_state, check_system, is_concrete, with_possible_bodies
@@ -63,10 +65,11 @@ def simulate(
     state = checked_state(system, state)
     ts = checked_times(ts, state.q.dtype)
     signals = as_signals(inputs, system.inputs, ts, type(system).__name__)
-    check_state(system, ts[0], state.q)
-    check_system(system, ts[0], state.q)
+    t = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
+    check_state(system, t, state.q)
+    check_system(system, t, state.q)
     if not is_concrete(system):
-        state = with_possible_bodies(system, ts[0], state)
+        state = with_possible_bodies(system, t, state)
     settings = settings_for(
         ts,
         rtol=rtol,
@@ -88,7 +91,7 @@ def simulate(
             ride = solve(system, state, ts, signals, dataclasses.replace(settings, adjoint=ADJOINTS["forward"]()))
         except TypeError:
             raise error from None
-    if is_concrete(ride.status) and ride.status == Status.NO_SOLUTION:
+    if is_concrete(ride.status) and int(ride.status) == Status.NO_SOLUTION:
         inputs_now = inputs_at(system, signals, ts[0], state.q, state.u)
         raise ValueError(
             diagnosis(system, ts[0], state.q, state.u, inputs_now) or _UNSOLVED.format(type(system).__name__)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import csv
+import gzip
 import os
+import zlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -34,12 +36,13 @@ def read_trials(
     - `t`: the column of the times [s]. `by`: the column that tells the trials apart; without it the file is one trial.
     - `sigma`: as `Trial` takes it.
 
-    An empty cell, or one that says NaN, is a gap. The file is UTF-8, with or without a byte-order mark.
+    An empty cell, or one that says NaN, is a gap. The file is UTF-8, with or without a byte-order mark; compressed by
+    gzip where its name ends in `.gz`.
 
     **Returns:** trials in the order of the file, named after the file and the value of `by`.
 
     **Raises:** `ValueError` that names file, line and column for a column that is missing or there twice, a short line,
-    text in a number, or another encoding.
+    text in a number, another encoding, or a damaged file.
     """
     path = Path(path)
     groups = [dict(measured), dict(inputs or {}), dict(initial or {})]
@@ -47,7 +50,8 @@ def read_trials(
     rows = _read(path, columns, by)
     trials = []
     for key, table in rows.items():
-        name = path.stem if by is None else f"{path.stem}, {by} {key}"
+        stem = path.name.partition(".")[0]
+        name = stem if by is None else f"{stem}, {by} {key}"
         chosen = [{name: table[column] for name, column in group.items()} for group in groups]
         trials.append(Trial(table[t], chosen[0], chosen[1], sigma=sigma, initial=chosen[2], name=name))
     return trials
@@ -59,10 +63,13 @@ def _read(path: Path, columns: list[str], by: str | None) -> dict[str, dict[str,
         return _tables(path, columns, by)
     except (UnicodeDecodeError, csv.Error) as error:
         raise ValueError(f"{path} is no CSV file in UTF-8: {error}.") from None
+    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+        raise ValueError(f"{path} is damaged, or was not compressed by gzip: {error}.") from None
 
 
 def _tables(path: Path, columns: list[str], by: str | None) -> dict[str, dict[str, np.ndarray]]:
-    with path.open(newline="", encoding="utf-8-sig") as file:  # with or without a byte-order mark
+    opened = gzip.open if path.suffix == ".gz" else open
+    with opened(path, "rt", newline="", encoding="utf-8-sig") as file:  # with or without a byte-order mark
         lines = csv.reader(file)
         header = [cell.strip() for cell in next(lines, [])]
         needed = (*columns, *([by] if by else []))
