@@ -64,6 +64,7 @@ PAGES = {
     "stability": "stability",
     "plot": "pictures",
     "catalog": "catalogue",
+    "data": "identification",
 }
 PAGES |= {"loads": "describing", "rotations": "describing"}
 
