@@ -4,16 +4,14 @@
                offsets on roll rate, steer and steer rate; three parameters up to 30 % off, ten random initial guesses;
                by multiple shooting, and by a single shoot
     coverage   at 1, 3, 5 and 7 m/s jointly, eight parameters: how often 95 % intervals hold the truth in repetitions
-    measured   31 rides of a steer-by-wire bicycle (`--data FOLDER`): damping alone, four parameters, trials left out
+    measured   31 rides of a steer-by-wire bicycle: damping alone, four parameters, trials left out
 
-Run:      python benchmarks/identification.py [unstable] [coverage] [measured] [--data FOLDER] [--repetitions 100]
+Run:      python benchmarks/identification.py [unstable] [coverage] [measured] [--repetitions 100]
 Takes:    on two cores two minutes, two minutes, and one.
 """
 
 import argparse
-import json
 import time
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -31,7 +29,6 @@ from jaxkane.fit import (
     fit_bicycle,
     minimize,
     multi_start,
-    read_trials,
     report,
 )
 
@@ -128,17 +125,9 @@ def coverage(repetitions):
         print(f"{name:<16}{n:>4} of {repetitions} intervals hold the truth; z {mean:+.2f} ± {std:.2f}")
 
 
-def measured(folder):
-    values = {"IByy": 2.0, "IHyy": 0.01} | json.loads((folder / "parameters.json").read_text())
-    rides = read_trials(
-        folder / "free_responses.csv",
-        {"roll": "roll_angle", "steer": "steer_angle", "roll_rate": "roll_rate", "steer_rate": "steer_rate"},
-        inputs={"steer_torque": "steer_torque"},
-        initial={"speed": "speed_treadmill"},
-        sigma={"roll": 0.01, "steer": 0.02, "roll_rate": 0.1, "steer_rate": 0.2},
-        by="segment",
-    )
-    rides, bicycle = [r.between(0.0, 0.995) for r in rides], WhippleBicycle.from_parameters(values)
+def measured():
+    recording = jk.data.steer_by_wire()
+    rides, bicycle = recording.trials, WhippleBicycle.from_parameters(recording.parameters)
     options = {"input_bias": ("roll_torque", "steer_torque"), "hold": ("steer_torque",), "optimizer": LeastSquares()}
     four = (Gain("steer_torque"), "steer_damping", "IHzz", "c")
     for free in (("steer_damping",), four, four, (*four, "IBxx")):
@@ -152,15 +141,14 @@ def measured(folder):
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("what", nargs="*", default=["unstable", "coverage"], help="unstable, coverage, measured")
-    parser.add_argument("--data", type=Path, help="folder with free_responses.csv and parameters.json")
     parser.add_argument("--repetitions", type=int, default=100)
     arguments = parser.parse_args()
     if "unstable" in arguments.what:
         unstable()
     if "coverage" in arguments.what:
         coverage(arguments.repetitions)
-    if arguments.data:
-        measured(arguments.data)
+    if "measured" in arguments.what:
+        measured()
 
 
 if __name__ == "__main__":

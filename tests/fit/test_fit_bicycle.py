@@ -1,8 +1,5 @@
 """Bicycles: four parameters of a simulated one, the damping of a measured one."""
 
-import json
-from pathlib import Path
-
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -22,10 +19,8 @@ from jaxkane.fit import (
     frame_inertia,
     minimize,
     multi_start,
-    read_trials,
 )
 
-MEASURED = Path(__file__).parents[3] / "shared" / "data" / "steer_by_wire"
 SIGMA = {"roll": 0.005, "steer": 0.005, "roll_rate": 0.03, "steer_rate": 0.05}
 OFF = {"IBxx": 1.2, "zB": 0.8, "c": 1.2, "IFyy": 0.8}
 
@@ -119,18 +114,8 @@ def test_priors_of_a_file(tmp_path):
 @pytest.fixture(scope="module")
 def measured():
     """The first second of 31 rides of a steer-by-wire bicycle, and its authors' parameters."""
-    if not MEASURED.exists():
-        pytest.skip("../shared/data/steer_by_wire is absent: the measured rides are not part of the repository")
-    rides = read_trials(
-        MEASURED / "free_responses.csv",
-        {"roll": "roll_angle", "steer": "steer_angle", "roll_rate": "roll_rate", "steer_rate": "steer_rate"},
-        inputs={"steer_torque": "steer_torque"},
-        initial={"speed": "speed_treadmill"},
-        sigma={"roll": 0.01, "steer": 0.02, "roll_rate": 0.1, "steer_rate": 0.2},
-        by="segment",
-    )
-    parameters = json.loads((MEASURED / "parameters.json").read_text()) | {"IByy": 2.0, "IHyy": 0.01}
-    return [ride.between(0.0, 0.995) for ride in rides], WhippleBicycle.from_parameters(parameters)
+    recording = jk.data.steer_by_wire()
+    return recording.trials, WhippleBicycle.from_parameters(recording.parameters)
 
 
 OPTIONS = {"input_bias": ("roll_torque", "steer_torque"), "hold": ("steer_torque",)}
