@@ -1,5 +1,6 @@
 """One residual, several transcriptions: chained windows, delays, gains, rates, gaps; and what is kept in a file."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -235,3 +236,50 @@ def test_tied_parameters_and_gains():
     result = minimize(problem, LeastSquares())
     assert result.estimates["gain of push"] == pytest.approx(2.0, abs=0.05)
     assert float(result.system.damping) == pytest.approx(0.4, abs=0.02)
+
+
+class Pulled(jk.System):
+    """Two forces on one mass."""
+
+    mass: jk.Scalar = jk.parameter(1.0, positive=True)
+    coordinates = ("x",)
+    speeds = ("x_dot",)
+    inputs = ("left", "right")
+
+    def motion(self, t, q, u):
+        N, _ = jk.inertial()
+        P = jk.Point.at(u[0] * N.x, q[0] * N.x, "P")
+        return jk.Motion([jk.Body(self.mass, 0.0, P, name="cart")], frames={"N": N})
+
+    def loads(self, t, q, u, motion, inputs):
+        return (jk.Force((inputs["right"] - inputs["left"]) * motion.N.x, motion["cart"]),)
+
+
+@pytest.mark.parametrize(("options", "kinks", "anew"), [({}, 11, False), ({"input_delay": ["left"]}, 2 * 23, True)])
+def test_inputs_that_share_their_times_share_their_kinks(options, kinks, anew, monkeypatch):
+    import jaxkane._simulation.ride as ride
+
+    seen, original = [], ride.sample_times
+    monkeypatch.setattr(ride, "sample_times", lambda *a: seen.append(original(*a)) or seen[-1])
+    t = np.linspace(0.0, 1.0, 11)
+    trial = Trial(t, {"x": 0.1 * t**2}, {"left": np.sin(t), "right": np.cos(t)}, sigma=0.1)
+    problem = Problem.of(Pulled(), trial, "mass", simulation=Simulation(rtol=1e-6), **options)
+    window = jax.tree.map(lambda x: x[0], problem.windows)
+    jax.eval_shape(problem.model.simulate, window, window.start, problem.start.b[0], problem.start.x)
+    assert [(times.shape[0], several) for times, several in seen] == [(kinks, anew)]
+
+
+def test_kinks_that_are_shared_move_together():
+    # x(1) = int (1 - t) f(t - s) dt for a delay s; by parts, its slope at s = 0 is -int (1 - t) f'(t) dt.
+    t = np.linspace(0.0, 1.0, 5)
+    left, right = np.sin(5.0 * t), np.cos(3.0 * t)
+
+    def end(delay, apart):
+        times = jnp.asarray(t) + delay
+        inputs = {"left": jk.Samples(times, left), "right": jk.Samples(times + 0.0 if apart else times, right)}
+        return jk.simulate(Pulled(), jk.State(jnp.zeros(1), jnp.zeros(1)), t, inputs)["x"][-1]
+
+    slopes, middles = np.diff(right - left), 1.0 - (t[1:] + t[:-1]) / 2
+    for apart in (False, True):
+        found = jax.jit(jax.jacfwd(lambda s, apart=apart: end(s, apart)))(0.0)
+        assert float(found) == pytest.approx(-float(slopes @ middles), rel=1e-8)

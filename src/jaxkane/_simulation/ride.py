@@ -25,7 +25,7 @@ from .._scalars.types import Component
 from .events import Events, at_zero, determinant_of_dependent_speeds, events_of, values_and_rates
 from .kinks import ToKinks
 from .settings import Settings
-from .signals import evaluate, sample_times, signals_are_sound, without_nonsense
+from .signals import evaluate, sample_times, signals_are_sound, with_own_times, without_nonsense
 from .stops import AdaptiveToStops, Quantities, ToStops
 from .trajectory import Status, Trajectory
 
@@ -52,6 +52,7 @@ class Now(eqx.Module):
 @compiled
 def solve(system: System, state: State, ts: Array, signals: Any, settings: Settings) -> Trajectory:
     """`simulate` without its checks: one compiled program."""
+    signals = with_own_times(signals)
     origin = (system, state, ts, signals)
     valid = _is_valid(*origin)
     # What is not finite must not enter the solver, where it would spoil the gradient of what is shared.

@@ -99,6 +99,36 @@ def _is_samples(x: Any) -> bool:
     return isinstance(x, Samples)
 
 
+class OneTimes(eqx.Module):
+    """Signals whose samples share their times, fit to be an argument of a compiled program, in which arrays are no
+    longer the same: `times` without repetition, and `signals` with a number in the place of their times."""
+
+    times: tuple[Array, ...]
+    signals: Any
+
+
+def with_one_times(signals: Any) -> OneTimes:
+    """To be undone by `with_own_times` where the program begins."""
+    times: dict[int, Array] = {}
+
+    def numbered(x: Any) -> Any:
+        if not _is_samples(x):
+            return x
+        times.setdefault(id(x.ts), x.ts)
+        return eqx.tree_at(lambda s: s.ts, x, list(times).index(id(x.ts)))
+
+    signals = jax.tree.map(numbered, signals, is_leaf=_is_samples)
+    return OneTimes(tuple(times.values()), signals)
+
+
+def with_own_times(given: Any) -> Any:
+    """Signals with their times, the same array where they share them."""
+    if not isinstance(given, OneTimes):
+        return given
+    there = lambda x: eqx.tree_at(lambda s: s.ts, x, given.times[x.ts]) if _is_samples(x) else x  # noqa: E731
+    return jax.tree.map(there, given.signals, is_leaf=_is_samples)
+
+
 def sample_times(signals: Any, dtype: Any) -> tuple[Array, bool] | None:
     """All times at which some signal has a kink, in their order, and whether two signals may have theirs at one time
     and not together; None where there is none."""
@@ -116,9 +146,12 @@ def signals_are_sound(signals: Any) -> Array:
 def without_nonsense(signals: Any, valid: Array) -> Any:
     """The signals where they are valid, else others of the same shapes that spoil no derivative."""
 
+    times: dict[int, Array] = {}  # signals that share their times go on sharing them: see `sample_times`
+
     def safe(x: Any) -> Any:
         if _is_samples(x):
-            ts = jnp.where(valid, x.ts, jnp.arange(x.ts.shape[0], dtype=x.ts.dtype))
+            other = jnp.arange(x.ts.shape[0], dtype=x.ts.dtype)
+            ts = times.setdefault(id(x.ts), jnp.where(valid, x.ts, other))
             return eqx.tree_at(lambda s: (s.ts, s.values), x, (ts, safe(x.values)))
         return jnp.where(valid, x, jnp.ones_like(x)) if eqx.is_inexact_array(x) else x
 

@@ -15,7 +15,7 @@ from .._method.diagnose import diagnosis
 from .._scalars.types import Inputs
 from .ride import inputs_at, solve
 from .settings import ADJOINTS, checked_state, checked_times, settings_for
-from .signals import as_signals
+from .signals import as_signals, with_one_times
 from .trajectory import Status, Trajectory
 
 
@@ -82,13 +82,14 @@ def simulate(
         max_steps=max_steps,
         progress=progress,
     )
+    shared = with_one_times(signals)
     try:
-        ride = solve(system, state, ts, signals, settings)
+        ride = solve(system, state, ts, shared, settings)
     except TypeError as error:  # as JAX says, too, that a derivative forward through the reverse adjoint is asked for
         if adjoint != "auto":
             raise
         try:
-            ride = solve(system, state, ts, signals, dataclasses.replace(settings, adjoint=ADJOINTS["forward"]()))
+            ride = solve(system, state, ts, shared, dataclasses.replace(settings, adjoint=ADJOINTS["forward"]()))
         except TypeError:
             raise error from None
     if is_concrete(ride.status) and int(ride.status) == Status.NO_SOLUTION:

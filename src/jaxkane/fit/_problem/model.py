@@ -21,7 +21,7 @@ from ..._method.assembly import assemble
 from ..._scalars.reads import compiled
 from ..._simulation.ride import solve
 from ..._simulation.settings import Settings
-from ..._simulation.signals import Samples
+from ..._simulation.signals import Samples, with_one_times
 from ..._simulation.trajectory import Trajectory
 from .._data.windows import Windows
 from .blocks import Blocks
@@ -106,14 +106,21 @@ class Model(eqx.Module):
             bias = self.nuisance.of_trial(b, "bias of input", name, 0.0)
             if name in self.driven:
                 gain = roles.get(("gain", name), 1.0) * self.nuisance.of_trial(b, "gain of input", name, 1.0)
-                delay = roles.get(("delay", name), 0.0) + self.nuisance.of_trial(b, "delay of input", name, 0.0)
                 kind = Held if name in self.held else Samples
-                signals[name] = kind(window.t_input + delay, gain * window.inputs[i] + bias)
+                signals[name] = kind(self._times_of(name, window, b, roles), gain * window.inputs[i] + bias)
             elif ("bias of input", name) in self.nuisance.trial:
                 signals[name] = bias
         n_q = len(system.coordinates)
         settings = self.settings if self.settings.step is None else dataclasses.replace(self.settings, step=window.step)
-        return solve(system, State(start[:n_q], start[n_q:]), window.t, signals, settings)
+        return solve(system, State(start[:n_q], start[n_q:]), window.t, with_one_times(signals), settings)
+
+    def _times_of(self, name: str, window: Windows, b: Array, roles: dict[tuple[str, str], Array]) -> Array:
+        """When an input's samples act (n_in,) [s]: the same array for all that have no delay, since kinks that are
+        known to be at the same times cost no more than those of one input."""
+        if ("delay", name) not in roles and ("delay of input", name) not in self.nuisance.trial:
+            return window.t_input
+        delay = roles.get(("delay", name), 0.0) + self.nuisance.of_trial(b, "delay of input", name, 0.0)
+        return window.t_input + delay
 
     def simulated(self, ride: Trajectory, b: Array) -> Array:
         """What the sensors would have said (n_c, n_t)."""
