@@ -252,3 +252,17 @@ N, O = jk.inertial()
 def test_what_is_no_vector_frame_or_point_is_refused_in_words(call, words):
     with pytest.raises((TypeError, ValueError), match=re.escape(words)):
         call()
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda s: jk.accelerations(s, 0.0, [0.1, 0.2], [0.0, 0.0]),
+        lambda s: jk.positions(s, 0.0, [0.1, 0.2], [0.0, 0.0]),
+        lambda s: jk.simulate(s, jk.State([0.1, 0.2], [0.0, 0.0]), [0.0, 1.0]),
+        lambda s: jk.stability.equilibrium(s),
+    ],
+)
+def test_one_instant_refuses_a_batch_of_systems_by_its_name(ask):
+    with pytest.raises(ValueError, match="DoublePendulum: mass has more axes than it was declared with.*jax.vmap"):
+        ask(jk.catalog.DoublePendulum(mass=np.array([1.0, 2.0])))

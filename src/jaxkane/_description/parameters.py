@@ -58,6 +58,11 @@ def parameter_info(system: System | type[System]) -> dict[str, ParameterInfo]:
     return {f.name: f.metadata["jaxkane"] for f in fields if "jaxkane" in f.metadata}
 
 
+def in_batches(system: System) -> list[str]:
+    """Parameters that have leading axes more than they were declared with."""
+    return [n for n, info in parameter_info(system).items() if np.ndim(getattr(system, n)) > len(info.shape)]
+
+
 def to_float(value: Any) -> Any:
     # What is no number is left alone here: `System.__check_init__` refuses it by its name.
     if isinstance(value, (jax.Array, np.ndarray)) and jnp.issubdtype(value.dtype, jnp.inexact):

@@ -16,7 +16,7 @@ import numpy as np
 from jax.core import Tracer
 
 from .._description.bodies import Body
-from .._description.parameters import parameter_info
+from .._description.parameters import in_batches
 from .._description.system import State, System
 from .._scalars.fuse import fused
 from .._scalars.jax_internals import concretely
@@ -34,11 +34,6 @@ def is_concrete(*trees: Any) -> bool:
     return not any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))
 
 
-def is_batch(system: System) -> bool:
-    """Whether some parameter has leading axes more than it was declared with."""
-    return any(np.ndim(getattr(system, name)) > len(info.shape) for name, info in parameter_info(system).items())
-
-
 def check_system(system: System, t: Any, q: Any, *, bodies: bool = True) -> None:
     """Refuse a description that contradicts itself, once for each structure, and `bodies` that cannot be.
 
@@ -48,7 +43,7 @@ def check_system(system: System, t: Any, q: Any, *, bodies: bool = True) -> None
     **Raises:** `ValueError` as `check_description`; for a negative mass, and an inertia that no body can have, as
     `check_bodies` says.
     """
-    if is_batch(system):
+    if in_batches(system):
         return
     system, t, q = jax.tree.map(_value, (system, t, q))
     # Of one type, whoever asks: a number of Python and an array would be two programs.

@@ -30,6 +30,7 @@ from jaxtyping import Array
 
 from .._common.lookup import not_there, refuse_unknown
 from .._description.bodies import Body, Load, Motion, flatten_loads, flatten_residuals
+from .._description.parameters import in_batches
 from .._description.system import System
 from .._scalars.components import add, add3, component, cross, dot, is_exact, is_zero, matvec, mul, scale3
 from .._scalars.linear import Rows, solve, solve_positive
@@ -95,6 +96,11 @@ class Reading:
     def __init__(self, system: System, inputs: Mapping[str, Component] | None = None):
         self.system = system
         self.name = type(system).__name__
+        if several := in_batches(system):
+            raise ValueError(
+                f"{self.name}: {', '.join(several)} has more axes than it was declared with. For a batch of systems "
+                "use jax.vmap, or jaxkane.sweep.sweep for their motions."
+            )
         self.n, self.k = len(system.speeds), len(system.dependent_speeds)
         self.inputs = Inputs(checked_inputs(system, inputs), f"the inputs of {self.name}")
 
