@@ -264,5 +264,5 @@ def test_what_is_no_vector_frame_or_point_is_refused_in_words(call, words):
     ],
 )
 def test_one_instant_refuses_a_batch_of_systems_by_its_name(ask):
-    with pytest.raises(ValueError, match="DoublePendulum: mass has more axes than it was declared with.*jax.vmap"):
+    with pytest.raises(ValueError, match=r"DoublePendulum: mass has more axes than it was declared with.*jax.vmap"):
         ask(jk.catalog.DoublePendulum(mass=np.array([1.0, 2.0])))
