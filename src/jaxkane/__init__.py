@@ -56,8 +56,10 @@ __version__ = "0.1.0"
 # Rooms that a description and its motion do not need, and what they import (scipy, optax), are imported when named.
 if _typing.TYPE_CHECKING:
     from . import catalog as catalog
+    from . import convert as convert
     from . import data as data
     from . import fit as fit
+    from . import joints as joints
     from . import plot as plot
     from . import stability as stability
     from . import sweep as sweep
@@ -65,7 +67,7 @@ if _typing.TYPE_CHECKING:
     from ._animate import Sketch as Sketch
     from ._animate import animate as animate
 
-_ROOMS = ("catalog", "data", "fit", "plot", "stability", "sweep")
+_ROOMS = ("catalog", "convert", "data", "fit", "joints", "plot", "stability", "sweep")
 _OF_ANIMATE = ("Animation", "Sketch", "animate")
 
 

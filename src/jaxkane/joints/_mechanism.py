@@ -1,0 +1,303 @@
+"""The system of a tree of links. Reads its structure; knows kinematics and no dynamics.
+
+For every structure there is one class, whose fields are the parameters that the structure has: `mass.forearm` is a
+field like any other, so that sweeps, fits and tables know it by this name. Programs are kept by class.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Mapping
+from typing import Any, ClassVar, NamedTuple
+
+from .._common.lookup import hint
+from .._description.bodies import Body, Force, Motion
+from .._description.parameters import parameter, parameter_info
+from .._description.system import System
+from .._description.vectors import Frame, Point, inertial
+from .._scalars.components import ZERO3, add, dot, is_zero, mul, sub
+from .._scalars.types import Component, Scalar, Triple
+from ..rotations import Matrix
+from ._joints import Placed, Shape, total
+
+KINDS = "mass center inertia position anchor site gravity damping stiffness rest armature"
+KINDS += " gain offset position_gain velocity_gain"
+"""Kinds of parameters: the first part of their names."""
+
+
+class LinkShape(NamedTuple):
+    name: str
+    parent: str | None
+    orientation: Matrix | None
+    joints: tuple[Shape, ...]
+    has_mass: bool
+
+
+class SiteShape(NamedTuple):
+    name: str
+    link: str | None
+    orientation: Matrix | None
+
+
+class ActuatorShape(NamedTuple):
+    name: str
+    joint: str
+    gear: tuple[float, ...]
+
+
+class LoopShape(NamedTuple):
+    first: str
+    second: str
+    rigid: bool
+    kept: tuple[int, ...]  # of its residuals
+
+
+class CouplingShape(NamedTuple):
+    first: str
+    second: str | None
+    coefficients: tuple[float, ...]
+    is_kept: bool
+
+
+class Structure(NamedTuple):
+    """All that is static in a mechanism."""
+
+    name: str
+    links: tuple[LinkShape, ...]  # parents before children
+    sites: tuple[SiteShape, ...] = ()
+    actuators: tuple[ActuatorShape, ...] = ()
+    loops: tuple[LoopShape, ...] = ()
+    couplings: tuple[CouplingShape, ...] = ()
+    dependent_speeds: tuple[str, ...] = ()
+    dependent_coordinates: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def joints(self) -> tuple[Shape, ...]:
+        return tuple(joint for link in self.links for joint in link.joints)
+
+
+class Mechanism(System):
+    """A tree of links and joints; made by `jaxkane.joints.mechanism`, or from a file by `jaxkane.convert`.
+
+    Parameters are read by kind and name, as `arm.mass["forearm"]` or `arm.center["forearm"]["z"]`, and named so in a
+    fit or the columns of a sweep: "mass.forearm", "center.forearm.z". `arm.replace({"mass.forearm": 1.3})` is a copy.
+    """
+
+    structure: ClassVar[Structure]
+    left_out: ClassVar[tuple[str, ...]] = ()
+    """What a file said and the mechanism does not have."""
+
+    def __init__(self, **values: Any):
+        for field in dataclasses.fields(self):  # names with a dot cannot be those of arguments
+            setattr(self, field.name, values.pop(field.name))
+        if values:
+            raise TypeError(f"{type(self).__name__} has no parameter {', '.join(values)}.")
+
+    def __reduce__(self) -> Any:
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return _restored, (self.structure, _fields(type(self)), values)
+
+    def replace(self, values: Mapping[str, Any]) -> Mechanism:
+        """A copy with other parameters, by name. **Raises:** `ValueError` for a name that is none."""
+        names = [field.name for field in dataclasses.fields(self)]
+        wrong = [name for name in values if name not in names]
+        if wrong:
+            raise ValueError(f"{type(self).__name__} has no parameter {wrong[0]!r}; {hint(wrong, names, 'it has')}")
+        return dataclasses.replace(self, **values)
+
+    def _read(self, name: str) -> Component:
+        return getattr(self, name, 0.0)
+
+    def _triple(self, name: str) -> Triple:
+        return self._read(f"{name}.x"), self._read(f"{name}.y"), self._read(f"{name}.z")
+
+    def _of(self, joint: Shape, q: Any, u: Any) -> tuple[list[Component], list[Component]]:
+        """The joint's own coordinates and speeds."""
+        return [q[name] for name in joint.names(joint.coordinates)], [u[name] for name in joint.names(joint.speeds)]
+
+    def q_dot(self, t, q, u):
+        return [rate for joint in self.structure.joints for rate in joint.rates(*self._of(joint, q, u))]
+
+    def motion(self, t, q, u):
+        N, O = inertial()
+        carried: dict[str | None, tuple[Frame, Point]] = {None: (N, O)}
+        bodies, points, placed = [], {}, {}
+        for link in self.structure.links:
+            F, P = carried[link.parent]
+            P = _moved(P, F, self._triple(f"position.{link.name}"))
+            F = _turned(F, link.orientation, link.name)
+            for joint in link.joints:
+                at = placed[joint.name] = joint.move(F, P, *self._of(joint, q, u), self._triple(f"anchor.{joint.name}"))
+                F, P = at.moved, at.end
+            carried[link.name] = F, P
+            if link.has_mass:
+                G = _moved(P, F, self._triple(f"center.{link.name}"))
+                bodies.append(Body(self._read(f"mass.{link.name}"), self._inertia(link.name), G, F, name=link.name))
+            else:
+                points[link.name] = P.fixed(F.vector(0.0, 0.0, 0.0))
+        for joint in self.structure.joints:
+            armature = self._read(f"armature.{joint.name}")
+            if not is_zero(armature):
+                bodies += joint.rotors(N, placed[joint.name].end, armature, self._of(joint, q, u)[1])
+        sites = {}
+        for site in self.structure.sites:
+            F, P = carried[site.link]
+            points[site.name] = P.fixed(F.vector(*self._triple(f"site.{site.name}")))
+            sites[site.name] = _turned(F, site.orientation, site.name), points[site.name]
+        frames = {at.moved.name: at.moved for at in placed.values() if at.moved is not at.frame}
+        motion = TreeMotion(bodies, self._closed(sites, q, u)[1], points=points, frames=frames)
+        motion.placed, motion.sites = placed, sites
+        return motion
+
+    def loads(self, t, q, u, motion: Any, inputs):
+        gravity = motion.N.vector(*self._triple("gravity"))
+        links = motion.bodies[: sum(link.has_mass for link in self.structure.links)]
+        falls = not all(is_zero(x) for x in gravity.components)
+        loads: list[Any] = [Force(body.mass * gravity, body.center) for body in links if falls]
+        for joint in self.structure.joints:
+            forces = self._forces(joint, *self._of(joint, q, u), inputs)
+            if not all(is_zero(x) for x in forces):
+                loads += joint.loads(motion.placed[joint.name], forces)
+        return loads
+
+    def configuration_constraints(self, t, q):
+        own = lambda joint: [q[name] for name in joint.names(joint.coordinates)]  # noqa: E731
+        norms = [x for joint in self.structure.joints for x in joint.norm(own(joint))]
+        if not (self.structure.loops or self.structure.couplings):
+            return norms
+        still = dict.fromkeys((*self.speeds, *self.dependent_speeds), 0.0)
+        return [*self._closed(self.motion(t, q, tuple(still.values())).sites, q, still)[0], *norms]
+
+    def _forces(self, joint: Shape, q: list[Component], u: list[Component], inputs: Any) -> list[Component]:
+        """Forces along the joint's speeds [N or N m]: of its spring, damper and actuators."""
+        damping, stiffness = self._read(f"damping.{joint.name}"), self._read(f"stiffness.{joint.name}")
+        forces = [mul(-1.0, mul(damping, w)) for w in u]
+        if not is_zero(stiffness):
+            rest = self._triple(f"rest.{joint.name}") if len(u) == 6 else (self._read(f"rest.{joint.name}"),)
+            forces = [sub(f, mul(stiffness, x)) for f, x in zip(forces, joint.stretch(q, rest), strict=True)]
+        for actuator in self.structure.actuators:
+            if actuator.joint == joint.name:
+                drive = self._drive(actuator, q, u, inputs[actuator.name])
+                forces = [add(f, mul(g, drive)) for f, g in zip(forces, actuator.gear, strict=True)]
+        return forces
+
+    def _drive(self, actuator: ActuatorShape, q: list[Component], u: list[Component], control: Component) -> Component:
+        gain, offset, stiff, damp = (
+            self._read(f"{kind}.{actuator.name}") for kind in ("gain", "offset", "position_gain", "velocity_gain")
+        )
+        terms = [mul(gain, control), offset, mul(-1.0, mul(damp, dot(actuator.gear, u)))]
+        return total([*terms, mul(-1.0, mul(stiff, mul(actuator.gear[0], q[0])))])
+
+    def _inertia(self, link: str) -> Matrix:
+        xx, yy, zz, xy, xz, yz = (self._read(f"inertia.{link}.{ij}") for ij in MOMENTS)
+        return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+
+    def _closed(self, sites: dict[str, tuple[Frame, Point]], q: Any, u: Any) -> tuple[list[Any], list[Any]]:
+        """What closes the loops: residuals of the configuration, and of the velocities."""
+        h: list[Any] = []
+        c: list[Any] = []
+        for loop in self.structure.loops:
+            (A, P), (B, Q) = sites[loop.first], sites[loop.second]
+            apart = Q.position_from(P).components_in(A)
+            parting = (Q.velocity - P.velocity).components_in(A)
+            if loop.rigid:
+                x, y, z = (axis.components_in(A) for axis in (B.x, B.y, B.z))
+                apart = (*apart, z[1], x[2], y[0])  # cosines between axes that are across
+                parting = (*parting, *(B.angular_velocity - A.angular_velocity).components_in(A))
+            h += [apart[i] for i in loop.kept]
+            c += [parting[i] for i in loop.kept]
+        for coupling in self.structure.couplings:
+            if coupling.is_kept:
+                value, slope = _polynomial(coupling.coefficients, q[coupling.second] if coupling.second else 0.0)
+                h.append(q[coupling.first] - value)
+                rate = mul(slope, u[f"{coupling.second}_rate"]) if coupling.second else 0.0
+                c.append(sub(u[f"{coupling.first}_rate"], rate))
+        return h, c
+
+
+class TreeMotion(Motion):
+    """A motion that knows the frames and points at its joints and sites."""
+
+    __slots__ = ("placed", "sites")
+
+    placed: dict[str, Placed]
+    sites: dict[str, tuple[Frame, Point]]
+
+
+MOMENTS = ("xx", "yy", "zz", "xy", "xz", "yz")
+
+
+def _moved(P: Point, F: Frame, r: Triple) -> Point:
+    return P if all(is_zero(x) for x in r) else P.fixed(F.vector(*r))
+
+
+def _turned(F: Frame, orientation: Matrix | None, name: str) -> Frame:
+    return F if orientation is None else Frame(f"{name}, placed", F, orientation, ZERO3)
+
+
+def _polynomial(coefficients: tuple[float, ...], x: Component) -> tuple[Component, Component]:
+    """Value and slope."""
+    value: Component = 0.0
+    slope: Component = 0.0
+    for a in reversed(coefficients):
+        slope = add(mul(slope, x), value)
+        value = add(mul(value, x), a)
+    return value, slope
+
+
+def _view(kind: str) -> property:
+    def read(self: Mechanism) -> dict[str, Any]:
+        found: dict[str, Any] = {}
+        for field in dataclasses.fields(self):
+            first, *parents, last = field.name.split(".")
+            if first == kind:
+                inside = found
+                for parent in parents:
+                    inside = inside.setdefault(parent, {})
+                inside[last] = getattr(self, field.name)
+        return found
+
+    return property(read, doc=f"The parameters `{kind}.NAME`, by name.")
+
+
+for _kind in KINDS.split():
+    setattr(Mechanism, _kind, _view(_kind))
+
+Field = tuple[str, bool, str]
+"""Of a parameter: its name, whether it must be positive, its unit."""
+
+
+@functools.lru_cache(maxsize=1000)
+def class_of(structure: Structure, fields: tuple[Field, ...]) -> type[Mechanism]:
+    """The class of a structure: the same one each time, since programs are kept by class."""
+    joints = structure.joints
+    coordinates = [pair for joint in joints for pair in zip(joint.names(joint.coordinates), joint.coordinates)]
+    speeds = [pair for joint in joints for pair in zip(joint.names(joint.speeds), joint.speeds)]
+    units = {name: unit for name, (_, unit) in (*coordinates, *speeds) if unit}
+    of_parameters = {name: parameter(positive=positive, unit=unit) for name, positive, unit in fields}
+    members: dict[str, Any] = {
+        "__module__": __name__,
+        "__doc__": f"A mechanism of {len(structure.links)} links and {len(joints)} joints.",
+        "__annotations__": dict.fromkeys(of_parameters, Scalar),
+        "__init__": Mechanism.__init__,
+        "structure": structure,
+        "left_out": structure.left_out,
+        "coordinates": tuple(name for name, _ in coordinates),
+        "speeds": tuple(name for name, _ in speeds if name not in structure.dependent_speeds),
+        "dependent_speeds": structure.dependent_speeds,
+        "dependent_coordinates": structure.dependent_coordinates,
+        "inputs": tuple(actuator.name for actuator in structure.actuators),
+        "units": units,
+    }
+    made: Any = type(Mechanism)(structure.name, (Mechanism,), members | of_parameters)  # pyright: ignore
+    return made
+
+
+def _restored(structure: Structure, fields: tuple[Field, ...], values: dict[str, Any]) -> Mechanism:
+    return class_of(structure, fields)(**values)
+
+
+def _fields(cls: type[Mechanism]) -> tuple[Field, ...]:
+    return tuple((name, info.positive, info.unit) for name, info in parameter_info(cls).items())

@@ -1,0 +1,352 @@
+"""A mechanism from its links: checks of names and of the tree, parameters, and which speeds of loops are dependent."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import scipy.linalg
+
+from .._common.lookup import not_there
+from ._joints import Hinge, Joint, Shape, Slide, components, is_structural_zero
+from ._mechanism import (
+    MOMENTS,
+    ActuatorShape,
+    CouplingShape,
+    Field,
+    LinkShape,
+    LoopShape,
+    Mechanism,
+    SiteShape,
+    Structure,
+    class_of,
+)
+from ._parts import Actuator, Coupling, Link, Loop, Site, matrix_of
+
+_POSITIVE_MOMENTS = frozenset(MOMENTS[:3])
+
+
+def mechanism(
+    links: Sequence[Link],
+    *,
+    gravity: Any = (0.0, 0.0, -9.81),
+    actuators: Sequence[Actuator] = (),
+    sites: Sequence[Site] = (),
+    loops: Sequence[Loop | Coupling] = (),
+    dependent: Sequence[str] | None = None,
+    name: str = "Mechanism",
+    left_out: Sequence[str] = (),
+) -> Mechanism:
+    """A `System` of links in a tree, joined as they say.
+
+        upper = Link("upper", joints=hinge("q1", (0, 1, 0)), mass=2.0, center=(0, 0, -0.2), inertia=(0.02, 0.02, 0))
+        arm = mechanism([upper], actuators=[Actuator("motor", "q1")])
+
+    **Arguments:**
+
+    - `links`: in any order, a parent before or behind its children.
+    - `gravity` [m/s^2] in the inertial frame N; parameters `gravity.x` and so on.
+    - `actuators`, `sites`: inputs that drive joints; named points.
+    - `loops`: what closes loops, `Loop` and `Coupling`. They are configuration constraints and velocity residuals.
+    - `dependent`: the hinges and sliders that are solved for, as many as there are residuals; by default those are
+        found by which the residuals can best be solved, at trial coordinates.
+    - `name`: of its class, for messages.
+
+    **Returns:** a `Mechanism`, of one class for each structure. Its coordinates and speeds are those of its joints, in
+    the order of the tree.
+
+    **Raises:** `ValueError` for names that stand for two things or hold a dot, a parent that is not there, links in a
+    circle, and whatever has not the numbers that it should.
+    """
+    values: dict[str, Any] = components("gravity", gravity)
+    links = _in_order([_checked(link, Link) for link in links])
+    shapes = tuple(_link(link, values) for link in links)
+    joints = {joint.name: joint for link in shapes for joint in link.joints}
+    names = [link.name for link in links]
+    structure = Structure(
+        name,
+        shapes,
+        tuple(_site(_checked(site, Site), names, values) for site in sites),
+        tuple(_actuator(_checked(actuator, Actuator), joints, values) for actuator in actuators),
+        left_out=tuple(left_out),
+    )
+    if not any(link.has_mass for link in shapes):
+        raise ValueError(f"{name}: no link that could be moved by a force has a mass: Link(..., mass=1.0).")
+    _check_names(structure)
+    made = [_loop(loop, structure, joints) for loop in loops]
+    structure = structure._replace(
+        loops=tuple(x for x in made if isinstance(x, LoopShape)),
+        couplings=tuple(x for x in made if isinstance(x, CouplingShape)),
+    )
+    fields = tuple(_field(name, joints) for name in values)
+    return class_of(_with_dependent(structure, fields, values, dependent), fields)(**values)
+
+
+def _checked(part: Any, kind: type) -> Any:
+    if not isinstance(part, kind):
+        raise TypeError(f"mechanism: this is no {kind.__name__}: {part!r}.")
+    return part
+
+
+def _in_order(links: list[Link]) -> list[Link]:
+    """Parents before their children, otherwise as they were given."""
+    names = [link.name for link in links]
+    for link in links:
+        _check_name(link.name, "link")
+        if names.count(link.name) > 1:
+            raise ValueError(f"Two links have the name {link.name!r}.")
+        if link.parent is not None and link.parent not in names:
+            raise ValueError(
+                f"The parent of the link {link.name!r}: " + str(not_there(link.parent, names, "the links").args[0])
+            )
+    done: dict[str | None, Link | None] = {None: None}
+    waiting = links
+    while waiting:
+        ready = [link for link in waiting if link.parent in done]
+        if not ready:
+            raise ValueError(f"Links carry each other in a circle: {', '.join(link.name for link in waiting)}.")
+        first = ready[0]
+        done[first.name] = first
+        waiting = [link for link in waiting if link is not first]
+    return [link for link in done.values() if link is not None]
+
+
+def _check_name(name: Any, what: str) -> None:
+    if not isinstance(name, str) or not name or "." in name:
+        raise ValueError(
+            f"The name of a {what} is a text without a dot, which stands between the parts of a parameter's name as in "
+            f"mass.forearm; got {name!r}."
+        )
+
+
+def _link(link: Link, values: dict[str, Any]) -> LinkShape:
+    given = (link.joints,) if isinstance(link.joints, Joint) else tuple(link.joints)
+    shapes: list[Shape] = []
+    for joint in given:
+        _checked(joint, Joint)
+        shapes += joint.shapes
+        values |= joint.values
+    values |= components(f"position.{link.name}", link.position)
+    if any(len(shape.speeds) == 6 for shape in shapes) and (link.parent is not None or len(shapes) > 1):
+        raise ValueError(
+            f"The link {link.name!r} is free of its parent: a free joint is the only one of a link on the ground "
+            "(parent=None). To fly relative to a moving link, chain three sliders and a ball joint."
+        )
+    if link.mass is not None:
+        values[f"mass.{link.name}"] = link.mass
+        values |= components(f"center.{link.name}", link.center)
+        values |= _moments(link)
+    return LinkShape(
+        link.name, link.parent, matrix_of(link.orientation, link.name), tuple(shapes), link.mass is not None
+    )
+
+
+def _moments(link: Link) -> dict[str, Any]:
+    rows = link.inertia
+    if not hasattr(rows, "__len__") or len(rows) != 3:
+        raise ValueError(f"The inertia of {link.name!r} is three moments or a (3, 3) matrix, got {rows!r}.")
+    if not hasattr(rows[0], "__len__"):  # three moments
+        entries = dict(zip(MOMENTS, (*rows, 0.0, 0.0, 0.0), strict=True))
+    else:
+        entries = {ij: rows["xyz".index(ij[0])]["xyz".index(ij[1])] for ij in MOMENTS}
+        for i, j in ((0, 1), (0, 2), (1, 2)):
+            a, b = rows[i][j], rows[j][i]
+            if isinstance(a, (int, float)) and isinstance(b, (int, float)) and a != b:
+                raise ValueError(f"The inertia matrix of {link.name!r} is not symmetric: {a} and {b}.")
+    return {f"inertia.{link.name}.{ij}": x for ij, x in entries.items() if not is_structural_zero(x)}
+
+
+def _site(site: Site, links: list[str], values: dict[str, Any]) -> SiteShape:
+    _check_name(site.name, "site")
+    if site.link is not None and site.link not in links:
+        raise ValueError(f"The site {site.name!r}: " + str(not_there(site.link, links, "the links").args[0]))
+    values |= components(f"site.{site.name}", site.position)
+    return SiteShape(site.name, site.link, matrix_of(site.orientation, site.name))
+
+
+def _actuator(actuator: Actuator, joints: Mapping[str, Shape], values: dict[str, Any]) -> ActuatorShape:
+    _check_name(actuator.name, "actuator")
+    if actuator.joint not in joints:
+        raise ValueError(
+            f"The actuator {actuator.name!r}: " + str(not_there(actuator.joint, joints, "the joints").args[0])
+        )
+    joint = joints[actuator.joint]
+    gear = tuple(float(x) for x in np.atleast_1d(np.asarray(actuator.gear, float)))
+    if len(gear) != len(joint.speeds):
+        raise ValueError(
+            f"The gear of the actuator {actuator.name!r} is {len(joint.speeds)} numbers, one for each speed of "
+            f"{joint.name!r}; got {actuator.gear!r}."
+        )
+    for kind in ("gain", "offset", "position_gain", "velocity_gain"):
+        value = getattr(actuator, kind)
+        if not is_structural_zero(value):
+            values[f"{kind}.{actuator.name}"] = value
+    if f"position_gain.{actuator.name}" in values and len(gear) > 1:
+        raise ValueError(
+            f"The actuator {actuator.name!r}: {joint.name!r} has no length that a position gain could act on."
+        )
+    return ActuatorShape(actuator.name, joint.name, gear)
+
+
+def _loop(loop: Any, structure: Structure, joints: Mapping[str, Shape]) -> LoopShape | CouplingShape:
+    if isinstance(loop, Loop):
+        sites = [site.name for site in structure.sites]
+        for end in (loop.first, loop.second):
+            if end not in sites:
+                raise ValueError("What closes a loop: " + str(not_there(end, sites, "the sites").args[0]))
+        return LoopShape(loop.first, loop.second, bool(loop.rigid), tuple(range(6 if loop.rigid else 3)))
+    _checked(loop, Coupling)
+    for end in (loop.first, loop.second):
+        if end is not None and not isinstance(joints.get(end), (Hinge, Slide)):
+            raise ValueError(f"A coupling is of hinges and sliders; {end!r} is none.")
+    return CouplingShape(loop.first, loop.second, tuple(float(a) for a in loop.coefficients), True)
+
+
+def _check_names(structure: Structure) -> None:
+    """Names are those of the parts of one motion, of its coordinates, speeds and inputs, and of parameters."""
+    for joint in structure.joints:
+        _check_name(joint.name, "joint")
+    for what, names in (
+        ("joints", [joint.name for joint in structure.joints]),
+        ("sites or links", [*(link.name for link in structure.links), *(site.name for site in structure.sites)]),
+        ("actuators", [actuator.name for actuator in structure.actuators]),
+    ):
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"Two {what} have the name {twice[0]!r}.")
+
+
+_UNITS = {"mass": "kg", "inertia": "kg m^2", "gravity": "m/s^2"} | dict.fromkeys(
+    ("center", "position", "anchor", "site"), "m"
+)
+_OF_HINGES = {"damping": "N m s/rad", "stiffness": "N m/rad", "rest": "rad", "armature": "kg m^2"}
+_OF_SLIDERS = {"damping": "N s/m", "stiffness": "N/m", "rest": "m", "armature": "kg"}
+
+
+def _field(name: str, joints: Mapping[str, Shape]) -> Field:
+    kind, *_, last = name.split(".")
+    positive = kind in ("mass", "armature") or (kind == "inertia" and last in _POSITIVE_MOMENTS)
+    if kind not in _OF_HINGES:
+        return name, positive, _UNITS.get(kind, "")
+    joint = joints[name.split(".")[1]]
+    if len(joint.speeds) == 6:  # newtons and newton metres in one
+        return name, positive, "m" if kind == "rest" else ""
+    return name, positive, (_OF_SLIDERS if isinstance(joint, Slide) else _OF_HINGES)[kind]
+
+
+# Loops: which residuals count, and what they are solved for.
+
+
+def _with_dependent(
+    structure: Structure, fields: tuple[Field, ...], values: dict[str, Any], dependent: Sequence[str] | None
+) -> Structure:
+    norms = [joint.name + joint.coordinates[-1][0] for joint in structure.joints if len(joint.coordinates) > 1]
+    if not (structure.loops or structure.couplings):
+        return structure._replace(dependent_coordinates=tuple(norms))
+    trial = class_of(structure, fields)(**_numbers(values))
+    C, G = _slopes(trial)  # (k,n) by speeds, (k,n_q) by coordinates
+    kept = _independent_rows(C)
+    names = (*trial.speeds, *trial.dependent_speeds)
+    if dependent is None:
+        follows = [f"{x.first}_rate" for x in structure.couplings]
+        speeds = [names[i] for i in _pivots(C[kept] * [1e3 if name in follows else 1.0 for name in names])]
+        if all(name.endswith("_rate") for name in speeds):
+            coordinates = [*(name.removesuffix("_rate") for name in speeds), *norms]
+        else:
+            coordinates = [trial.coordinates[i] for i in _pivots(np.concatenate([G[kept], _norm_slopes(trial)]))]
+    else:
+        speeds, coordinates = _chosen(structure, dependent, len(kept)), [*dependent, *norms]
+        places = [names.index(s) for s in speeds]
+        if np.linalg.svd(C[kept][:, places], compute_uv=False)[-1] < 1e-9 * np.abs(C).max():
+            raise ValueError(f"`dependent`: what closes the loops cannot be solved for {', '.join(dependent)}.")
+    start, loops = 0, []
+    for loop in structure.loops:
+        loops.append(loop._replace(kept=tuple(i - start for i in kept if start <= i < start + len(loop.kept))))
+        start += len(loop.kept)
+    couplings = [x._replace(is_kept=start + i in kept) for i, x in enumerate(structure.couplings)]
+    return structure._replace(
+        loops=tuple(loops),
+        couplings=tuple(couplings),
+        dependent_speeds=tuple(name for name in names if name in speeds),
+        dependent_coordinates=tuple(name for name in trial.coordinates if name in coordinates),
+    )
+
+
+def _chosen(structure: Structure, dependent: Sequence[str], n: int) -> list[str]:
+    simple = [joint.name for joint in structure.joints if len(joint.speeds) == 1]
+    wrong = [name for name in dependent if name not in simple]
+    if wrong:
+        raise ValueError("`dependent`: " + str(not_there(wrong[0], simple, "the hinges and sliders").args[0]))
+    if len(set(dependent)) != n:
+        raise ValueError(f"`dependent` names {len(set(dependent))} joints, and what closes the loops takes {n}.")
+    return [f"{name}_rate" for name in dependent]
+
+
+def _numbers(values: dict[str, Any]) -> dict[str, Any]:
+    """Numbers for what is traced or a batch: which rows are independent is a matter of structure."""
+    rng = np.random.default_rng(0)
+
+    def number(x: Any) -> float:
+        try:
+            return float(np.ravel(np.asarray(x))[0])
+        except Exception:  # traced: it has no value
+            return float(rng.uniform(0.5, 1.5))
+
+    return {name: number(x) for name, x in values.items()}
+
+
+def _slopes(trial: Mechanism) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives of the loops' residuals by all speeds and by all coordinates, near the reference."""
+    rng = np.random.default_rng(1)
+    q = np.array([1.0 if name.endswith("_e4") else 0.0 for name in trial.coordinates])
+    for joint in trial.structure.joints:
+        if len(joint.coordinates) == 1:
+            q[trial.coordinates.index(joint.name)] = joint.reference
+    q = q + rng.uniform(-0.2, 0.2, q.shape)
+    for joint in trial.structure.joints:
+        if len(joint.coordinates) > 1:
+            last = trial.coordinates.index(joint.name + joint.coordinates[-1][0])
+            q[last - 3 : last + 1] /= np.linalg.norm(q[last - 3 : last + 1])
+    n = len(trial.speeds) + len(trial.dependent_speeds)
+
+    def residuals(q: np.ndarray, u: np.ndarray) -> tuple[list[Any], list[Any]]:
+        motion = trial.motion(0.0, list(map(float, q)), list(map(float, u)))
+        return trial._closed(motion.sites, _by_name(trial.coordinates, q), _by_name(trial.speeds, u))
+
+    still = np.zeros(n)
+    c = lambda q, u: np.array([float(x) for x in residuals(q, u)[1]])  # noqa: E731
+    h = lambda q: np.array([float(x) for x in residuals(q, still)[0]])  # noqa: E731
+    C = np.array([c(q, e) - c(q, still) for e in np.eye(n)]).T
+    G = np.array([(h(q + 1e-6 * e) - h(q - 1e-6 * e)) / 2e-6 for e in np.eye(len(q))]).T
+    return C, G
+
+
+def _by_name(names: Sequence[str], x: np.ndarray) -> dict[str, float]:
+    return {name: float(a) for name, a in zip(names, x, strict=True)}
+
+
+def _norm_slopes(trial: Mechanism) -> np.ndarray:
+    rows = []
+    for joint in trial.structure.joints:
+        if len(joint.coordinates) > 1:
+            row = np.zeros(len(trial.coordinates))
+            row[trial.coordinates.index(joint.name + joint.coordinates[-1][0])] = 2.0
+            rows.append(row)
+    return np.array(rows).reshape(len(rows), len(trial.coordinates))
+
+
+def _independent_rows(C: np.ndarray) -> list[int]:
+    R, order = _qr(C.T)
+    rank = int(np.sum(np.abs(np.diag(R)) > 1e-9 * max(abs(R[0, 0]), 1e-300)))
+    return sorted(int(i) for i in order[:rank])
+
+
+def _pivots(A: np.ndarray) -> list[int]:
+    """The columns by which A is best solved, as many as it has rows."""
+    return [int(i) for i in _qr(A)[1][: len(A)]]
+
+
+def _qr(A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    found: Any = scipy.linalg.qr(A, mode="economic", pivoting=True)
+    return found[1], found[2]
