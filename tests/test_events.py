@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.special import ellipk
+from slopes import differences, slopes
 
 import jaxkane as jk
 from jaxkane._simulation.crossings import first_crossing
@@ -64,20 +65,16 @@ def test_a_dropped_particle(options):
     assert np.isnan(ride["drive"][~reached]).all()
 
 
-def test_derivatives_of_the_end():
-    """Forward, reverse and second ones against the formula."""
-    rtol, at = 1e-6, (jnp.array(1.0), jnp.array(0.3), jnp.array(9.81))
+def test_second_derivatives_of_the_end():
+    """By the velocity at the start, against the formula."""
+    h, g = jnp.array(1.0), jnp.array(9.81)
 
-    def end(h, v, g, adjoint):
-        ride = dropped(h, v, Particle(gravity=g), adjoint=adjoint)
+    def end(v):
+        ride = dropped(h, v, adjoint="forward")
         return jnp.stack([ride.t_end, ride.end.q[0], ride.end.u[0]])
 
-    slope = jax.jacfwd(exact, argnums=(0, 1, 2))(*at)
-    for mode, adjoint in ((jax.jacfwd, "forward"), (jax.jacrev, "reverse")):
-        found = jax.jit(mode(lambda *x: end(*x, adjoint), argnums=(0, 1, 2)))(*at)  # noqa: B023
-        np.testing.assert_allclose(np.array(found), np.array(slope), rtol=rtol, atol=1e-12)
-    second = jax.jit(jax.jacfwd(jax.jacfwd(lambda v: end(at[0], v, at[2], "forward"))))(at[1])
-    np.testing.assert_allclose(second, jax.jacfwd(jax.jacfwd(lambda v: exact(at[0], v, at[2])))(at[1]), atol=1e-9)
+    second = jax.jit(jax.jacfwd(jax.jacfwd(end)))(0.3)
+    np.testing.assert_allclose(second, jax.jacfwd(jax.jacfwd(lambda v: exact(h, v, g)))(0.3), atol=1e-9)
 
 
 class Pendulum(jk.System):
@@ -126,14 +123,15 @@ def test_a_start_on_zero():
         assert np.isnan(at_once.q[1:]).all()
 
 
-@pytest.mark.parametrize("options", [{}, {"step": 0.5}], ids=["adaptive", "fixed"])
-def test_down_and_up_again_within_a_step(options):
+@pytest.mark.parametrize(
+    ("ends", "options"), [("ground", {}), ("either", {"step": 0.5})], ids=["falling-adaptive", "either-fixed"]
+)
+def test_down_and_up_again_within_a_step(ends, options):
     """Both ends of the first step are above: h = 0.08 - t + 5.19 t^2 / 2 is zero at 0.0987 and 0.29 s."""
     start = jk.State(jnp.array([0.08]), jnp.array([-1.0]))
-    for ends in ("ground", "either"):
-        ride = jk.simulate(Particle(ends=ends), start, TS, {"drive": 15.0}, **options)
-        assert ride.reason == "ground"
-        np.testing.assert_allclose(ride.t_end, (1 - np.sqrt(1 - 2 * 5.19 * 0.08)) / 5.19, atol=1e-9)
+    ride = jk.simulate(Particle(ends=ends), start, TS, {"drive": 15.0}, **options)
+    assert ride.reason == "ground"
+    np.testing.assert_allclose(ride.t_end, (1 - np.sqrt(1 - 2 * 5.19 * 0.08)) / 5.19, atol=1e-9)
 
 
 def test_the_earlier_of_several_events_in_one_step():
@@ -155,30 +153,6 @@ def test_an_event_at_a_sample_and_at_the_last_time():
         assert np.isnan(ride.q[n:]).all()
 
 
-def test_members_of_a_batch_end_at_their_own_times():
-    """One completes, one is invalid, one is dropped; read where they were reached, derivatives by what all share are
-    clean, and NaN where what is missing is read."""
-    heights = jnp.array([1.0, 50.0, jnp.nan, 0.3])
-
-    def rides(g, adjoint):
-        one = lambda h: dropped(h, 0.0, Particle(gravity=g), adjoint=adjoint)  # noqa: E731
-        return jax.vmap(one)(heights)
-
-    ride = jax.jit(lambda g: rides(g, "reverse"))(9.81)
-    assert ride.reason == ["ground", "completed", "invalid", "ground"]
-    np.testing.assert_allclose(ride.t_end[:2], [np.sqrt(2 / 9.81), 2.0], atol=1e-9)
-    np.testing.assert_allclose(ride.t_end[3], np.sqrt(0.6 / 9.81), atol=1e-9)
-    for mode, adjoint in ((jax.jacfwd, "forward"), (jax.jacrev, "reverse")):
-
-        def read(g):
-            ride = rides(g, adjoint)  # noqa: B023
-            return jnp.stack([ride["h"][1, -1] + ride["h"][0, 2] + ride.t_end[3], ride["h"][0, -1], ride["v"][2, 0]])
-
-        slopes = jax.jit(mode(read))(9.81)
-        np.testing.assert_allclose(slopes[0], -2.0 - 0.08 - 0.5 * np.sqrt(0.6) * 9.81**-1.5, rtol=1e-6)
-        assert np.isnan(slopes[1:]).all()
-
-
 class Suction(Particle):
     """A force that exists down to a centimetre under the ground only."""
 
@@ -188,20 +162,19 @@ class Suction(Particle):
 
 
 def test_trial_steps_that_are_not_finite():
-    """Steps that ended under the ground are thrown away, and leave no NaN in a derivative in reverse mode."""
+    """Steps that ended under the ground are thrown away, and leave no NaN in a derivative in either mode."""
 
     def read(v, adjoint):
-        ride = dropped(1.0, v, Suction(), adjoint=adjoint, rtol=1e-10, atol=1e-10)
-        return ride["h"][1] + ride.t_end
+        ride = dropped(1.0, v[0], Suction(), adjoint=adjoint, rtol=1e-10, atol=1e-10)
+        wanted = (ride.status == jk.Status.EVENT) & (ride.stats["rejected"] > 5)
+        return jnp.where(wanted, ride["h"][1] + ride.t_end, jnp.nan)
 
-    v, h = -0.2, 1e-5
-    ride = dropped(1.0, v, Suction())
-    assert ride.reason == "ground"
-    assert ride.stats["rejected"] > 5
-    value = jax.jit(lambda v: read(v, "reverse"))
-    numeric = (value(v + h) - value(v - h)) / (2 * h)
-    for mode, adjoint in ((jax.jacfwd, "forward"), (jax.jacrev, "reverse")):
-        np.testing.assert_allclose(jax.jit(mode(lambda v: read(v, adjoint)))(v), numeric, rtol=1e-5)  # noqa: B023
+    v = jnp.array([-0.2])
+    forward, reverse = (slopes(read, mode) for mode in ("forward", "reverse"))
+    numeric = differences(forward, v, 1e-5)
+    assert np.isfinite(numeric)
+    for both in (forward, reverse):
+        np.testing.assert_allclose(both(v)[0], numeric, rtol=1e-5)
 
 
 class Bead(jk.System):
@@ -249,13 +222,14 @@ def test_what_follows_from_a_motion_that_ends_early():
         reached = ride["vy"][3] + 2.0 * ride["push"][4] + 3.0 * ride["y"][4]
         return jnp.stack([reached, ride.t_end + ride.end.u[0], ride["vy"][-1], ride["push"][-1], ride["y"][-1]])
 
-    x, h = jnp.array([0.3, 1.0, 0.2]), 1e-5
-    value = jax.jit(lambda x: read(x, "forward"))
-    numeric = np.stack([(value(x + e) - value(x - e)) / (2 * h) for e in h * jnp.eye(3)], axis=-1)
+    x = jnp.array([0.3, 1.0, 0.2])
+    forward, reverse = (slopes(read, mode) for mode in ("forward", "reverse"))
+    numeric = differences(forward, x, 1e-5)
     assert np.isfinite(numeric[:2]).all()
-    for mode, adjoint in ((jax.jacfwd, "forward"), (jax.jacrev, "reverse")):
-        found = jax.jit(mode(lambda x: read(x, adjoint)))(x)  # noqa: B023
+    for both in (forward, reverse):
+        found, value = both(x)
         np.testing.assert_allclose(found[:2], numeric[:2], rtol=1e-5, atol=1e-8)
+        assert np.isnan(value[2:]).all()
         assert np.isnan(found[2:]).all()
 
 
@@ -276,11 +250,11 @@ def test_other_ends_have_no_derivative():
         ride = dropped(100.0, v, max_steps=3, adjoint=adjoint)
         return jnp.stack([ride.t_end, ride["h"][-1], ride["h"][0]])
 
-    assert dropped(100.0, max_steps=3).reason == "max steps"
     for mode, adjoint in ((jax.jacfwd, "forward"), (jax.jacrev, "reverse")):
-        slopes = jax.jit(mode(lambda v: few(v, adjoint)))(0.1)  # noqa: B023
-        assert np.isnan(slopes[:2]).all()
-        assert slopes[2] == 0.0
+        found = jax.jit(mode(lambda v: few(v, adjoint)))(0.1)  # noqa: B023
+        assert np.isnan(found[:2]).all()
+        assert found[2] == 0.0
+    assert dropped(100.0, max_steps=3, adjoint="forward").reason == "max steps"
 
 
 def test_an_event_that_reads_no_speed_costs_no_accelerations():
@@ -309,26 +283,25 @@ def test_the_first_crossing_of_cubics():
         np.testing.assert_allclose(x, crossings[0] if crossings else np.inf, atol=0.02)
 
 
-@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
 def test_derivatives_by_times_of_samples(mode):
     """Two signals, one of whose kinks stand at one time; the times of the ride itself; against central differences."""
     kinks = jnp.array([0.1, 0.35, 0.8, 1.1, 1.7])
     others, values = jnp.array([0.05, 0.35, 0.6, 1.2, 1.9]), jnp.array([1.0, -2.0, 3.0, -1.0, 2.0])
     ts = jnp.linspace(0.02, 2.0, 5)
 
-    def height(x):
+    def height(x, adjoint):
         """x: the delay of a signal; of all times of the ride."""
         one, other = jk.Samples(kinks + x[0], 5 * values), jk.Samples(others, -3 * values)
         drive = Both(one, other)
         ride = jk.simulate(
             Particle(), jk.State(jnp.array([9.0]), jnp.zeros(1)), ts + x[1], {"drive": drive}, rtol=1e-11, atol=1e-11,
-            adjoint="forward" if mode is jax.jacfwd else "reverse",
+            adjoint=adjoint,
         )  # fmt: skip
         return ride["h"][-1] + ride["v"][2]
 
-    f, h = jax.jit(height), 1e-5
-    numeric = [(f(e) - f(-e)) / (2 * h) for e in h * jnp.eye(2)]
-    np.testing.assert_allclose(jax.jit(mode(height))(jnp.zeros(2)), numeric, rtol=1e-6)
+    both, x = slopes(height, mode), jnp.zeros(2)
+    np.testing.assert_allclose(both(x)[0], differences(both, x, 1e-5), rtol=1e-6)
 
 
 class Both(eqx.Module):
@@ -385,33 +358,41 @@ def test_times_that_tracing_hides_are_invalid():
         assert np.isnan(ride.q).all()
 
 
-def _of_a_batch(h, v, g, adjoint):
-    """t_end, the end's speed and the height at the first two times, of three members; the last cannot be."""
-    rides = jax.vmap(lambda h, v, g: dropped(h, v, Particle(gravity=g), adjoint=adjoint))(h, v, g)
-    return jnp.stack([rides.t_end, rides.end.u[:, 0], rides["h"][:, 0], rides["h"][:, 1]], axis=1)
+def _of_a_batch(x, adjoint):
+    """Of four members: when it ended, height and speed there, and the height at the first two times and the last."""
+    rides = jax.vmap(lambda h, v: dropped(h, v, Particle(gravity=x[2, 0]), adjoint=adjoint))(x[0], x[1])
+    heights = rides["h"][:, jnp.array([0, 1, -1])].T
+    return jnp.stack([rides.t_end, rides.end.q[:, 0], rides.end.u[:, 0], *heights, rides.status.astype(float)], axis=1)
 
 
 def _formulas(h, v, g):
-    t_end, _, v_end = exact(h, v, g)
-    return jnp.stack([t_end, v_end, h, h + v * TS[1] - 0.5 * g * TS[1] ** 2])
+    ends = jnp.stack([*exact(h, v, g), h, h + v * TS[1] - 0.5 * g * TS[1] ** 2])
+    high = jnp.stack([2.0 + 0 * h, h + 2 * v - 2 * g, v - 2 * g, *ends[3:], h + 2 * v - 2 * g])
+    return jnp.where(h > 20.0, high, jnp.append(ends, jnp.nan))
 
 
-_SLOPES = {
-    "forward": jax.jit(jax.jacfwd(lambda x: _of_a_batch(*x, "forward"))),
-    "reverse": jax.jit(jax.jacrev(lambda x: _of_a_batch(*x, "reverse"))),
-    "formula": jax.jit(jax.vmap(jax.jacfwd(lambda x: _formulas(*x)), in_axes=1)),
-}
+_OF_A_BATCH = {mode: slopes(_of_a_batch, mode) for mode in ("forward", "reverse")}
+_BY_FORMULA = jax.jit(jax.vmap(slopes(lambda x, _: _formulas(*x), "forward"), in_axes=1))
 _number = lambda low, high: st.floats(low, high, allow_nan=False)  # noqa: E731
 
 
 @settings(max_examples=25, deadline=None, derandomize=True)
 @given(_number(0.5, 1.5), _number(-1.0, 2.0), _number(5.0, 15.0), st.sampled_from(["forward", "reverse"]))
-def test_derivatives_of_any_fall(h, v, g, mode):
-    """Of a ride that ends early, of one beside it, and with one in the batch whose start is no number."""
+def test_members_of_a_batch_end_at_their_own_times(h, v, g, mode):
+    """Two end early, one completes, and the start of one is no number. Derivatives by what is theirs and by what all
+    share (g, in the first column) are those of the formula, and NaN where what is missing is read."""
     rtol = 1e-6
-    x = jnp.array([[h, 1.1 * h, jnp.nan], [v, v + 0.1, 0.0], [g, g + 1.0, 9.81]])
-    found, right = _SLOPES[mode](x), _SLOPES["formula"](x)  # (3,4,3,3) (3,4,3)
-    for k in (0, 1):
-        np.testing.assert_allclose(found[k, :, :, k], right[k], rtol=rtol, atol=rtol)
-        assert not np.any(np.delete(found[k], k, axis=-1)), "of other members' numbers"
-    assert np.isnan(found[2, 1:, 0, 2]).all(), "what is missing has no derivative"
+    x = jnp.array([[h, 50.0, jnp.nan, 1.1 * h], [v, v, 0.0, v + 0.1], [g] * 4])
+    (found, values), (right, right_values) = _OF_A_BATCH[mode](x), _BY_FORMULA(x)  # (4,7,3,4) (4,7); (4,6,3) (4,6)
+    ground, completed, invalid = jk.Status.EVENT, jk.Status.COMPLETED, jk.Status.INVALID
+    assert list(values[:, 6]) == [ground, completed, invalid, ground]
+    for k in (0, 1, 3):
+        np.testing.assert_allclose(values[k, :6], right_values[k], atol=1e-8)
+        n = 6 if k == 1 else 5  # a ride that ended has no height at the last time, and no derivative of it
+        np.testing.assert_allclose(found[k, :n, :2, k], right[k, :n, :2], rtol=rtol, atol=rtol)
+        np.testing.assert_allclose(found[k, :n, 2, 0], right[k, :n, 2], rtol=rtol, atol=rtol)
+        assert not np.any(np.delete(found[k, :n, :2], k, axis=-1)), "of other members' numbers"
+        assert k == 1 or np.isnan(found[k, 5, 0, k])
+        assert k == 1 or np.isnan(found[k, 5, 2, 0])
+    assert np.isnan(values[2, 1:6]).all()
+    assert np.isnan(found[2, 1:6, 0, 2]).all(), "what is missing has no derivative"
