@@ -273,6 +273,7 @@ def test_rates_of_euler_parameters_that_leave_the_constraint():
         evaluate(type("Unbound", (Unbound,), {})(2.0), jk.State(upright, turning))
 
 
+@pytest.mark.filterwarnings("ignore:.*its description uses:UserWarning")  # a constant matrix is no single numbers
 def test_a_matrix_that_is_no_rotation():
     class Sheared(Slider):
         def motion(self, t, q, u):

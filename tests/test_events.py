@@ -36,6 +36,7 @@ class Particle(jk.System):
         return {
             "ground": {"ground": jk.falling(q["h"])},
             "either": {"ground": q["h"]},
+            "none": {},
             "roof": {"a_late": jk.falling(q["h"]), "b_early": jk.falling(q["h"] - 0.1), "c_top": jk.falling(u["v"])},
         }[self.ends]
 
@@ -247,14 +248,14 @@ def test_other_ends_have_no_derivative():
     """`max_steps` is no smooth end: its time has a derivative that is NaN, and so has what was not reached."""
 
     def few(v, adjoint):
-        ride = dropped(100.0, v, max_steps=3, adjoint=adjoint)
+        ride = dropped(100.0, v, Particle(ends="none"), max_steps=3, adjoint=adjoint)
         return jnp.stack([ride.t_end, ride["h"][-1], ride["h"][0]])
 
     for mode, adjoint in ((jax.jacfwd, "forward"), (jax.jacrev, "reverse")):
         found = jax.jit(mode(lambda v: few(v, adjoint)))(0.1)  # noqa: B023
         assert np.isnan(found[:2]).all()
         assert found[2] == 0.0
-    assert dropped(100.0, max_steps=3, adjoint="forward").reason == "max steps"
+    assert dropped(100.0, 0.1, Particle(ends="none"), max_steps=3).reason == "max steps"
 
 
 def test_an_event_that_reads_no_speed_costs_no_accelerations():

@@ -114,7 +114,7 @@ class Rod(jk.System):
         if not self.about_pin:
             return jk.Motion([jk.Body(self.mass, np.diag([1.0, 2.0, 2.5]), G, B)])
         x = np.array([0.3, 0.4, -0.5])
-        inertia = jnp.diag(jnp.array([1.0, 2.0, 2.5])) + self.mass * jnp.asarray(x @ x * np.eye(3) - np.outer(x, x))
+        inertia = np.diag([1.0, 2.0, 2.5]) + self.mass * jnp.asarray(x @ x * np.eye(3) - np.outer(x, x))
         about = O.moving(0.0 * A.x, 1.0 * A.x) if self.wrong else O
         return jk.Motion([jk.Body(self.mass, inertia, G, B, about=about)])
 

@@ -110,7 +110,8 @@ def test_a_chunk_that_cannot_be_read_is_computed_again(rides, tmp_path):
         same(run(tmp_path), rides)
 
 
-def test_after_an_interruption_the_rest_is_called_so_and_not_kept(rides, tmp_path, monkeypatch):
+@pytest.mark.parametrize("kept", [True, False], ids=["folder", "memory"])
+def test_after_an_interruption_the_rest_is_called_so_and_not_kept(rides, tmp_path, monkeypatch, kept):
     import jaxkane.sweep._solve as solving
 
     calls, original = [], solving._solve
@@ -122,8 +123,13 @@ def test_after_an_interruption_the_rest_is_called_so_and_not_kept(rides, tmp_pat
         return original(*args)
 
     monkeypatch.setattr(solving, "_solve", interrupted)
-    part = run(tmp_path)
+    part = run(tmp_path if kept else None)
     assert part.counts == {"interrupted": 600 - 64, "completed": 64}
+    done, whole = (x.q.reshape(600, 4, 2) for x in (part, rides))
+    np.testing.assert_array_equal(done[:64], whole[:64])
+    assert np.isnan(done[64:]).all()
+    if not kept:
+        return
     assert len(chunks(tmp_path)) == 2
     monkeypatch.setattr(solving, "_solve", original)
     same(run(tmp_path), rides)

@@ -1,10 +1,11 @@
 """Whether the tests that are not marked `slow` call every module of the library.
 
 `pytest` runs those alone, and so does CI with the lowest versions. On Python 3.12 or later it looks at it, at no cost,
-and names each module that slow tests alone call, or none: mark other tests, or add a cheap one.
+and fails if slow tests alone call a module, or none: mark other tests, or add a cheap one.
 """
 
 import ast
+import os
 import sys
 from pathlib import Path
 
@@ -13,12 +14,17 @@ import pytest
 import jaxkane
 
 SOURCE = Path(jaxkane.__file__).parent
+PREFIX = f"{SOURCE}{os.sep}"
+PROGRAM = "__name__ == '__main__'"
 TOOL = 3  # an id of sys.monitoring that neither debuggers, nor coverage, nor profilers take
 
 
 def modules_with_functions():
+    """All but those that are programs of their own, which no process of the tests imports."""
     for path in sorted(SOURCE.rglob("*.py")):
-        if any(isinstance(node, ast.FunctionDef) for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))):
+        nodes = list(ast.walk(ast.parse(path.read_text(encoding="utf-8"))))
+        is_program = any(isinstance(node, ast.If) and ast.unparse(node.test) == PROGRAM for node in nodes)
+        if not is_program and any(isinstance(node, ast.FunctionDef) for node in nodes):
             yield str(path)
 
 
@@ -26,22 +32,27 @@ class Touched:
     """Listens for the first call of every function of the library while a test runs that is not slow."""
 
     def __init__(self, config):
-        self.config, self.files, self.counts, self.missing = config, set(), False, []
+        self.config, self.files, self.counts, self.ask_again, self.missing = config, set(), False, False, []
         sys.monitoring.use_tool_id(TOOL, "jaxkane's tests")
         sys.monitoring.register_callback(TOOL, sys.monitoring.events.PY_START, self._started)
         sys.monitoring.set_events(TOOL, sys.monitoring.events.PY_START)
 
     def _started(self, code, _):
-        ours = code.co_filename.startswith(str(SOURCE))
-        if ours and not self.counts:
-            return None  # ask again
-        if ours:
-            self.files.add(code.co_filename)
+        """The first call of a function; there is no second, whatever a slow test does."""
+        file = code.co_filename
+        if file not in self.files and file.startswith(PREFIX):
+            if self.counts:
+                self.files.add(file)
+            else:
+                self.ask_again = True
         return sys.monitoring.DISABLE
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item):
         self.counts = item.get_closest_marker("slow") is None
+        if self.counts and self.ask_again:
+            self.ask_again = False
+            sys.monitoring.restart_events()
         try:
             return (yield)
         finally:
@@ -58,11 +69,13 @@ class Touched:
             self.config.workeroutput["touched"] = sorted(self.files)
         elif session.exitstatus == pytest.ExitCode.OK:
             self.missing = sorted(set(modules_with_functions()) - self.files)
+            if self.missing:
+                session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
     def pytest_terminal_summary(self, terminalreporter):
         for path in self.missing:
             name = Path(path).relative_to(SOURCE)
-            terminalreporter.write_line(f"no test that is not marked slow calls {name}", yellow=True)
+            terminalreporter.write_line(f"no test that is not marked slow calls {name}", red=True)
 
 
 def watch(config):

@@ -36,6 +36,13 @@ def forces(system, q, u, inputs):
     return jk.constraint_forces(system, 0.3, q, u, inputs), jk.generalized_active_forces(system, 0.3, q, u, inputs)
 
 
+def kinematics(system, q, u, inputs):
+    """What is read of a description, and the matrix of its speeds."""
+    at = (system, 0.3, q, u)
+    by_name = [f(*at) for f in (jk.positions, jk.velocities, jk.orientations)]
+    return by_name, jk.kinetic_energy(*at), jk.mass_matrix(*at), jk.dependent_speeds(*at), jk.partial_velocities(*at)
+
+
 def modes(system, q, u, inputs):
     """Of the linear model of an instant; coordinates go back to the constraint that parameters move."""
     if system.dependent_coordinates:
@@ -45,7 +52,7 @@ def modes(system, q, u, inputs):
     return model.A, model.B, jnp.max(x.real), jnp.max(x.imag)
 
 
-@pytest.mark.parametrize("f", [equations, forces, modes])
+@pytest.mark.parametrize("f", [equations, forces, kinematics, modes])
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_three_modes_against_differences(name, f):
     """Along one direction of parameters, state and inputs, of one weighted sum of all that a function gives."""
@@ -55,11 +62,11 @@ def test_three_modes_against_differences(name, f):
     x, unravel = ravel_pytree((system, q, u, inputs))
     rng = np.random.default_rng(7)
     direction = jnp.asarray(rng.uniform(-1, 1, x.size)) * jnp.maximum(jnp.abs(x), 0.1)
-    weights = jnp.asarray(rng.uniform(0.5, 1.5, 200))
+    weights = jnp.asarray(rng.uniform(0.5, 1.5, 300))
 
     def along(s):
         y = ravel_pytree(f(*unravel(x + s * direction)))[0]
-        return weights[: y.size] @ y
+        return weights[: y.size] @ y  # as many weights as there are numbers, or an error
 
     @jax.jit
     def all_modes(s):

@@ -1,13 +1,18 @@
-"""Two processes on the loopback fit as one does."""
+"""Two processes on the loopback fit as one does; and how windows are shared, in one."""
 
 import json
 import os
 import socket
 import subprocess
 import sys
+from typing import NamedTuple
 
+import jax
 import numpy as np
 import pytest
+
+from jaxkane.fit._problem import parallel
+from jaxkane.fit._problem.model import Unknowns
 
 # Three pushed pendulums, windows of half a second: five a trial, so that the shares differ.
 SCRIPT = """
@@ -118,3 +123,38 @@ def test_two_processes_fit_as_one_and_refuse_different_trials(script):
             np.testing.assert_allclose(one["estimates"][name], alone["estimates"][name], rtol=rtol)
             np.testing.assert_allclose(one["errors"][name], alone["errors"][name], rtol=1e-8)
     assert both[0] == both[1]
+
+
+class Given(NamedTuple):
+    trial: np.ndarray
+    measured: np.ndarray
+
+
+@pytest.mark.parametrize("processes", [1, 2, 3, 7])
+def test_shares_put_together_are_the_whole(monkeypatch, processes):
+    """What each of several processes finds about its share, in the order of the processes, without starting any."""
+    windows = Given(np.arange(5), 10.0 * np.arange(5))
+    point = Unknowns(np.array([2.0]), np.zeros((1, 0)), np.arange(5.0)[:, None])
+    seen, said = [], []
+
+    def evaluate(windows, point, starts):
+        seen.append(len(windows.trial))
+        return {"sum": windows.measured + point.x * point.z[:, 0] + starts, "trial": windows.trial}
+
+    monkeypatch.setattr(jax, "process_count", lambda: processes)
+    monkeypatch.setattr(parallel, "process_allgather", lambda found, tiled: said.append(found) or found)
+    for i in range(processes):
+        monkeypatch.setattr(jax, "process_index", lambda i=i: i)
+        parallel._by_all(evaluate, windows, point, 0.1 * np.arange(5))
+    together = {name: np.concatenate([found[name] for found in said])[:5] for name in said[0]}
+    np.testing.assert_array_equal(together["trial"], np.arange(5))
+    np.testing.assert_allclose(together["sum"], 12.1 * np.arange(5), rtol=1e-15)
+    assert set(seen) == {-(-5 // processes) + 1}  # one more than its share, to be compared with
+
+
+def test_processes_with_different_problems_are_refused(monkeypatch):
+    monkeypatch.setattr(parallel, "process_allgather", lambda own: np.stack([own, own]))
+    parallel.check_same({"mass": np.ones(2)}, {"t": np.arange(3.0)})
+    monkeypatch.setattr(parallel, "process_allgather", lambda own: np.stack([own, own + np.uint32(1)]))
+    with pytest.raises(ValueError, match="the processes pose different problems"):
+        parallel.check_same({"mass": np.ones(2)}, {"t": np.arange(3.0)})
