@@ -7,7 +7,7 @@ from slopes import differences, slopes
 from systems import Track
 
 from jaxkane.fit import LeastSquares, Problem, Trial, design, minimize
-from jaxkane.fit._analysis.design import _covariance, goal_of
+from jaxkane.fit._analysis.information import covariance_of, goal_of
 
 t = np.arange(0.0, 4.0, 0.1)
 SIGMA = {"x": 0.01}
@@ -74,6 +74,6 @@ def test_the_gradient_of_a_plan_against_differences():
 def test_what_a_plan_does_not_tell_has_an_infinite_error():
     # Of the first two only their sum is known.
     rows = np.array([[1.0, 1.0, 0.0], [2.0, 2.0, 1.0], [0.0, 0.0, 3.0]])
-    covariance = _covariance(rows.T @ rows)
+    covariance = covariance_of(rows.T @ rows)
     assert np.isinf(covariance.diagonal()[:2]).all()
     assert covariance[2, 2] == pytest.approx(np.linalg.pinv(rows.T @ rows)[2, 2])

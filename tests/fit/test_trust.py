@@ -259,9 +259,9 @@ def test_what_runs_to_its_bound_is_told_so(trials):
     assert found.estimates["damping"] == pytest.approx(0.8, abs=1e-3)
     assert not found.ok
     assert any("damping has gone to its bound" in note for note in found.notes)
-    with pytest.raises(ValueError, match="These data do not tell damping: give a prior"):
+    with pytest.raises(ValueError, match="These data do not determine damping: give a prior"):
         laplace(found)
-    with pytest.raises(ValueError, match="These data do not tell damping: the cost has converged, but"):
+    with pytest.raises(ValueError, match="These data do not determine damping: the cost has converged, but"):
         profile(found, "damping")
     assert "bound" in report(found)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -99,6 +99,13 @@ def _plan(system: System, q: Any, free: Sequence[str] | None) -> _Plan:
     # Beside a scalar that is named, the axis of a rotation cannot be found: it is zero, or named too.
     still = {names[i] for four in quaternions if names[four[3]] in named for i in four}
     return _Plan(tuple(c for c in names if c not in named and c not in still), named, guess, lenient=True)
+
+
+def found_of(system: System, named: Iterable[str]) -> tuple[tuple[str, ...], dict[str, float]]:
+    """Of coordinates in a dict with these names: those that `assemble` moves, and where of those that are left out
+    some start that do not start at zero."""
+    plan = _plan(system, dict.fromkeys(named, 0.0), None)
+    return plan.moved, plan.guess
 
 
 _EULER_PARAMETERS: dict[Any, list[tuple[int, ...]]] = {}  # structures, the oldest first

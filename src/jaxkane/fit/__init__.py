@@ -1,4 +1,4 @@
-"""Parameters from measured motion: trials, residuals with exact derivatives, optimizers, and what can be told."""
+"""Parameters from measured motion: trials, exact derivatives, optimizers, and how far to trust what is found."""
 
 from ._analysis.design import Design as Design
 from ._analysis.design import design as design

@@ -1,4 +1,4 @@
-"""What data can tell before anything is fitted to them. Knows how to find the nuisance values."""
+"""What data determine before anything is fitted to them. Knows how to find the nuisance values."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from .._result.identifiability import Identifiability, identifiability_at
 
 
 def identifiability(problem: Problem, *, flat: float = 0.5, at: Unknowns | None = None) -> Identifiability:
-    """Which parameters, or combinations of them, the data can tell; of a `Fit`, `fit.identifiability` says it.
+    """Which parameters, or combinations of them, the data determine; of a `Fit`, `fit.identifiability` says it.
 
         identifiability(Problem.of(system, trials, free, unknown=("roll",)))
 

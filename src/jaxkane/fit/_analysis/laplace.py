@@ -53,13 +53,15 @@ def laplace(fit: Fit) -> Laplace:
     uniform density between them; else it is improper, and the evidence is NaN. Starts and biases without a standard
     deviation have a density of one per unit: compare only models that have the same of these, or give deviations.
 
-    **Raises:** `ValueError` that names the parameters that the data do not tell (nothing bounds their posterior), and
+    **Raises:** `ValueError` that names the parameters that the data do not determine (nothing bounds their posterior), and
     for a fit that is not at a minimum.
     """
     refuse_other(fit, Fit, "laplace", "laplace(fit(...))")
-    untold = [name for name, error in fit.standard_errors.items() if np.isinf(error)]
-    if untold:
-        raise ValueError(f"These data do not tell {', '.join(untold)}: give a prior, or leave something out.")
+    undetermined = [name for name, error in fit.standard_errors.items() if np.isinf(error)]
+    if undetermined:
+        raise ValueError(
+            f"These data do not determine {', '.join(undetermined)}: give a prior, or leave something out."
+        )
     eliminated = eliminate(fit.linearization.blocks, 0.0)
     to_gain = fit.cost - float(eliminated.step(1e-9)[1])
     if fit.status == "applied" or not to_gain < 0.1:
@@ -70,7 +72,7 @@ def laplace(fit: Fit) -> Laplace:
     A = np.asarray(eliminated.rows[0], float)
     _, s, V = np.linalg.svd(A, full_matrices=False)
     log_prior, message = _log_priors(fit)
-    message = message or _untold_nuisance(fit.problem, eliminated)
+    message = message or _undetermined_nuisance(fit.problem, eliminated)
     evidence = log_likelihood(fit.problem, fit.cost) + log_prior + _log_volume(fit, eliminated, s)
     return Laplace(fit, np.asarray(fit.point.x), (V.T / s**2) @ V, math.nan if message else evidence, message)
 
@@ -105,19 +107,19 @@ def _log_priors(fit: Fit) -> tuple[float, str]:
 
 def _log_volume(fit: Fit, eliminated: Eliminated, s: np.ndarray) -> float:
     """1/2 log det(2 pi C) of all unknowns in their units; those that have no density at all are left out."""
-    z, b = (np.asarray(x) for x in eliminated.told)
+    z, b = (np.asarray(x) for x in eliminated.informed)
     number = s.size + np.count_nonzero(z) + np.count_nonzero(b)
     log_information = 2 * np.sum(np.log(s)) + float(eliminated.log_determinant)
     to_units = float(fit.parameters.log_determinant(fit.point.x))
     return 0.5 * number * LOG_2PI - 0.5 * log_information + to_units
 
 
-def _untold_nuisance(problem: Problem, eliminated: Eliminated) -> str:
+def _undetermined_nuisance(problem: Problem, eliminated: Eliminated) -> str:
     """The starts and biases that have neither data nor a prior, in words: nothing bounds their posterior."""
-    z, b = (np.asarray(x) for x in eliminated.told)  # (T, m, n_z), (T, n_b)
+    z, b = (np.asarray(x) for x in eliminated.informed)  # (T, m, n_z), (T, n_b)
     counts, n = np.append(problem.seen, False)[np.asarray(problem.by_trial)], problem.model.nuisance  # (T, m)
     names = [name for j, name in enumerate(n.start) if np.any(counts & ~z[..., j])]
     names += [" ".join(pair) for j, pair in enumerate(n.trial) if np.any(counts.any(axis=1) & ~b[:, j])]
     if not names:
         return ""
-    return f"No evidence: the data do not tell {', '.join(names)} of every window. Give a standard deviation."
+    return f"No evidence: the data do not determine {', '.join(names)} of every window. Give a standard deviation."

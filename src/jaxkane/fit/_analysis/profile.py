@@ -37,7 +37,7 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
     **Arguments:** `name`; `n`: values, half on either side of the estimate; `span`: how many formal standard errors to
     either side, by default half as far again as the interval reaches; `level` of the interval.
 
-    **Raises:** `ValueError` for a name that is not free, or a parameter that the data do not tell.
+    **Raises:** `ValueError` for a name that is not free, or a parameter that the data do not determine.
     """
     refuse_other(fit, Fit, "profile", "profile(fit(...), name)")
     if name not in fit.names:
@@ -46,7 +46,7 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
         raise ValueError(f"A profile has three values at least over a positive span, got n = {n}, span = {span}.")
     error, best = fit.standard_errors[name], fit.estimates[name]
     if not np.isfinite(error):
-        raise ValueError(f"These data do not tell {name}: {fit.message}.")
+        raise ValueError(f"These data do not determine {name}: {fit.message}.")
     if span is None:
         low, high = fit.intervals(level)[name]
         span = 0.75 * (high - low) / error

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -61,10 +61,12 @@ def cut(
     *,
     chained: bool = False,
     delayed: bool = False,
+    guess: Mapping[str, float] | None = None,
 ) -> tuple[Windows, tuple[Place, ...]]:
     """Windows of `window` [s], or one a trial; and the place of each.
 
-    A last piece shorter than half a window is joined to the one before.
+    A last piece shorter than half a window is joined to the one before. `guess`: by name, where coordinates start of
+    which nothing is known, if not at zero.
     """
     places = [(k, i, n) for k, trial in enumerate(trials) for i, n in _pieces(trial.t, window, chained)]
     if not chained:  # a window without one measurement would only add unknowns
@@ -89,7 +91,9 @@ def cut(
         rows = [trial.inputs.get(name, np.zeros_like(trial.t))[there] for name in system.inputs]
         found["inputs"].append(np.array(rows).reshape(len(system.inputs), len(wanted)))
     names = (*system.coordinates, *system.speeds)
-    start = np.array([[_start(trials[k], i, n, name) for name in names] for k, i, n in places])
+    guesses = [(guess or {}).get(name, 0.0) for name in names]
+    pairs = tuple(zip(names, guesses, strict=True))
+    start = np.array([[_start(trials[k], i, n, *pair) for pair in pairs] for k, i, n in places])
     owner = np.array([k for k, _, _ in places])
     array = lambda x: jnp.asarray(np.array(x), dtype=jnp.result_type(float))  # noqa: E731
     windows = Windows(
@@ -116,7 +120,7 @@ def _pieces(t: np.ndarray, window: float | None, chained: bool) -> list[tuple[in
     if len(pieces) > 1 and (t[-1] - t[pieces[-1][0]] < 0.5 * window or pieces[-1][1] < 2):
         (i, n), (_, m) = pieces[-2:]
         pieces[-2:] = [(i, n + m)]
-    # One sample tells nothing about motion, unless the next window goes on from it.
+    # One sample says nothing about motion, unless the next window goes on from it.
     return [(i, n) for i, n in pieces if n > 1 or chained]
 
 
@@ -135,8 +139,8 @@ def _fill(rows: np.ndarray, n_t: int) -> np.ndarray:
     return np.pad(rows, ((0, 0), (0, n_t - rows.shape[1])))
 
 
-def _start(trial: Trial, i: int, n: int, name: str) -> float:
-    """What is known of a coordinate or speed where a window starts, else its first measurement there, else zero."""
+def _start(trial: Trial, i: int, n: int, name: str, guess: float) -> float:
+    """What is known of a coordinate or speed where a window starts, else its first measurement there, else a guess."""
     if name in trial.initial:
         return float(trial.initial[name][i])
     if name in trial.measured:
@@ -144,4 +148,4 @@ def _start(trial: Trial, i: int, n: int, name: str) -> float:
         seen = seen[np.isfinite(seen)]
         if seen.size:
             return float(seen[0])
-    return 0.0
+    return guess

@@ -130,7 +130,7 @@ def _directions(eliminated: Eliminated, variance: float | None) -> Array:
     if variance is None:
         return jnp.eye(A.shape[1], dtype=A.dtype) / jnp.linalg.norm(A)
     _, s, V = jnp.linalg.svd(A, full_matrices=False)
-    # What the data do not tell may not run away: as if every parameter were known to about its scale.
+    # What the data do not determine may not run away: as if every parameter were known to about its scale.
     floor = jnp.maximum(variance**0.5, 1e-6 * s[0]) + jnp.finfo(s.dtype).tiny
     return (V.T / jnp.sqrt(s**2 + floor**2)[None, :]) @ V
 

@@ -40,7 +40,7 @@ def solve_nuisance(
 
     Windows that cannot be simulated to their end with the initial guess (an unstable ride falls over) begin with a
     shorter horizon, which is doubled as soon as it fits. Where that fails for windows that are chained, each is first
-    settled by itself.
+    solved for by itself.
 
     **Raises:** `ValueError` that names a window which does not reach its end.
     """

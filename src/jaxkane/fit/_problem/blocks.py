@@ -41,7 +41,7 @@ class Blocks(eqx.Module):
         return jnp.sqrt(jnp.sum(self.R[:, :, -1 - self.n_x : -1] ** 2, axis=(0, 1)))
 
     @property
-    def silent(self) -> Array:
+    def without_influence(self) -> Array:
         """Whether an x (n_x,) moves no residual by more than rounding errors."""
         norms = self.column_norms
         return norms <= 1e4 * jnp.finfo(norms.dtype).eps * jnp.max(norms)
@@ -76,11 +76,13 @@ class Eliminated(eqx.Module):
     @property
     def log_determinant(self) -> Array:
         """log det of the information about z and b, those without any left out."""
-        logs = [jnp.sum(jnp.log(jnp.where(told, d, 1.0))) for d, told in zip(self._diagonals, self.told, strict=True)]
+        logs = [
+            jnp.sum(jnp.log(jnp.where(known, d, 1.0))) for d, known in zip(self._diagonals, self.informed, strict=True)
+        ]
         return 2 * (logs[0] + logs[1])
 
     @property
-    def told(self) -> tuple[Array, Array]:
+    def informed(self) -> tuple[Array, Array]:
         """Whether there is information about z (T, m, n_z) and b (T, n_b): elimination leaves rounding errors of a
         column that others can stand for, and less of one that moves no residual."""
 
@@ -129,8 +131,8 @@ def eliminate(blocks: Blocks, damping: Array | float) -> Eliminated:
     """z and b eliminated, each with `damping` * |column| * unknown added to the residuals (Levenberg-Marquardt)."""
     R, n_z, n_next, n_b, n_x = blocks.R, blocks.n_z, blocks.n_next, blocks.n_b, blocks.n_x
     # What has no influence has rounding errors; a step along them would lead anywhere.
-    silent = jnp.zeros(R.shape[-1], bool).at[-1 - n_x : -1].set(blocks.silent)
-    R = jnp.where(silent[None, None, :], 0.0, R)
+    none = jnp.zeros(R.shape[-1], bool).at[-1 - n_x : -1].set(blocks.without_influence)
+    R = jnp.where(none[None, None, :], 0.0, R)
     of_z, of_b = _column_squares(blocks)
     # Never quite zero: an unknown without influence then stays where it is, instead of becoming NaN.
     damping = jnp.maximum(jnp.asarray(damping, R.dtype), 1e3 * jnp.finfo(R.dtype).eps)

@@ -82,6 +82,7 @@ class Model(eqx.Module):
     channels: tuple[str, ...] = eqx.field(static=True)
     driven: tuple[str, ...] = eqx.field(static=True)  # inputs of which there are samples
     held: tuple[str, ...] = eqx.field(static=True)
+    assembled: tuple[str, ...] | None = eqx.field(static=True)  # coordinates that `assemble` moves, if not its own
     outputs: tuple[tuple[str, Callable[[Trajectory], Array]], ...] = eqx.field(static=True)
 
     @property
@@ -95,7 +96,7 @@ class Model(eqx.Module):
         system, _ = self.parameters.apply(self.system, x)
         start = window.start.at[self.unknown_places].add(z)
         n_q = len(system.coordinates)
-        state = assemble(system, start[:n_q], start[n_q:], t=window.t[0])
+        state = assemble(system, start[:n_q], start[n_q:], t=window.t[0], free=self.assembled)
         return jnp.concatenate([state.q, state.u])
 
     def simulate(self, window: Windows, start: Array, b: Array, x: Array) -> Trajectory:

@@ -10,8 +10,11 @@ import numpy as np
 
 from ..._common.lookup import hint, refuse_unknown
 from ..._description.system import System
+from ..._method.assembly import found_of
+from ..._method.drift import has_configuration_constraints
 from .._data.trial import Trial
 from .model import Nuisance
+from .parameters import Delay
 
 Names = Sequence[str] | Mapping[str, float | None]
 """Names, or names with the standard deviation of a Gaussian prior around the initial guess (None: no prior)."""
@@ -51,18 +54,68 @@ def checked_names(system: System, what: str, given: Any, known: Sequence[str]) -
     return {name: float("inf") if deviation is None else float(deviation) for name, deviation in given.items()}
 
 
-def nuisance_of(
-    system: System, unknown: Names, per_trial: Mapping[str, Mapping[str, float]], continuity: Mapping[str, float] | None
-) -> Nuisance:
-    held = tuple(c for c in system.coordinates if c not in system.dependent_coordinates)
-    start = checked_names(system, "unknown", unknown, (*held, *system.speeds))
-    jump = checked_names(system, "continuity", continuity or {}, tuple(start))
+def starts_found(
+    system: System, trials: Sequence[Trial], unknown: Sequence[str]
+) -> tuple[tuple[str, ...] | None, dict[str, float]]:
+    """How the windows' starts are made to satisfy the constraints: as `assemble` does with a dict that names what is
+    known, measured or unknown. The coordinates that it moves, None for those that it moves of an array; and where some
+    of which nothing is known start, the others starting at zero.
+
+    **Raises:** `ValueError` for a trial that says nothing of a coordinate which is held in the others.
+    """
+    by_trial = [{*trial.initial, *trial.measured, *unknown} for trial in trials]
+    named = [c for c in system.coordinates if any(c in names for names in by_trial)]
+    moved, guess = found_of(system, named)
+    q = jnp.zeros(len(system.coordinates))
+    if system.dependent_coordinates or not has_configuration_constraints(system, jnp.zeros(()), q):
+        return None, guess
+    for trial, names in zip(trials, by_trial, strict=True):
+        missing = [c for c in named if c not in names]
+        if missing:
+            raise ValueError(
+                f"{trial.name} says nothing of {', '.join(missing)}, which is held where other trials start: name it "
+                f"in `initial`, or give {type(system).__name__} its `dependent_coordinates`."
+            )
+    return (None if len(named) == len(system.coordinates) else moved), guess
+
+
+def nuisance_of(system: System, channels: Sequence[str], driven: Sequence[str], posed: Mapping[str, Any]) -> Nuisance:
+    """What is unknown beside the parameters, of the arguments of a fit by name; `driven` are inputs with samples."""
+    known = {
+        "sensor_bias": channels,
+        "sensor_gain": channels,
+        "input_bias": system.inputs,
+        "input_gain": driven,
+        "input_delay": driven,
+    }
+    trial = {}
+    for argument, names in known.items():
+        where, kind = argument.split("_")
+        for name, deviation in checked_names(system, argument, posed[argument], names).items():
+            trial[f"{kind} of {where}", name] = deviation
+    independent = tuple(c for c in system.coordinates if c not in system.dependent_coordinates)
+    start = checked_names(system, "unknown", posed["unknown"], (*independent, *system.speeds))
+    jump = checked_names(system, "continuity", posed["continuity"] or {}, tuple(start))
     array = lambda numbers: jnp.asarray(np.array(list(numbers), float), jnp.result_type(float))  # noqa: E731
     return Nuisance(
         start=tuple(start),
-        trial=tuple((kind, name) for kind, names in per_trial.items() for name in names),
-        chained=continuity is not None,
+        trial=tuple(trial),
+        chained=posed["continuity"] is not None,
         start_deviation=array(start.values()),
-        trial_deviation=array(d for names in per_trial.values() for d in names.values()),
+        trial_deviation=array(trial.values()),
         jump=array(jump.get(name, float("inf")) for name in start),
     )
+
+
+def held_and_delayed(
+    system: System, hold: Any, free: Any, nuisance: Nuisance
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Inputs that keep each sample until the next, and those that act with a delay which is to be found."""
+    items = [free] if isinstance(free, Delay) else free if isinstance(free, (list, tuple)) else ()
+    delayed = [name for kind, name in nuisance.trial if kind == "delay of input"]
+    delayed += [item.input for item in items if isinstance(item, Delay)]
+    held = tuple(checked_names(system, "hold", hold, system.inputs))
+    stuck = sorted(set(delayed) & set(held))
+    if stuck:
+        raise ValueError(f"{stuck[0]} is held from sample to sample: nothing changes smoothly with its delay.")
+    return held, tuple(delayed)

@@ -19,9 +19,9 @@ from .._data.trial import Trial
 from .._data.windows import Place, Windows, cut
 from .blocks import Blocks
 from .model import Model, Unknowns, blocks_of, costs_of, rides_of, starts_of
-from .names import Names, checked_names, checked_trials, nuisance_of
+from .names import Names, checked_trials, held_and_delayed, nuisance_of, starts_found
 from .parallel import blocks_of_all, check_same, costs_of_all
-from .parameters import Delay, Parameters, Prior, parameters_of
+from .parameters import Parameters, Prior, parameters_of
 from .simulation import Simulation
 
 STEP_TOLERANCE = 0.05, 0.25
@@ -76,36 +76,25 @@ class Problem:
         trials = (trials,) if isinstance(trials, Trial) else tuple(trials)
         outputs = dict(outputs or {})
         channels = checked_trials(system, trials, outputs)
-        if window is not None and not window > 0:
-            raise ValueError(f"`window` is a length of time [s], got {window}.")
-        if continuity is not None and window is None:
-            raise ValueError("`continuity` binds the windows of a trial together: give their length, `window` [s].")
+        _check_windows(window, continuity)
         driven = tuple(name for name in system.inputs if any(name in trial.inputs for trial in trials))
-        per_trial = {
-            "bias of sensor": checked_names(system, "sensor_bias", sensor_bias, channels),
-            "gain of sensor": checked_names(system, "sensor_gain", sensor_gain, channels),
-            "bias of input": checked_names(system, "input_bias", input_bias, system.inputs),
-            "gain of input": checked_names(system, "input_gain", input_gain, driven),
-            "delay of input": checked_names(system, "input_delay", input_delay, driven),
-        }
-        items = [free] if isinstance(free, Delay) else free if isinstance(free, (list, tuple)) else ()
-        late = [*per_trial["delay of input"], *(item.input for item in items if isinstance(item, Delay))]
-        held = tuple(checked_names(system, "hold", hold, system.inputs))
-        stuck = sorted(set(late) & set(held))
-        if stuck:
-            raise ValueError(f"{stuck[0]} is held from sample to sample: nothing changes smoothly with its delay.")
+        nuisance = nuisance_of(system, channels, driven, posed)
+        held, delayed = held_and_delayed(system, hold, free, nuisance)
+        assembled, guess = starts_found(system, trials, nuisance.start)
         parameters = parameters_of(system, free).with_priors(priors or {})
-        windows, places = cut(system, trials, window, channels, chained=continuity is not None, delayed=bool(late))
+        options = {"chained": nuisance.chained, "delayed": bool(delayed), "guess": guess}
+        windows, places = cut(system, trials, window, channels, **options)
         check_system(system, windows.t[0, 0], jnp.nan_to_num(windows.start[0, : len(system.coordinates)]))
         varying = any(np.ptp(x) > 0 for t in trials for x in t.inputs.values())
         model = Model(
             system=system,
             parameters=parameters,
-            nuisance=nuisance_of(system, unknown, per_trial, continuity),
+            nuisance=nuisance,
             settings=simulation.settings(windows.t[0], varying),
             channels=channels,
             driven=driven,
             held=held,
+            assembled=assembled,
             outputs=tuple(outputs.items()),
         )
         if simulation.step is not None:  # one step in all windows
@@ -280,6 +269,13 @@ class Problem:
         return dataclasses.replace(
             self, model=eqx.tree_at(lambda m: m.parameters, self.model, self.parameters.with_priors(priors))
         )
+
+
+def _check_windows(window: float | None, continuity: Mapping[str, float] | None) -> None:
+    if window is not None and not window > 0:
+        raise ValueError(f"`window` is a length of time [s], got {window}.")
+    if continuity is not None and window is None:
+        raise ValueError("`continuity` binds the windows of a trial together: give their length, `window` [s].")
 
 
 def refuse_other(given: Any, wanted: type, name: str, instead: str) -> None:

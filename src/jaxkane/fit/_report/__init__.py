@@ -1,1 +1,1 @@
-"""A fit told: tables, text, pictures, a page."""
+"""What a fit looks like: tables, text, pictures, a page."""

@@ -1,4 +1,4 @@
-"""A fit told: as a text, and as one HTML page with pictures that needs nothing else. Knows results; computes none."""
+"""A fit as a text, and as one HTML page with pictures that needs nothing else. Knows results and what can be asked."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def save_report(
             "Parameters",
             _table(*_parameters(fit, truth)) + _paragraph(_how_sure(fit)) + _picture(pictures.draw_estimates(fit)),
         ),
-        ("What the data tell", _table(*_directions(fit)) + _picture(pictures.draw_correlation(fit))),
+        ("What the data determine", _table(*_directions(fit)) + _picture(pictures.draw_correlation(fit))),
         ("Way down", _picture(pictures.draw_history(fit))),
         ("Measured and fitted", _table(*_channels(fit)) + "".join(map(_picture, pictures.draw_trials(fit, trials)))),
         ("Residuals", _picture(pictures.draw_residuals(fit)) + _details("Every trial", _table(*_tests(fit)))),
@@ -102,7 +102,7 @@ def _all_notes(fit: Fit) -> tuple[str, ...]:
     return (*fit.notes, *contrary_signs(fit))
 
 
-# What is told: a heading and rows of text for each table.
+# What is shown: a heading and rows of text for each table.
 
 
 def _parameters(fit: Fit, truth: Any) -> tuple[Row, Sequence[Row]]:

@@ -23,7 +23,7 @@ def clustered_covariance(problem: Problem, point: Unknowns, at: Linearization) -
 
     (Liang and Zeger 1986; White's sandwich with a trial as the unit.) The parameters' priors, of information P, are
     measurements of their own with the deviations they were given, and no part of any trial. NaN with fewer trials than
-    parameters plus two, and for parameters that the data do not tell.
+    parameters plus two, and for parameters that the data do not determine.
     """
     blocks = np.asarray(eliminate(at.blocks, 0.0).R, float)  # (T, p+1, p+1)
     T, p, parameters, x = problem.clusters, len(problem.parameters.names), problem.parameters, point.x

@@ -1,4 +1,4 @@
-"""What the data can tell: singular values of the sensitivity, and the directions in which nothing changes."""
+"""What the data determine: singular values of the sensitivity, and the directions in which nothing changes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class Identifiability:
     - `deviations` (p,): standard deviation along each row, in scaled units.
     - `without_influence`: names of the parameters that change no residual at all. `at_bound`: of those that went as far
         as their bounds let them.
-    - `undetermined`: the directions that the data do not tell, weakest first.
+    - `undetermined`: the directions that the data do not determine, weakest first.
     - `covariance` (p, p) of the parameters in their units, infinite for those without influence.
     - `covariance_of_x` (p, p) of the free numbers behind them.
     """
@@ -56,7 +56,7 @@ class Identifiability:
 
     @property
     def ok(self) -> bool:
-        """Whether every parameter can be told."""
+        """Whether every parameter is determined."""
         return not self.undetermined
 
     @property
@@ -94,36 +94,36 @@ def identifiability_at(problem: Problem, point: Unknowns, at: Linearization, fla
     A = np.asarray(eliminated.rows[0]) @ to_x
     before = np.linalg.norm(np.asarray(at.blocks.R)[:, :, -1 - p : -1] @ to_x, axis=(0, 1))
     eps = float(jnp.finfo(eliminated.R.dtype).eps)
-    silent = before <= 1e4 * eps * before.max()
+    no_influence = before <= 1e4 * eps * before.max()
     variance = residual_variance(problem, at.cost)
     # Without a degree of freedom nothing says that `sigma` is wrong.
     deviation = 1.0 if np.isnan(variance) else variance**0.5
-    heard = np.flatnonzero(~silent)
+    seen = np.flatnonzero(~no_influence)
     s, V = np.zeros(p), np.zeros((p, p))
-    if heard.size:
-        # Columns that belong to silent free numbers are left out of the elimination: nothing is lost.
-        _, s[: heard.size], V[: heard.size, heard] = np.linalg.svd(A[:, heard], full_matrices=False)
-    # Each silent parameter is a direction of its own.
-    V[np.arange(heard.size, p), np.flatnonzero(silent)] = 1.0
+    if seen.size:
+        # Columns that belong to free numbers without influence are left out of the elimination: nothing is lost.
+        _, s[: seen.size], V[: seen.size, seen] = np.linalg.svd(A[:, seen], full_matrices=False)
+    # Each parameter without influence is a direction of its own.
+    V[np.arange(seen.size, p), np.flatnonzero(no_influence)] = 1.0
     s = np.where(s <= 1e3 * eps * before.max(), 0.0, s)  # elimination leaves rounding errors of what it removed
     with np.errstate(divide="ignore"):
         deviations = deviation / s
         inverse = np.where(s > 0, 1 / s, 0.0)
     V = V * np.sign(V[np.arange(p), np.abs(V).argmax(axis=1)])[:, None]
-    told = ~silent & np.all((np.abs(V) < 1e-6) | (s[:, None] > 0), axis=0)
+    determined = ~no_influence & np.all((np.abs(V) < 1e-6) | (s[:, None] > 0), axis=0)
     scaled = variance * (V.T * inverse**2) @ V
     of_x = to_x @ scaled @ to_x.T
     covariance = scaled * np.outer(scales, scales)
-    covariance[~told, :] = covariance[:, ~told] = np.nan
-    covariance[~told, ~told] = np.inf
-    seen = Identifiability(
+    covariance[~determined, :] = covariance[:, ~determined] = np.nan
+    covariance[~determined, ~determined] = np.inf
+    found = Identifiability(
         names=names,
         units=parameters.units,
         scales=scales,
         singular_values=s,
         vectors=V,
         deviations=deviations,
-        without_influence=tuple(name for name, quiet in zip(names, silent, strict=True) if quiet),
+        without_influence=tuple(name for name, none in zip(names, no_influence, strict=True) if none),
         at_bound=(),
         undetermined=(),
         covariance=covariance,
@@ -133,13 +133,13 @@ def identifiability_at(problem: Problem, point: Unknowns, at: Linearization, fla
     alone = np.count_nonzero(to_values, axis=1) <= 1
     edge = alone & (scales < 1e-3 * np.asarray(parameters.scale))
     at_bound = tuple(name for name, there in zip(names, edge, strict=True) if there)
-    seen = dataclasses.replace(
-        seen,
+    found = dataclasses.replace(
+        found,
         at_bound=at_bound,
-        without_influence=tuple(name for name in seen.without_influence if name not in at_bound),
+        without_influence=tuple(name for name in found.without_influence if name not in at_bound),
     )
     weak = [i for i in reversed(range(p)) if not deviations[i] <= flat]
-    return dataclasses.replace(seen, undetermined=tuple(_direction(seen, i) for i in weak))
+    return dataclasses.replace(found, undetermined=tuple(_direction(found, i) for i in weak))
 
 
 def _direction(seen: Identifiability, i: int) -> Direction:
@@ -152,7 +152,7 @@ def _direction(seen: Identifiability, i: int) -> Direction:
     elif len(parts) == 1 and first in seen.without_influence:
         text = f"{first} has no influence on these data; it stays at its start."
     elif len(parts) == 1 and s == 0:
-        text = f"{first} cannot be told from the unknown starts and biases."
+        text = f"{first} cannot be told apart from the unknown starts and biases."
     elif len(parts) == 1:
         unit = f" {seen.units[order[0]]}" * bool(seen.units[order[0]])
         error = deviation * seen.scales[order[0]]

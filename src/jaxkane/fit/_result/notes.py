@@ -161,7 +161,7 @@ def bodies_at_the_edge(fit: Fit) -> list[str]:
 
 
 def trade_offs(fit: Fit) -> list[str]:
-    """Pairs of parameters of which the data tell little more than a combination."""
+    """Pairs of parameters of which the data determine little more than a combination."""
     notes, correlation = [], fit.correlation
     for i, name in enumerate(fit.names):
         for j in range(i):

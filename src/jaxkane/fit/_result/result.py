@@ -1,4 +1,4 @@
-"""What a fit found, how sure it is, and what it could not tell: numbers only. Simulates nothing, fits nothing."""
+"""What a fit found, how sure it is, and what the data do not determine: numbers only. Simulates nothing, fits nothing."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Fit:
     - `intervals(level)`: by name. `correlation` (p, p) of the estimates, in the order of `names`.
     - `cost`: sum of squared residuals; `history`: of the cost. `status`, `message`: how it ended, in a word and in
         words.
-    - `identifiability`: singular values and directions of the sensitivity, and what the data do not tell.
+    - `identifiability`: singular values and directions of the sensitivity, and what the data do not determine.
     - `residuals`: by trial and channel, (simulated - measured) / sigma (n_t,), NaN in gaps; `fitted`: simulated (n_t,).
         `tests`: by trial and channel, a `ResidualTest`. `variance_accounted_for`: by channel, over all trials.
     - `nuisance`: by trial, values of the biases and of the windows' starts by name.
