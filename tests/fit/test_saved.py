@@ -138,6 +138,11 @@ def test_options_of_the_optimizer_and_of_the_simulation_are_two(result):
         steps=7,
     )
     assert tight.problem.model.settings.rtol == 1e-9
+    for optimizer in ("least_squares", LeastSquares):
+        with pytest.raises(TypeError, match=r"`optimizer` is such as GradientDescent\(\), LeastSquares\(\) .*; got"):
+            minimize(result.problem, optimizer)
+    with pytest.raises(TypeError, match=r"`simulation=` takes a Simulation, as in Simulation\(step=0.01\); got dict"):
+        pose(simulation={"step": 0.1})
     assert np.isnan(tight.step_error)
 
 

@@ -21,6 +21,8 @@ from ._optimize.bfgs import BFGS as BFGS
 from ._optimize.gradient_descent import GradientDescent as GradientDescent
 from ._optimize.least_squares import LeastSquares as LeastSquares
 from ._optimize.minimize import minimize as minimize
+from ._optimize.optimizer import Iterate as Iterate
+from ._optimize.optimizer import Optimizer as Optimizer
 from ._problem.bijections import Interval as Interval
 from ._problem.bijections import PossibleBody as PossibleBody
 from ._problem.density import log_density as log_density

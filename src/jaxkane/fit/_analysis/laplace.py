@@ -53,8 +53,8 @@ def laplace(fit: Fit) -> Laplace:
     uniform density between them; else it is improper, and the evidence is NaN. Starts and biases without a standard
     deviation have a density of one per unit: compare only models that have the same of these, or give deviations.
 
-    **Raises:** `ValueError` that names the parameters that the data do not determine (nothing bounds their posterior), and
-    for a fit that is not at a minimum.
+    **Raises:** `ValueError` that names the parameters that the data do not determine (nothing bounds their posterior),
+    and for a fit that is not at a minimum.
     """
     refuse_other(fit, Fit, "laplace", "laplace(fit(...))")
     undetermined = [name for name, error in fit.standard_errors.items() if np.isinf(error)]

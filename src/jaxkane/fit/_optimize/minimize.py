@@ -42,9 +42,11 @@ def minimize(
     **Returns:** a `Fit` at the best point seen, with the history of the cost; after an interruption (Ctrl-C) too, and
     `status` says so.
 
-    **Raises:** `ValueError` where a window cannot be simulated with the initial guess, or a checkpoint is of another
-    fit.
+    **Raises:** `TypeError` for what is no optimizer; `ValueError` where a window cannot be simulated with the initial
+    guess, or a checkpoint is of another fit.
     """
+    if not isinstance(optimizer, Optimizer):
+        raise TypeError(f"`optimizer` is such as GradientDescent(), LeastSquares() or BFGS(); got {optimizer!r}.")
     steps = optimizer.steps if steps is None else steps
     start = problem.start if start is None else start
     key = {} if checkpoint is None else {"method": optimizer.name, **optimizer.depends_on(problem, steps)}

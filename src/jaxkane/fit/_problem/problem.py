@@ -72,6 +72,7 @@ class Problem:
     ) -> Problem:
         """Pose a fit. The arguments are those of `jaxkane.fit.fit`."""
         simulation = Simulation() if simulation is None else simulation
+        refuse_other(simulation, Simulation, "`simulation=`", "Simulation(step=0.01)")
         posed = {key: value for key, value in locals().items() if key not in ("cls", "trials")}
         trials = (trials,) if isinstance(trials, Trial) else tuple(trials)
         outputs = dict(outputs or {})

@@ -95,27 +95,21 @@ def identifiability_at(problem: Problem, point: Unknowns, at: Linearization, fla
     before = np.linalg.norm(np.asarray(at.blocks.R)[:, :, -1 - p : -1] @ to_x, axis=(0, 1))
     eps = float(jnp.finfo(eliminated.R.dtype).eps)
     no_influence = before <= 1e4 * eps * before.max()
+    s, V = _by_singular_values(A, no_influence, 1e3 * eps * before.max())
     variance = residual_variance(problem, at.cost)
-    # Without a degree of freedom nothing says that `sigma` is wrong.
-    deviation = 1.0 if np.isnan(variance) else variance**0.5
-    seen = np.flatnonzero(~no_influence)
-    s, V = np.zeros(p), np.zeros((p, p))
-    if seen.size:
-        # Columns that belong to free numbers without influence are left out of the elimination: nothing is lost.
-        _, s[: seen.size], V[: seen.size, seen] = np.linalg.svd(A[:, seen], full_matrices=False)
-    # Each parameter without influence is a direction of its own.
-    V[np.arange(seen.size, p), np.flatnonzero(no_influence)] = 1.0
-    s = np.where(s <= 1e3 * eps * before.max(), 0.0, s)  # elimination leaves rounding errors of what it removed
     with np.errstate(divide="ignore"):
-        deviations = deviation / s
+        # Without a degree of freedom nothing says that `sigma` is wrong.
+        deviations = (1.0 if np.isnan(variance) else variance**0.5) / s
         inverse = np.where(s > 0, 1 / s, 0.0)
-    V = V * np.sign(V[np.arange(p), np.abs(V).argmax(axis=1)])[:, None]
-    determined = ~no_influence & np.all((np.abs(V) < 1e-6) | (s[:, None] > 0), axis=0)
     scaled = variance * (V.T * inverse**2) @ V
-    of_x = to_x @ scaled @ to_x.T
     covariance = scaled * np.outer(scales, scales)
+    determined = ~no_influence & np.all((np.abs(V) < 1e-6) | (s[:, None] > 0), axis=0)
     covariance[~determined, :] = covariance[:, ~determined] = np.nan
     covariance[~determined, ~determined] = np.inf
+    # Beside a bound nothing moves any more: that is not a parameter which the data do not see.
+    alone = np.count_nonzero(to_values, axis=1) <= 1
+    at_bound = alone & (scales < 1e-3 * np.asarray(parameters.scale))
+    named = lambda which: tuple(name for name, there in zip(names, which, strict=True) if there)  # noqa: E731
     found = Identifiability(
         names=names,
         units=parameters.units,
@@ -123,23 +117,29 @@ def identifiability_at(problem: Problem, point: Unknowns, at: Linearization, fla
         singular_values=s,
         vectors=V,
         deviations=deviations,
-        without_influence=tuple(name for name, none in zip(names, no_influence, strict=True) if none),
-        at_bound=(),
+        without_influence=named(no_influence & ~at_bound),
+        at_bound=named(at_bound),
         undetermined=(),
         covariance=covariance,
-        covariance_of_x=of_x,
-    )
-    # Beside a bound nothing moves any more: that is not a parameter which the data do not see.
-    alone = np.count_nonzero(to_values, axis=1) <= 1
-    edge = alone & (scales < 1e-3 * np.asarray(parameters.scale))
-    at_bound = tuple(name for name, there in zip(names, edge, strict=True) if there)
-    found = dataclasses.replace(
-        found,
-        at_bound=at_bound,
-        without_influence=tuple(name for name in found.without_influence if name not in at_bound),
+        covariance_of_x=to_x @ scaled @ to_x.T,
     )
     weak = [i for i in reversed(range(p)) if not deviations[i] <= flat]
     return dataclasses.replace(found, undetermined=tuple(_direction(found, i) for i in weak))
+
+
+def _by_singular_values(A: np.ndarray, no_influence: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
+    """Singular values (p,) of a sensitivity (m, p), and a row (p, p) for each, whose largest entry is positive.
+
+    Values below `rounding` are zero: elimination leaves rounding errors of what it removed. Each parameter without
+    influence is a direction of its own.
+    """
+    p, seen = A.shape[1], np.flatnonzero(~no_influence)
+    s, V = np.zeros(p), np.zeros((p, p))
+    if seen.size:
+        # Columns that belong to free numbers without influence are left out of the elimination: nothing is lost.
+        _, s[: seen.size], V[: seen.size, seen] = np.linalg.svd(A[:, seen], full_matrices=False)
+    V[np.arange(seen.size, p), np.flatnonzero(no_influence)] = 1.0
+    return np.where(s <= rounding, 0.0, s), V * np.sign(V[np.arange(p), np.abs(V).argmax(axis=1)])[:, None]
 
 
 def _direction(seen: Identifiability, i: int) -> Direction:

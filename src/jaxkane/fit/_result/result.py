@@ -1,4 +1,4 @@
-"""What a fit found, how sure it is, and what the data do not determine: numbers only. Simulates nothing, fits nothing."""
+"""What a fit found, how sure that is, and what the data do not determine: numbers only. Simulates and fits nothing."""
 
 from __future__ import annotations
 

@@ -1,0 +1,67 @@
+"""An optimizer is one class: the loop gives it steps, a checkpoint, a callback, Ctrl-C and the result."""
+
+import dataclasses
+from typing import ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from systems import Track
+
+from jaxkane.fit import Iterate, LeastSquares, Optimizer, Problem, Simulation, Trial, fit, minimize
+from jaxkane.fit._optimize.steps import moved
+from jaxkane.fit._problem.blocks import eliminate
+from jaxkane.fit._problem.problem import linearize
+
+t = np.linspace(0.0, 1.0, 11)
+TRIAL = Trial(t, {"x": 0.4 * t**2 + 0.02 * np.cos(40.0 * t)}, {"push": np.sin(3.0 * t)}, sigma=0.1)
+POSED = {"unknown": ("x",), "simulation": Simulation(step=0.1)}
+
+
+@dataclasses.dataclass(frozen=True)
+class Part(Optimizer):
+    """A part of the way to the minimum of the linearized problem: of a linear one, the same part of what is left."""
+
+    steps: ClassVar[int] = 6
+    part: float = 0.5
+
+    @property
+    def name(self):
+        return "part of the way"
+
+    def begin(self, problem, point, at):
+        return jnp.zeros(())
+
+    def step(self, problem, now, taken):
+        eliminated = eliminate(now.at.blocks, 0.0)
+        point = moved(now.point, self.part * eliminated.step(0.0)[0], eliminated)
+        at = linearize(problem, point)
+        return Iterate(point, at.cost, at, now.memory + 1)
+
+
+def test_an_optimizer_is_one_class(tmp_path):
+    problem = Problem.of(Track(), TRIAL, ["gain", "drift"], **POSED)
+    least = minimize(problem, LeastSquares(rtol=1e-13)).cost
+    found = fit(Track(), TRIAL, ["gain", "drift"], optimizer=Part(), **POSED)
+    assert (found.method, found.status, len(found.history)) == ("part of the way", "steps", 7)
+    # What a linear problem costs more than its minimum falls by the square of what is left of the way.
+    excess = np.array(found.history) - least
+    np.testing.assert_allclose(excess[1:], 0.25 * excess[:-1], rtol=1e-6)
+    calls, path = [], tmp_path / "fit.npz"
+
+    def stop(point, cost):
+        calls.append(cost)
+        if len(calls) == 4:
+            raise KeyboardInterrupt
+
+    begun = minimize(problem, Part(), checkpoint=path, callback=stop)
+    assert (begun.status, begun.cost) == ("interrupted", min(calls))
+    resumed = minimize(problem, Part(), checkpoint=path)
+    assert resumed.history == pytest.approx(found.history, rel=1e-12)
+
+
+def test_the_best_is_kept_where_the_last_is_worse():
+    problem = Problem.of(Track(), TRIAL, ["gain", "drift"], **POSED)
+    away = minimize(problem, Part(part=2.5))
+    np.testing.assert_allclose(away.history[-1] / away.history[-2], 2.25, rtol=0.05)  # (1 - 2.5)^2
+    assert away.cost == away.history[0] == min(away.history)
