@@ -58,16 +58,18 @@ if _typing.TYPE_CHECKING:
     from . import catalog as catalog
     from . import convert as convert
     from . import data as data
+    from . import export as export
     from . import fit as fit
     from . import joints as joints
     from . import plot as plot
     from . import stability as stability
     from . import sweep as sweep
+    from . import symbolic as symbolic
     from ._animate import Animation as Animation
     from ._animate import Sketch as Sketch
     from ._animate import animate as animate
 
-_ROOMS = ("catalog", "convert", "data", "fit", "joints", "plot", "stability", "sweep")
+_ROOMS = ("catalog", "convert", "data", "export", "fit", "joints", "plot", "stability", "sweep", "symbolic")
 _OF_ANIMATE = ("Animation", "Sketch", "animate")
 
 

@@ -112,3 +112,26 @@ def check_parameter(label: str, value: Any, info: ParameterInfo) -> None:
         raise ValueError(f"{label} = {array} is not finite.")
     if info.positive and not np.all(array > 0):
         raise ValueError(f"{label} = {array} must be positive.")
+
+
+def leaf_name(path: tuple[Any, ...]) -> str:
+    """A leaf's name as it is written in Python: "mass", "frame.mass", "links[2].mass"."""
+    return jax.tree_util.keystr(path).lstrip(".")
+
+
+def declared(system: Any, path: tuple[Any, ...]) -> ParameterInfo:
+    """What `parameter` was told of the field that holds this leaf."""
+    found = _UNDECLARED
+    for key in path:
+        if isinstance(key, jax.tree_util.GetAttrKey):
+            field = {f.name: f for f in dataclasses.fields(system)}.get(key.name)
+            found = field.metadata.get("jaxkane", _UNDECLARED) if field else _UNDECLARED
+            system = getattr(system, key.name)
+        elif isinstance(key, jax.tree_util.SequenceKey):
+            system = system[key.idx]
+        elif isinstance(key, jax.tree_util.DictKey):
+            system = system[key.key]
+    return found
+
+
+_UNDECLARED = ParameterInfo(False, ())

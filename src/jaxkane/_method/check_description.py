@@ -107,7 +107,9 @@ class _Description:
         return self._check_state(beside.astype(self.q.dtype)) or judged
 
     def read(self, q: np.ndarray, u: np.ndarray) -> Found:
-        return jax.device_get(self._reading(self.system, self.t, q, u.astype(q.dtype), self.inputs))
+        # As arrays of JAX: numbers of NumPy are floats, whose zeros would be exact where no program is traced.
+        at = jnp.asarray(q), jnp.asarray(u, q.dtype)
+        return jax.device_get(self._reading(self.system, self.t, *at, self.inputs))
 
     def read_along(self, q: np.ndarray, u: np.ndarray, now: Found) -> Found:
         """How all that is read changes along the motion [1/s]."""

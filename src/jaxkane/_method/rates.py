@@ -7,7 +7,7 @@ bodies, and the linear system goes to LAPACK: nothing here grows faster than M i
 from __future__ import annotations
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .._description.system import System
@@ -35,7 +35,7 @@ def rates_and_equations(
     # The columns of M are one program, whose lanes are the directions.
     q_dot, f = _rates_and_forcing(system, t, q, u, inputs)
     columns = jax.vmap(lambda direction: _mass_times(system, t, q, u, inputs, direction))
-    return q_dot, columns(jnp.eye(len(system.speeds), dtype=q.dtype)), f
+    return q_dot, columns(np.eye(len(system.speeds), dtype=q.dtype)), f
 
 
 def accelerations_and_mass_matrix(

@@ -24,12 +24,14 @@ import numpy as np
 from jax.core import Tracer
 
 from . import native
+from .graph import CALLS, NotScalarError
 from .jax_internals import (
     FUSES,
     ClosedJaxpr,
     Jaxpr,
     Literal,
     as_lowering,
+    bound,
     dce_jaxpr,
     instantiate_zeros,
     is_no_tangent,
@@ -39,7 +41,7 @@ from .jax_internals import (
     one_function,
     settings,
 )
-from .native import CALLS, NotScalarError, Scalars
+from .native import Scalars
 from .reads import on_forget, settling, version_of
 
 # What one compiled function may hold: elementwise work and the moving of scalars. Calls into libraries (LAPACK) may not
@@ -407,7 +409,7 @@ def _evaluate_once(program: Jaxpr, consts: Sequence[Any], args: Sequence[Any], k
             names = [_bits(v) if isinstance(v, Literal) else id(read(v)) for v in equation.invars]
             key = (equation.primitive, *names, _name_of(equation))
             if key not in known:
-                outputs = equation.primitive.bind(*inputs, **equation.params)
+                outputs = bound(equation, inputs)
                 known[key] = outputs if equation.primitive.multiple_results else [outputs], inputs
             outputs = known[key][0]
         values.update(zip(equation.outvars, outputs, strict=True))

@@ -60,6 +60,12 @@ def new_primitive(
     return primitive
 
 
+def bound(equation: Any, inputs: list[Any]) -> Any:
+    """What an equation of a jaxpr does, to other inputs; with its own rules for derivatives, where it has some."""
+    primitive = equation.primitive
+    return primitive.bind(*inputs, **primitive.get_bind_params(equation.params))
+
+
 def as_lowering(f: Callable[..., Any]) -> Callable[..., Any]:
     """A function of JAX, with several results, as a rule that makes text for XLA."""
     return mlir.lower_fun(f, multiple_results=True)

@@ -14,14 +14,14 @@ from typing import Any
 import jax
 import numpy as np
 
+from ..graph import LIBRARY, Graph, NotScalarError, symbol, unrolled
 from ..jax_internals import ClosedJaxpr
 from .available import is_on, is_wanted, machine, tell, use, why_not
-from .graph import CALLS, LIBRARY, Graph, NotScalarError, symbol, unrolled
 from .handler import handler_text
 from .llvm import Writer
 from .objects import Objects, cache_folder
 
-__all__ = ["CALLS", "NotScalarError", "Scalars", "is_on", "is_wanted", "tell", "use", "why_not"]
+__all__ = ["Scalars", "is_on", "is_wanted", "tell", "use", "why_not"]
 
 FMOD = "fmod"  # in the C library what is `rem` in JAX
 

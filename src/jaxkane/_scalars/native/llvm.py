@@ -7,7 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from .graph import BINARY, COMPARISONS, INTRINSICS, LIBRARY, LOGIC, TYPES, Graph, Node, NotScalarError, symbol
+from ..graph import LIBRARY, Graph, NotScalarError, needed, symbol
+
+# Operations of graphs as LLVM writes them.
+TYPES = {"float64": "double", "float32": "float", "bool": "i1"}
+BINARY = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv", "rem": "frem"}
+LOGIC = {"and": "and", "or": "or", "xor": "xor"}
+COMPARISONS = {"eq": "oeq", "ne": "une", "lt": "olt", "le": "ole", "gt": "ogt", "ge": "oge"}
+INTRINSICS = {"sqrt": "sqrt", "abs": "fabs", "floor": "floor", "max": "maximum", "min": "minimum"}
 
 
 class Writer:
@@ -29,7 +36,7 @@ class Writer:
 
     def text(self, n_in: int, outputs: Sequence[np.ndarray]) -> str:
         nodes = self.graph.nodes
-        used = _needed(nodes, outputs)
+        used = needed(nodes, outputs)
         self.wide = wide = self._wide(used)
         shared = {k for k in used if k not in wide and nodes[k].operation != "constant"}
         read = {i for k in wide if nodes[k].operation != "input" for i in nodes[k].operands}
@@ -225,15 +232,3 @@ def _digits(value: Any, dtype: str) -> str:
     """A float as LLVM writes it: the bits of a double, also for a float32."""
     number = np.float64(value) if dtype == "float64" else np.float64(np.float32(value))
     return f"0x{number.view(np.uint64):016X}"
-
-
-def _needed(nodes: Sequence[Node], outputs: Sequence[np.ndarray]) -> list[int]:
-    needed = [False] * len(nodes)
-    for array in outputs:
-        for k in array.flat:
-            needed[int(k)] = True
-    for k in range(len(nodes) - 1, -1, -1):
-        if needed[k] and nodes[k].operation not in ("input", "constant"):
-            for i in nodes[k].operands:
-                needed[i] = True
-    return [k for k, is_needed in enumerate(needed) if is_needed]

@@ -20,7 +20,7 @@ from typing import Any
 import jaxlib
 import numpy as np
 
-from .graph import Graph
+from ..graph import Graph
 from .handler import handler_text
 from .llvm import Writer
 from .machine import Machine

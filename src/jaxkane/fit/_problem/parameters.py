@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..._common.lookup import hint
-from ..._description.parameters import ParameterInfo
+from ..._description.parameters import declared, leaf_name
 from ..._description.system import System
 from .bijections import Interval, PossibleBody
 
@@ -265,14 +265,14 @@ def _of_leaves(system: System, item: Free):
         path, leaf = leaves[i]
         many = leaf.size > 1 or len(chosen) > 1
         if followers and many:
-            raise ValueError(f"{_path_name(path)} has several entries; only a number can have others tied to it.")
+            raise ValueError(f"{leaf_name(path)} has several entries; only a number can have others tied to it.")
         for place, index in enumerate(np.ndindex(leaf.shape)):
-            label = item.name if item.name and not many else _path_name(path)
+            label = item.name if item.name and not many else leaf_name(path)
             label += str(list(index)) if leaf.ndim else ""
             start = float(leaf[index]) if item.start is None else float(item.start)
-            declared = _declared(system, path)
-            entry = _Entry(label, item.unit or declared.unit, ((i, place, 1.0), *followers))
-            parts.append(_scalar(entry, item, start, declared.positive))
+            info = declared(system, path)
+            entry = _Entry(label, item.unit or info.unit, ((i, place, 1.0), *followers))
+            parts.append(_scalar(entry, item, start, info.positive))
     return parts
 
 
@@ -280,9 +280,9 @@ def _followers(system: System, name: str, factor: float) -> list[tuple[int, int,
     """(leaf, place, factor) of every entry of what is tied."""
     chosen, leaves = _find(system, name)
     for path in (leaves[i][0] for i in chosen):
-        if not math.isfinite(factor) or (factor <= 0 and _declared(system, path).positive):
+        if not math.isfinite(factor) or (factor <= 0 and declared(system, path).positive):
             must = "positive, as the parameter is declared" if math.isfinite(factor) else "a finite number"
-            raise ValueError(f"`tied`: the factor of {_path_name(path)} must be {must}; got {factor}.")
+            raise ValueError(f"`tied`: the factor of {leaf_name(path)} must be {must}; got {factor}.")
     return [(i, place, float(factor)) for i in chosen for place in range(leaves[i][1].size)]
 
 
@@ -385,43 +385,21 @@ def _find(system: System, where: str | Callable[[Any], Any]) -> tuple[list[int],
     except (AttributeError, IndexError, KeyError, TypeError):
         chosen = []
     if not chosen or not all(isinstance(i, int) and 0 <= i < len(leaves) for i in chosen):
-        known = [_path_name(path) for path, _ in leaves]
+        known = [leaf_name(path) for path, _ in leaves]
         raise ValueError(f"{title} has no parameter {where!r}; {hint(str(where), known, 'it has')}")
     for i in chosen:
         path, leaf = leaves[i]
         if not (eqx.is_inexact_array(leaf) and not jnp.issubdtype(leaf.dtype, jnp.complexfloating)):
-            raise ValueError(f"{title}.{_path_name(path)} is no real number and cannot be fitted.")
+            raise ValueError(f"{title}.{leaf_name(path)} is no real number and cannot be fitted.")
     return chosen, leaves
 
 
 def leaf_names(system: System) -> tuple[str, ...]:
     """The names of all parameters of a system, by which they can be freed."""
-    return tuple(_path_name(path) for path, _ in jax.tree_util.tree_flatten_with_path(system)[0])
+    return tuple(leaf_name(path) for path, _ in jax.tree_util.tree_flatten_with_path(system)[0])
 
 
 def _follow(tree: Any, path: str) -> Any:
     for part in path.split("."):
         tree = tree[part] if isinstance(tree, Mapping) else tree[int(part)] if part.isdigit() else getattr(tree, part)
     return tree
-
-
-def _path_name(path: tuple[Any, ...]) -> str:
-    return jax.tree_util.keystr(path).lstrip(".")
-
-
-def _declared(system: Any, path: tuple[Any, ...]) -> ParameterInfo:
-    """What `parameter` was told of the field that holds this leaf."""
-    found = _UNDECLARED
-    for key in path:
-        if isinstance(key, jax.tree_util.GetAttrKey):
-            field = {f.name: f for f in dataclasses.fields(system)}.get(key.name)
-            found = field.metadata.get("jaxkane", _UNDECLARED) if field else _UNDECLARED
-            system = getattr(system, key.name)
-        elif isinstance(key, jax.tree_util.SequenceKey):
-            system = system[key.idx]
-        elif isinstance(key, jax.tree_util.DictKey):
-            system = system[key.key]
-    return found
-
-
-_UNDECLARED = ParameterInfo(False, ())

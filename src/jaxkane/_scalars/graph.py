@@ -8,17 +8,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..jax_internals import Jaxpr, Literal
+from .jax_internals import Jaxpr, Literal
 
 CALLS = ("jit", "pjit")
+# Programs within programs, and the parameter that holds them. A rule for derivatives has been used before, or is not.
+_OPENED = dict.fromkeys(CALLS, "jaxpr") | dict.fromkeys(("custom_jvp_call", "custom_vjp_call"), "call_jaxpr")
 
-# Operations by the names of JAX's primitives, as LLVM writes them.
-FLOATS = {"float64": "double", "float32": "float"}
-TYPES = {**FLOATS, "bool": "i1"}
-BINARY = {"add": "fadd", "sub": "fsub", "mul": "fmul", "div": "fdiv", "rem": "frem"}
-LOGIC = {"and": "and", "or": "or", "xor": "xor"}
-COMPARISONS = {"eq": "oeq", "ne": "une", "lt": "olt", "le": "ole", "gt": "ogt", "ge": "oge"}
-INTRINSICS = {"sqrt": "sqrt", "abs": "fabs", "floor": "floor", "max": "maximum", "min": "minimum"}
+# Operations by the names of JAX's primitives.
+FLOATS = ("float64", "float32")
+DTYPES = (*FLOATS, "bool")
+ARITHMETIC = frozenset("add sub mul div rem".split())
+LOGIC = frozenset("and or xor".split())
+COMPARISONS = frozenset("eq ne lt le gt ge".split())
+SIMPLE = frozenset("sqrt abs floor max min".split())
+# Those that a mathematical library has, by the same names.
 LIBRARY = frozenset(
     "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp exp2 expm1 log log1p pow cbrt erf".split()
 )
@@ -27,7 +30,7 @@ _SAME = frozenset("copy copy_p stop_gradient optimization_barrier".split())
 
 
 class NotScalarError(Exception):
-    """The program holds something that this file does not write."""
+    """The program holds something that is no operation of scalars, or that a language lacks."""
 
 
 class Node(NamedTuple):
@@ -42,16 +45,17 @@ def symbol(node: Node) -> str:
 
 
 class Graph:
-    """Scalars, each once. Folded is what XLA folds too: x + 0, x - 0, x * 1, x * -1, x / 1. Not x * 0 and 0 / x, which
-    are NaN where x is not finite or zero, nor 0 - x, which is no -x where x is zero: the zeros of descriptions and of
-    derivatives are gone before (`_components`, and JAX), so that nothing is to be gained."""
+    """Scalars, each once. Folded is what XLA folds too: x + 0, x - 0, x * 1, x * -1, x / 1; and signs, which are exact:
+    -(-x) is x, and x + (-y) is x - y. Not x * 0 and 0 / x, which are NaN where x is not finite or zero, nor 0 - x,
+    which is no -x where x is zero: the zeros of descriptions and of derivatives are gone before (`components`, and
+    JAX), so that nothing is to be gained."""
 
     def __init__(self) -> None:
         self.nodes: list[Node] = []
         self._numbers: dict[Node, int] = {}
 
     def add(self, operation: str, operands: tuple[Any, ...], dtype: str) -> int:
-        if dtype not in TYPES:
+        if dtype not in DTYPES:
             raise NotScalarError(dtype)
         node = Node(operation, tuple(sorted(operands)) if operation in _COMMUTES else operands, dtype)
         if node not in self._numbers:
@@ -70,8 +74,22 @@ class Graph:
         return float.fromhex(node.operands[0]) if node.dtype != "bool" else node.operands[0]
 
     def apply(self, operation: str, operands: tuple[int, ...], dtype: str) -> int:
-        known = self._folded(operation, operands, dtype) if operation in BINARY else None
+        known = self._folded(operation, operands, dtype) if operation in ARITHMETIC else None
+        if known is None:
+            known = self._signed(operation, operands, dtype) if operation in ("neg", "add", "sub") else None
         return self.add(operation, operands, dtype) if known is None else known
+
+    def _signed(self, operation: str, operands: tuple[int, ...], dtype: str) -> int | None:
+        last = operands[-1]
+        if self.nodes[last].operation == "neg":
+            opposite = self.nodes[last].operands[0]
+            if operation == "neg":
+                return opposite
+            return self.apply("sub" if operation == "add" else "add", (operands[0], opposite), dtype)
+        if operation == "add" and self.nodes[operands[0]].operation == "neg":
+            return self.apply("sub", (last, self.nodes[operands[0]].operands[0]), dtype)
+        value = self.value(last) if operation == "neg" else None
+        return None if value is None else self.constant(-value, dtype)
 
     def _folded(self, operation: str, operands: tuple[int, ...], dtype: str) -> int | None:
         a, b = operands
@@ -93,26 +111,30 @@ class Graph:
 def unrolled(program: Jaxpr, consts: Sequence[Any], inputs: Sequence[np.ndarray], graph: Graph) -> list[np.ndarray]:
     """The program's outputs as arrays of node numbers."""
 
-    def constants(x: Any) -> np.ndarray:
-        x = np.asarray(x)
-        if str(x.dtype) in TYPES:
-            return _each(lambda v: graph.constant(v, str(x.dtype)), x)
-        return x  # whole numbers: exponents, places
-
+    constants = functools.partial(as_constants, graph=graph)
     values: dict[Any, np.ndarray] = {}
     values.update(zip(program.constvars, map(constants, consts), strict=True))
     values.update(zip(program.invars, inputs, strict=True))
     for equation in program.eqns:
         xs = [constants(v.val) if isinstance(v, Literal) else values[v] for v in equation.invars]
-        if equation.primitive.name in CALLS:
-            inner = equation.params["jaxpr"]
-            outputs = unrolled(inner.jaxpr, inner.consts, xs, graph)
-        else:
-            found = _operation(equation, xs, graph)
-            avals: list[Any] = [v.aval for v in equation.outvars]
-            outputs = [np.broadcast_to(x, aval.shape) for x, aval in zip(found, avals, strict=True)]
-        values.update(zip(equation.outvars, outputs, strict=True))
+        values.update(zip(equation.outvars, applied(equation, xs, graph), strict=True))
     return [constants(v.val) if isinstance(v, Literal) else values[v] for v in program.outvars]
+
+
+def as_constants(x: Any, graph: Graph) -> np.ndarray:
+    x = np.asarray(x)
+    if str(x.dtype) in DTYPES:
+        return _each(lambda v: graph.constant(v, str(x.dtype)), x)
+    return x  # whole numbers: exponents, places
+
+
+def applied(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.ndarray]:
+    """The outputs of an equation whose inputs are these nodes."""
+    if equation.primitive.name in _OPENED:
+        inner = equation.params[_OPENED[equation.primitive.name]]
+        return unrolled(inner.jaxpr, inner.consts, xs, graph)
+    avals: list[Any] = [v.aval for v in equation.outvars]
+    return [np.broadcast_to(x, aval.shape) for x, aval in zip(_operation(equation, xs, graph), avals, strict=True)]
 
 
 def _each(f: Callable[..., int], *xs: np.ndarray) -> np.ndarray:
@@ -135,9 +157,9 @@ def _operation(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.nda
     moved = _moved(name, params, xs, aval.shape)
     if moved is not None:
         return moved
-    if name == "convert_element_type" and dtype in TYPES and x_dtype not in TYPES:
+    if name == "convert_element_type" and dtype in DTYPES and x_dtype not in DTYPES:
         return [_each(lambda v: graph.constant(v, dtype), xs[0])]  # whole numbers are constants here
-    if x_dtype not in TYPES or dtype not in TYPES:
+    if x_dtype not in DTYPES or dtype not in DTYPES:
         raise NotScalarError(f"{name} of {x_dtype}")
     one = _full((), 1.0, graph, dtype) if dtype in FLOATS else xs[0]
     match name:
@@ -172,7 +194,7 @@ def _operation(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.nda
     if name in COMPARISONS and x_dtype in FLOATS:
         return [each(name, *xs)]
     of_one_type = dtype in FLOATS and all(str(v.aval.dtype) == dtype for v in equation.invars)
-    if of_one_type and (name in BINARY or name in INTRINSICS or name in LIBRARY):
+    if of_one_type and name in ARITHMETIC | SIMPLE | LIBRARY:
         return [each(name, *xs)]
     raise NotScalarError(f"{name} of {x_dtype}")
 
@@ -230,3 +252,21 @@ def _summed(x: np.ndarray, axes: Iterable[int], each: Callable[..., np.ndarray],
     for axis in sorted(axes, reverse=True):
         x = functools.reduce(lambda a, b: each("add", a, b), np.moveaxis(x, axis, 0), zero)
     return x
+
+
+def needed(nodes: Sequence[Node], outputs: Iterable[np.ndarray]) -> list[int]:
+    """The nodes that outputs are made of, each after those that it reads."""
+    is_needed = [False] * len(nodes)
+    for array in outputs:
+        for k in array.flat:
+            is_needed[int(k)] = True
+    for k in range(len(nodes) - 1, -1, -1):
+        if is_needed[k]:
+            for i in reads(nodes[k]):
+                is_needed[i] = True
+    return [k for k, needs in enumerate(is_needed) if needs]
+
+
+def reads(node: Node) -> tuple[int, ...]:
+    """The nodes that a node is computed from."""
+    return () if node.operation in ("input", "constant") else node.operands

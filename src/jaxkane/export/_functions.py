@@ -1,0 +1,33 @@
+"""What the exports have in common: which functions are asked for. Knows no language."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .._common.lookup import refuse_unknown
+from .._description.system import System
+from .._method.formulas import JACOBIANS, OFFERED, Formulas
+
+USUAL = ("rates", "equations", "dependent_speeds", *JACOBIANS)
+
+
+def chosen(formulas: Formulas, functions: Sequence[str] | None, usual: Sequence[str] = USUAL) -> tuple[str, ...]:
+    """The functions that were asked for; by default the usual ones that the system has."""
+    if functions is None:
+        needs = {"dependent_speeds": "u_dep", "input_jacobian": "inputs", "parameter_jacobian": "parameters"}
+        return tuple(name for name in usual if name not in needs or formulas.names(needs[name]))
+    if isinstance(functions, str):
+        raise TypeError(f"functions is a sequence of names; one is ({functions!r},).")
+    functions = tuple(dict.fromkeys(functions))
+    refuse_unknown(functions, OFFERED, f"{formulas.name}: there is no function", "there are")
+    return functions
+
+
+def parameters(system: System) -> dict[str, np.ndarray]:
+    """A system's parameters by name, in the order in which exported functions take them.
+
+    A parameter of a part is called by its path, "frame.mass"; one with axes is an array.
+    """
+    return Formulas(system).values()

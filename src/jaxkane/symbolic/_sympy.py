@@ -1,0 +1,122 @@
+"""SymPy as a language of formulas: symbols of a system's names, operations, exact numbers. Knows no mechanics."""
+
+from __future__ import annotations
+
+import fractions
+import functools
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from .._method.formulas import Formulas
+
+
+def imported() -> Any:
+    """SymPy, which is imported when it is asked for."""
+    try:
+        import sympy
+    except ImportError as error:
+        raise ImportError('jaxkane.symbolic needs SymPy: pip install "jaxkane[symbolic]".') from error
+    return sympy
+
+
+def symbols_of(formulas: Formulas, of_time: bool) -> dict[str, dict[str, Any]]:
+    """Symbols by kind and name: real numbers, positive where a parameter is declared so; or functions of time.
+
+    A parameter that is called like a coordinate, a speed, an input, or the time, gets an underscore behind its name.
+    """
+    sp = imported()
+    t = sp.Symbol("t", real=True)
+    found: dict[str, dict[str, Any]] = {"t": {"t": t}}
+    taken = {"t"}
+    for kind in ("q", "u", "u_dep", "inputs"):
+        names = formulas.names(kind)
+        taken |= {*names}
+        make = (lambda name: sp.Function(name, real=True)(t)) if of_time else (lambda name: sp.Symbol(name, real=True))
+        found[kind] = {name: make(name) for name in names}
+    found["parameters"] = {}
+    for a in formulas.of_kind("parameters"):
+        for name in a.elements:
+            assumed = {"positive": True} if a.info.positive else {"real": True}
+            word = name
+            while word in taken:
+                word += "_"
+            taken.add(word)
+            found["parameters"][name] = sp.Symbol(word, **assumed)
+    return found
+
+
+def given_nodes(formulas: Formulas, symbols: Mapping[str, Mapping[str, Any]]) -> dict[int, Any]:
+    """The symbols that stand for input nodes."""
+    return {
+        int(k): symbols[a.kind][element]
+        for a, nodes in zip(formulas.arguments, formulas.inputs, strict=True)
+        for element, k in zip(a.elements, nodes.flat, strict=True)
+    }
+
+
+def fresh_names(taken: Iterable[str]) -> Any:
+    """x0, x1, ... without those that are taken."""
+    taken = {*taken}
+    number = 0
+    while True:
+        if f"x{number}" not in taken:
+            yield f"x{number}"
+        number += 1
+
+
+_LARGEST_DENOMINATOR = 10_000
+
+
+def exact(value: float | bool, dtype: str) -> Any:
+    """The number of small numerator and denominator, or the multiple of pi, that rounds to a float; else the float."""
+    sp = imported()
+    if dtype == "bool":
+        return sp.true if value else sp.false
+    if not math.isfinite(value):
+        return sp.nan if math.isnan(value) else sp.oo * (1 if value > 0 else -1)
+    ratio = fractions.Fraction(value).limit_denominator(_LARGEST_DENOMINATOR)
+    if float(ratio) == value:
+        return sp.Rational(ratio.numerator, ratio.denominator)
+    ratio = fractions.Fraction(value / math.pi).limit_denominator(360)
+    turned = sp.Rational(ratio.numerator, ratio.denominator) * sp.pi
+    if float(turned) == value:
+        return turned
+    decimal = fractions.Fraction(repr(float(value)))  # 1e-05 as 1/100000
+    if decimal.denominator <= 10**12:
+        return sp.Rational(decimal.numerator, decimal.denominator)
+    return sp.Float(value, 17)
+
+
+@functools.cache
+def table() -> dict[str, Any]:
+    """SymPy's functions for the operations of graphs, for real and finite numbers."""
+    sp = imported()
+    own = "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp log erf sqrt floor".split()
+    return {name: getattr(sp, name) for name in own} | {
+        "add": lambda x, y: x + y,
+        "sub": lambda x, y: x - y,
+        "mul": lambda x, y: x * y,
+        "div": lambda x, y: x / y,
+        "neg": lambda x: -x,
+        "rem": lambda x, y: sp.sign(x) * sp.Mod(sp.Abs(x), sp.Abs(y)),  # of the sign of x
+        "pow": lambda x, y: x**y,
+        "exp2": lambda x: 2**x,
+        "expm1": lambda x: sp.exp(x) - 1,
+        "log1p": lambda x: sp.log(1 + x),
+        "cbrt": lambda x: sp.sign(x) * sp.Abs(x) ** sp.Rational(1, 3),
+        "abs": sp.Abs,
+        "max": sp.Max,
+        "min": sp.Min,
+        "eq": sp.Eq,
+        "ne": sp.Ne,
+        "lt": sp.Lt,
+        "le": sp.Le,
+        "gt": sp.Gt,
+        "ge": sp.Ge,
+        "and": sp.And,
+        "or": sp.Or,
+        "xor": sp.Xor,
+        "select": lambda c, x, y: sp.Piecewise((x, c), (y, True)),
+        "convert": lambda x: sp.Piecewise((1, x), (0, True)) if isinstance(x, sp.logic.boolalg.Boolean) else x,
+    }
