@@ -2,3 +2,4 @@
 
 from ._mjcf import from_mjcf as from_mjcf
 from ._mjcf import from_urdf as from_urdf
+from ._sympy import from_sympy as from_sympy
