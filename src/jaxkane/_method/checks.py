@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from .._description.bodies import Body
 from .._description.parameters import in_batches
 from .._description.system import State, System
 from .._scalars.fuse import fused
@@ -24,7 +23,7 @@ from .._scalars.linear import stack
 from .._scalars.nan import nan_where
 from .check_description import check_description
 from .check_description import configuration_residual as configuration_residual
-from .kane import Reading
+from .kane import Reading, Row
 
 ROUNDING, MEASURED = 2e-3, 0.05
 
@@ -61,12 +60,13 @@ def _value(x: Any) -> Any:
 
 @fused
 def _masses_and_inertias(system: System, t: Any, q: Any):
-    return [(jnp.asarray(body.mass), stack(body.inertia)) for body in _bodies(system, t, q)]
+    bodies = Reading(system).read("bodies", t, *_at_rest(system, q))
+    return [(jnp.asarray(mass), stack(inertia)) for mass, inertia in bodies]
 
 
-def _bodies(system: System, t: Any, q: Any) -> tuple[Body, ...]:
+def _at_rest(system: System, q: Any) -> tuple[Row, Row]:
     still = (0.0,) * (len(system.speeds) + len(system.dependent_speeds))
-    return Reading(system).motion(t, tuple(q[i] for i in range(len(system.coordinates))), still).bodies
+    return tuple(q[i] for i in range(len(system.coordinates))), still
 
 
 def check_bodies(system: System, t: Any, q: Any) -> None:
@@ -80,7 +80,8 @@ def check_bodies(system: System, t: Any, q: Any) -> None:
         mass, I = float(mass), np.asarray(I, dtype=float)  # [kg], (3,3) [kg m^2]
         fault = _fault(mass, I) or (_excess_in_words(I) if system.check_inertia else "")
         if fault:
-            message = f"{type(system).__name__}, body {_bodies(system, t, q)[i].name!r}: {fault}"
+            body = Reading(system).motion(t, *_at_rest(system, q)).bodies[i]
+            message = f"{type(system).__name__}, body {body.name!r}: {fault}"
             if _fault(mass, I) or _excess(I) > MEASURED:
                 raise ValueError(message)
             warnings.warn(message, UserWarning, stacklevel=4)

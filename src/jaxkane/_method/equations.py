@@ -123,7 +123,7 @@ def generalized_active_forces(
 @fused
 def _generalized_active_forces(system, t, q, u, inputs):
     now = Instant(system, t, q, u, inputs)
-    return as_vector(now.active_forces(now.motion(now.t, now.q, now.u_all), now.partials()), q)
+    return as_vector(now.active_forces(now.partials()), q)
 
 
 def generalized_inertia_forces(
@@ -143,10 +143,10 @@ def generalized_inertia_forces(
 @fused
 def _generalized_inertia_forces(system, t, q, u, inputs, u_dot):
     now = Instant(system, t, q, u, inputs)
-    motion, partials = now.motion(now.t, now.q, now.u_all), now.partials()
-    Fr_star = now.inertia_forces(motion, partials)
+    partials = now.partials()
+    Fr_star = now.inertia_forces(partials)
     if u_dot is not None:
-        M_u_dot = matvec(now.mass_matrix(motion, partials), [u_dot[r] for r in range(now.n)])
+        M_u_dot = matvec(now.mass_matrix(partials), [u_dot[r] for r in range(now.n)])
         Fr_star = [sub(x, y) for x, y in zip(Fr_star, M_u_dot, strict=True)]
     return as_vector(Fr_star, q)
 

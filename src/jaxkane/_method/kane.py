@@ -19,6 +19,7 @@ are projected onto all speeds at once by the transpose of the map u -> (v, omega
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
@@ -34,6 +35,7 @@ from .._description.parameters import in_batches
 from .._description.system import System
 from .._scalars.components import add, add3, component, cross, dot, is_exact, is_zero, matvec, mul, scale3
 from .._scalars.linear import Rows, solve, solve_positive
+from .._scalars.record import recorded
 from .._scalars.types import Component
 
 Row = tuple[Component, ...]
@@ -91,7 +93,10 @@ def unit(n: int, r: int) -> Row:
 
 
 class Reading:
-    """What the description of a system says, at any time, coordinates and speeds."""
+    """What the description of a system says, at any time, coordinates and speeds.
+
+    `read` gives parts of it as components, from a record of the description; `motion` reads the description itself.
+    """
 
     def __init__(self, system: System, inputs: Mapping[str, Component] | None = None):
         self.system = system
@@ -103,6 +108,11 @@ class Reading:
             )
         self.n, self.k = len(system.speeds), len(system.dependent_speeds)
         self.inputs = Inputs(checked_inputs(system, inputs), f"the inputs of {self.name}")
+        self._memory: dict[Any, Any] = {}
+
+    def read(self, part: str, t: Component, q: Row, u: Row) -> Any:
+        """One of the parts of `Said`."""
+        return _said(part, self.system, (dict(self.inputs), t, tuple(q), tuple(u)), self._memory)
 
     def motion(self, t: Component, q: Row, u: Row) -> Motion:
         motion = self.system.motion(t, q, u)
@@ -110,20 +120,18 @@ class Reading:
             raise TypeError(f"{self.name}.motion must return a jaxkane.Motion, got {motion!r}.")
         return motion
 
-    def rates(self, t: Component, q: Row, u: Row) -> Row:
-        q_dot = self.system.q_dot(t, q, u)
-        return as_row(q_dot, self.system.coordinates, f"{self.name}.q_dot")
-
     def loads_at(self, t: Component, q: Row, u: Row, motion: Motion) -> tuple[Load, ...]:
         return flatten_loads(self.system.loads(t, q, u, motion, self.inputs), f"{self.name}.loads")
 
+    def rates(self, t: Component, q: Row, u: Row) -> Row:
+        return self.read("rates", t, q, u)
+
     def configuration(self, t: Component, q: Row) -> Row:
-        residuals = self.system.configuration_constraints(t, q)
-        return flatten_residuals(residuals, f"{self.name}: the residuals of configuration_constraints")
+        return self.read("configuration", t, q, (0.0,) * (self.n + self.k))
 
     def residuals(self, t: Component, q: Row, u: Row) -> Row:
         """Velocity residuals c(t, q, u), one for each dependent speed."""
-        rolling = self.motion(t, q, u).constraints
+        rolling = self.read("rolling", t, q, u)
         if len(rolling) == self.k:
             return rolling  # the configuration constraints, if there are any, are integrals of these
         h, h_dot = jvp(lambda t, *q: self.configuration(t, q), (t, *q), (1.0, *self.rates(t, q, u)))
@@ -135,6 +143,67 @@ class Reading:
                 "there are velocity residuals; or as many as both together, and the constraints' rates are added."
             )
         return (*rolling, *h_dot)
+
+
+class Said:
+    """What a description says at one time, coordinates and speeds, in parts that are components."""
+
+    def __init__(self, reading: Reading, t: Component, q: Row, u: Row):
+        self.reading, self.t, self.q, self.u = reading, t, q, u
+
+    @functools.cached_property
+    def motion(self) -> Motion:
+        return self.reading.motion(self.t, self.q, self.u)
+
+    @functools.cached_property
+    def loads(self) -> tuple[Load, ...]:
+        # `loads` makes points of its own from the speeds that it is given. No exact zero may divide there.
+        dtype = jnp.result_type(*([x for x in (*self.q, *self.u) if not is_exact(x)] or [float]))
+        u = tuple(jnp.asarray(x, dtype) if is_exact(x) else x for x in self.u)
+        return self.reading.loads_at(self.t, self.q, u, self.motion)
+
+    def rates(self) -> Row:
+        """q_dot (n_q,)."""
+        q_dot = self.reading.system.q_dot(self.t, self.q, self.u)
+        return as_row(q_dot, self.reading.system.coordinates, f"{self.reading.name}.q_dot")
+
+    def configuration(self) -> Row:
+        """Residuals (h,) of the configuration constraints."""
+        residuals = self.reading.system.configuration_constraints(self.t, self.q)
+        return flatten_residuals(residuals, f"{self.reading.name}: the residuals of configuration_constraints")
+
+    def rolling(self) -> Row:
+        """The velocity residuals of the motion itself."""
+        return self.motion.constraints
+
+    def bodies(self) -> list[tuple[Component, Rows]]:
+        """Masses and inertias, each in its body's frame."""
+        return [(body.mass, body.inertia) for body in self.motion.bodies]
+
+    def velocities(self) -> tuple[list, list]:
+        """Velocities (v, omega) of the bodies, each in the frame where it stands, and those that the loads act on."""
+        bodies = [(b.center.velocity.components, b.angular_velocity.components_in(b.frame)) for b in self.motion.bodies]
+        return bodies, [load.velocity.components for load in self.loads]
+
+    def momenta(self) -> list[tuple[Row, Row]]:
+        return [_momenta(body) for body in self.motion.bodies]
+
+    def turning(self) -> list[tuple[Row, Row]]:
+        """Angular velocities of the frames in which the bodies' momenta stand."""
+        frames = [(body.center.velocity.frame, body.frame) for body in self.motion.bodies]
+        return [(a.angular_velocity.components, b.angular_velocity.components) for a, b in frames]
+
+    def forces(self) -> list[Row]:
+        """The loads' vectors, in the frames of the velocities that they act on."""
+        return [load.vector.components_in(load.velocity.frame) for load in self.loads]
+
+
+@recorded
+def _said(system: System, components: Any) -> dict[str, Any]:
+    inputs, t, q, u = components
+    said = Said(Reading(system, inputs), t, q, u)
+    parts = "rates configuration rolling bodies velocities momenta turning forces"
+    return {part: getattr(said, part)() for part in parts.split()}
 
 
 class Instant(Reading):
@@ -186,18 +255,13 @@ class Instant(Reading):
 
     def velocities(self, u: Row) -> tuple[list, list]:
         """Velocities (v, omega) of the bodies, and those that the loads act on, at speeds `u`."""
-        motion = self.motion(self.t, self.q, u)
-        bodies = [(b.center.velocity.components, b.angular_velocity.components_in(b.frame)) for b in motion.bodies]
-        # `loads` makes points of its own from the speeds that it is given. What it makes vectors of is dropped here, so
-        # that no exact zero may divide there.
-        given = tuple(jnp.asarray(x, self._zero().dtype) if is_exact(x) else x for x in u)
-        return bodies, [load.velocity.components for load in self.loads(motion, given)]
+        return self.read("velocities", self.t, self.q, u)
 
     def body_velocities(self, u: Row) -> list:
         return self.velocities(u)[0]
 
     def momenta(self, u: Row) -> list[tuple[Row, Row]]:
-        return [_momenta(body) for body in self.motion(self.t, self.q, u).bodies]
+        return self.read("momenta", self.t, self.q, u)
 
     def with_dependent(self, direction: Row) -> Row:
         """A direction of the independent speeds, with what the dependent ones do: [1; J] of it."""
@@ -214,9 +278,8 @@ class Instant(Reading):
 
     def forcing(self) -> Row:
         """f of M u_dot = f, without partial velocities: all vectors onto all speeds at once."""
-        motion = self.motion(self.t, self.q, self.u_all)
-        inertia = [tuple(scale3(-1.0, rate) for rate in rates) for rates in self.momentum_rates(motion)]
-        return self.onto_speeds(self.velocities, (inertia, self.force_components(motion)))
+        inertia = [tuple(scale3(-1.0, rate) for rate in rates) for rates in self.momentum_rates()]
+        return self.onto_speeds(self.velocities, (inertia, self.force_components()))
 
     def bias(self) -> Row:
         """u_dep_dot at u_dot = 0: the residual is differentiated, never the solution of the solve.
@@ -234,53 +297,50 @@ class Instant(Reading):
             return ()
         return tuple(add(dot(row, u_dot), b) for row, b in zip(zip(*self.J, strict=True), self.bias(), strict=True))
 
-    def momentum_rates(self, motion: Motion, u_dot: Row | None = None) -> list[tuple[Row, Row]]:
+    def momentum_rates(self, u_dot: Row | None = None) -> list[tuple[Row, Row]]:
         """dp/dt and dH/dt of every body in the inertial frame; each in the frame where it stands.
 
         `u_dot` (n + k,) of the independent and the dependent speeds; by default u_dot = 0 and `bias`.
         """
-
-        def momenta(t, *q):
-            return [_momenta(body) for body in self.motion(t, q, self.u_all).bodies]
-
+        momenta = lambda t, *q: self.read("momenta", t, q, self.u_all)  # noqa: E731
         now, drift = jvp(momenta, (self.t, *self.q), (1.0, *self.q_dot))
         if u_dot is None and self.k:
             u_dot = (*(0.0,) * self.n, *self.bias())
         turning = None if u_dot is None else self.along_speeds(self.momenta, u_dot)
         rates = []
-        for i, body in enumerate(motion.bodies):
+        for i, frames in enumerate(self.read("turning", self.t, self.q, self.u_all)):
             # dx/dt in N = derivative of the components + omega x
             rate = []
-            for j, frame in enumerate((body.center.velocity.frame, body.frame)):
+            for j, angular_velocity in enumerate(frames):
                 x_dot = drift[i][j] if turning is None else add3(drift[i][j], turning[i][j])
-                rate.append(add3(x_dot, cross(frame.angular_velocity.components, now[i][j])))
+                rate.append(add3(x_dot, cross(angular_velocity, now[i][j])))
             rates.append(tuple(rate))
         return rates
 
-    def active_forces(self, motion: Motion, partials: list) -> Row:
+    def active_forces(self, partials: list) -> Row:
         # F_r = sum F . V_r + T . W_r
-        vectors = self.force_components(motion)
+        vectors = self.force_components()
         return tuple(_sum(dot(v, x) for v, x in zip(columns, vectors, strict=True)) for _, columns in partials)
 
-    def force_components(self, motion: Motion) -> list[Row]:
-        return [load.vector.components_in(load.velocity.frame) for load in self.loads(motion)]
+    def force_components(self) -> list[Row]:
+        return self.read("forces", self.t, self.q, self.u_all)
 
-    def inertia_forces(self, motion: Motion, partials: list) -> Row:
+    def inertia_forces(self, partials: list) -> Row:
         # F*_r = -sum_i V_ir . dp_i/dt + W_ir . dH_i/dt
-        rates = self.momentum_rates(motion)
+        rates = self.momentum_rates()
         return tuple(
             mul(-1.0, _sum(add(dot(V, p), dot(W, H)) for (V, W), (p, H) in zip(bodies, rates, strict=True)))
             for bodies, _ in partials
         )
 
-    def mass_matrix(self, motion: Motion, partials: list) -> list[list[Component]]:
+    def mass_matrix(self, partials: list) -> list[list[Component]]:
         # M_rs = sum_i V_ir . m_i V_is + W_ir . I_i W_is
         n = self.n
         M: list[list[Component]] = [[0.0] * n for _ in range(n)]
-        for i, body in enumerate(motion.bodies):
+        for i, (mass, inertia) in enumerate(self.read("bodies", self.t, self.q, self.u_all)):
             for s in range(n):
                 V, W = partials[s][0][i]
-                mV, IW = scale3(body.mass, V), matvec(body.inertia, W)
+                mV, IW = scale3(mass, V), matvec(inertia, W)
                 for r in range(s + 1):
                     V, W = partials[r][0][i]
                     M[r][s] = add(M[r][s], add(dot(V, mV), dot(W, IW)))
@@ -291,10 +351,9 @@ class Instant(Reading):
 
     def equations(self) -> tuple[list[list[Component]], Row]:
         """M and f of M u_dot = f."""
-        motion = self.motion(self.t, self.q, self.u_all)
         partials = self.partials()
-        pairs = zip(self.active_forces(motion, partials), self.inertia_forces(motion, partials), strict=True)
-        return self.mass_matrix(motion, partials), tuple(add(a, b) for a, b in pairs)
+        pairs = zip(self.active_forces(partials), self.inertia_forces(partials), strict=True)
+        return self.mass_matrix(partials), tuple(add(a, b) for a, b in pairs)
 
     def accelerations(self) -> Row:
         return solve_positive(*self.equations())

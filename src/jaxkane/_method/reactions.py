@@ -25,7 +25,7 @@ from .._scalars.linear import as_vector, solve
 from .._scalars.reads import compiled
 from .._scalars.types import Component, Triple
 from .equations import InputValues
-from .kane import Instant, Row, as_row, unit
+from .kane import Instant, Row, Said, as_row, unit
 from .rates import state_rates
 
 
@@ -72,12 +72,16 @@ class Reactions(Instant):
         self.description: Motion = self.motion(self.t, self.q, self.u_all)
         u_dot = as_row(u_dot, system.speeds, f"{self.name}: u_dot")
         u_dep_dot = self.dependent_accelerations(u_dot)
-        self.momentum = self.momentum_rates(self.description, (*u_dot, *u_dep_dot))
-        self.load_vectors = self.force_components(self.description)
+        self.momentum = self.momentum_rates((*u_dot, *u_dep_dot))
+        self.load_vectors = self.force_components()
         # R_dep + C_dep^T lambda = 0
         directions = [unit(self.n + self.k, self.n + r) for r in range(self.k)]
         R = [mul(-1.0, self.unbalanced(self.along_speeds(self.velocities, direction))) for direction in directions]
         self.multipliers: Row = solve(tuple(zip(*self.C_dep, strict=True)), R)[0] if self.k else ()
+
+    def read(self, part: str, t: Component, q: Row, u: Row) -> Any:
+        # The description itself: a record knows neither virtual velocities nor auxiliary speeds.
+        return getattr(Said(self, t, q, u), part)()
 
     def unbalanced(self, partial: Any) -> Component:
         """R = sum F . V + T . W - V . dp/dt - W . dH/dt along one direction."""
@@ -147,7 +151,7 @@ class Reactions(Instant):
         if not self.k:
             return ()
         still = (0.0,) * (self.n + self.k)
-        rows = self._along_virtual(part, axis, lambda: self.motion(self.t, self.q, still).constraints)
+        rows = self._along_virtual(part, axis, lambda: self.read("rolling", self.t, self.q, still))
         if len(rows) < self.k:
             configuration = lambda: self.configuration(self.t, self.q)  # noqa: E731
             rows = (*rows, *self._along_virtual(part, axis, configuration, displace=True))

@@ -145,7 +145,7 @@ class _Program:
         self.program = without_repetition(program)
         self.evaluate = jaxpr_as_fun(self.program)
         self.in_avals, self.out_avals = self.program.in_avals, self.program.out_avals
-        self.is_plain = not any(_foreign(self.program.jaxpr))
+        self.is_plain = is_plain(self.program.jaxpr)
         # A memory for each instance, since a cached method would keep the instance itself alive.
         self.tangent = functools.cache(self._tangent)
         self.transposed = functools.cache(self._transposed)
@@ -436,6 +436,11 @@ def _called(equation: Any) -> ClosedJaxpr | None:
         program, sizes, where = (equation.params[k] for k in ("program", "sizes", "where"))
         return (program.batched(sizes, where) if sizes else program).program
     return equation.params["jaxpr"] if equation.primitive.name in CALLS else None
+
+
+def is_plain(program: Jaxpr) -> bool:
+    """Whether a program can be one compiled function."""
+    return not any(_foreign(program))
 
 
 def _foreign(program: Jaxpr, is_ours: bool = False) -> Iterator[tuple[str, bool]]:
