@@ -327,11 +327,13 @@ def _in_chunks(args, program, sizes, where):
 def _one_function(f: Callable[..., Any], args: Sequence[Any]) -> Any:
     # XLA aborts on a parameter that its simplified program no longer reads. The sum reads them all, and the barrier
     # hides constant arguments, which XLA would write into the program in the parameter's stead.
-    def values_and_sum(*args):
-        return f(*args), sum(x[(0,) * x.ndim].astype(float) for x in args)
+    places = [i for i, x in enumerate(args) if x.size]
+
+    def values_and_sum(*some):
+        return f(*_replaced(args, places, some)), sum(x[(0,) * x.ndim].astype(float) for x in some)
 
     with one_function():
-        values, _ = jax.jit(values_and_sum)(*jax.lax.optimization_barrier(args))
+        values, _ = jax.jit(values_and_sum)(*jax.lax.optimization_barrier([args[i] for i in places]))
     return values
 
 

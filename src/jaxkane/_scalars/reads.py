@@ -340,7 +340,20 @@ _forgotten = b"0"
 _memories: list[Callable[[], None]] = []
 
 
+class _Tracing(threading.local):
+    """What is being traced in this thread: a trace belongs to what was read when it began."""
+
+    def __init__(self) -> None:
+        self.reads: dict[int, Reads] = {}
+
+
+_tracing = _Tracing()
+
+
 def _reads_of(root: Any) -> Reads:
+    reads = _tracing.reads.get(id(root))
+    if reads is not None:
+        return reads
     reads = _known.get(id(root))
     if reads is None or reads.root is not root or not reads.unchanged():
         reads = _kept(Reads(root))
@@ -405,7 +418,12 @@ def settling(f: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(f)
     def call(*args: Any, **kwargs: Any) -> Any:
         before = [_reads_of(root) for root in _roots((args, kwargs), [])]
-        found = f(*args, **kwargs)
+        outer = _tracing.reads
+        _tracing.reads = {id(reads.root): reads for reads in before} | outer
+        try:
+            found = f(*args, **kwargs)
+        finally:
+            _tracing.reads = outer
         for reads in before:
             now = _known.get(id(reads.root))
             if now is not None and now.version == reads.version and not now.unchanged():

@@ -62,11 +62,12 @@ class _Record:
     """The equations of a function, and where its parts stand among their results."""
 
     def __init__(self, f: Callable[..., dict[str, Any]], treedef: Any, specs: Sequence[Any]):
+        self.structures: dict[str, Any] = {}
         leaves: list[Any] = []
 
         def results(*xs: Any) -> list[Any]:
             found = f(*jax.tree.unflatten(treedef, xs))
-            self.structures = {part: jax.tree.structure(value) for part, value in found.items()}
+            self.structures.update({part: jax.tree.structure(value) for part, value in found.items()})
             leaves[:] = [x for value in found.values() for x in jax.tree.leaves(value)]
             return [x for x in leaves if not is_exact(x)]
 
@@ -74,8 +75,8 @@ class _Record:
         captured = any(isinstance(c, Tracer) for c in program.consts)
         self.program = without_repetition(program) if is_plain(program.jaxpr) and not captured else program
         traced = iter(self.program.jaxpr.outvars)
-        self.results = iter([x if is_exact(x) else next(traced) for x in leaves])
-        self.results = {part: [next(self.results) for _ in range(s.num_leaves)] for part, s in self.structures.items()}
+        row = iter([x if is_exact(x) else next(traced) for x in leaves])
+        self.results = {part: [next(row) for _ in range(s.num_leaves)] for part, s in self.structures.items()}
         self.needed = functools.cache(self._needed)  # a cached method would keep the instance alive
 
     def _needed(self, part: str) -> list[Any]:
@@ -113,7 +114,7 @@ def _evaluated(equation: Any, xs: Sequence[Any]) -> Sequence[Any]:
 
 
 _OF_TWO = {"add": add, "sub": sub, "mul": mul}
-_OF_EXACT: dict[str, Callable[..., float]] = {
+_OF_EXACT: dict[str, Callable[..., Any]] = {
     "add": lambda x, y: x + y,
     "sub": lambda x, y: x - y,
     "mul": lambda x, y: x * y,

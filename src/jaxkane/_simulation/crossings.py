@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -47,35 +46,40 @@ def first_crossing(
     **Arguments:** values `g0`, `g1` and slopes at 0 and 1; `direction`: 1 upwards, -1 downwards, 0 both. What is zero
     at 0 passes it if it leaves in its direction; without a direction, nothing passes zero at 0.
     """
+    ends = zip(g0, slope0, g1, slope1, direction, strict=True)
+    found = [_first_crossing(*(jnp.asarray(x, g0.dtype) for x in end)) for end in ends]
+    return jnp.stack(found) if found else jnp.zeros_like(g0)
+
+
+def _first_crossing(g0: Array, slope0: Array, g1: Array, slope1: Array, direction: Array) -> Array:
+    """Of one cubic: scalars, so that all of it can be one function."""
     a, b, c = 2 * (g0 - g1) + slope0 + slope1, 3 * (g1 - g0) - 2 * slope0 - slope1, slope0
     p = lambda x: ((a * x + b) * x + c) * x + g0  # noqa: E731
     p_dot = lambda x: (3 * a * x + 2 * b) * x + c  # noqa: E731
 
     # Between its extrema a cubic passes zero once at most.
     low, high = _extrema(a, b, c)
-    places = jnp.stack([jnp.zeros_like(a), low, high, jnp.ones_like(a)])  # (4,n)
-    values = jnp.stack([g0, p(low), p(high), g1])
-    before, after = values[:-1], values[1:]  # (3,n)
+    places = (jnp.zeros_like(a), low, high, jnp.ones_like(a))
+    values = (g0, p(low), p(high), g1)
     # Which way it must go: without a direction, away from the side that it is on.
     side = jnp.where(g0 != 0, g0, jnp.where(values[1] != 0, values[1], jnp.where(values[2] != 0, values[2], g1)))
-    way = jnp.where(direction == 0, -jnp.sign(side), direction)[None]  # (1,n)
-    passes = (way * before <= 0) & (way * after >= 0) & (before != after) & ((direction[None] != 0) | (before != 0))
-    i = jnp.argmax(passes, axis=0)[None]
-    of_first = lambda x: jnp.take_along_axis(x, i, axis=0)[0]  # noqa: E731
-    left, right = of_first(places[:-1]), of_first(places[1:])
+    way = jnp.where(direction == 0, -jnp.sign(side), direction)
+    left, right, before, after, any_passes = places[0], places[1], values[0], values[1], jnp.zeros((), bool)
+    for i in reversed(range(3)):
+        passes = (way * values[i] <= 0) & (way * values[i + 1] >= 0) & (values[i] != values[i + 1])
+        passes &= (direction != 0) | (values[i] != 0)
+        left, right = jnp.where(passes, places[i], left), jnp.where(passes, places[i + 1], right)
+        before, after = jnp.where(passes, values[i], before), jnp.where(passes, values[i + 1], after)
+        any_passes |= passes
 
-    # Newton's method inside the bracket; the step that follows is measured anew, so a few digits are enough. A loop,
-    # since XLA fuses unrolled steps into one, in which each does all those before it again, and compiles for seconds.
-    def nearer(_, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        x, left, right = carry
-        value = way[0] * p(x)
-        left, right = jnp.where(value <= 0, x, left), jnp.where(value > 0, x, right)
-        newton = x - _ratio(p(x), p_dot(x))
-        return jnp.where((newton >= left) & (newton <= right), newton, 0.5 * (left + right)), left, right
-
-    start = left + (right - left) * _ratio(of_first(before), of_first(before) - of_first(after))
-    x = jax.lax.fori_loop(0, 6, nearer, (start, left, right))[0]
-    return jnp.where(jnp.any(passes, axis=0), x, jnp.inf)
+    # Newton's method inside the bracket; the step that follows is measured anew, so a few digits are enough.
+    x = left + (right - left) * _ratio(before, before - after)
+    for _ in range(6):
+        value = p(x)
+        left, right = jnp.where(way * value <= 0, x, left), jnp.where(way * value > 0, x, right)
+        newton = x - _ratio(value, p_dot(x))
+        x = jnp.where((newton >= left) & (newton <= right), newton, 0.5 * (left + right))
+    return jnp.where(any_passes, x, jnp.inf)
 
 
 def _extrema(a: Array, b: Array, c: Array) -> tuple[Array, Array]:

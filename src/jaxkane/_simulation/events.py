@@ -5,7 +5,6 @@ Knows descriptions and their rates; knows no integrator.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -31,27 +30,27 @@ class Events(NamedTuple):
 
 def events_of(system: System, t: Array, state: State) -> Events:
     """What a description says may end its motion."""
-    found = jax.eval_shape(_named_events, system, t, state.q, state.u)
-    names = tuple(found)
+    program, found = jax.make_jaxpr(_named_events, return_shape=True)(system, t, state.q, state.u)
     directions = tuple(e.direction if isinstance(e, Crossing) else 0 for e in found.values())
-    values = lambda u: as_vector(_values(system, t, state.q, u), state.q)  # noqa: E731
-    return Events(names, directions, bool(names) and _is_read(values, state.u))
+    return Events(tuple(found), directions, _is_read(program.jaxpr, program.jaxpr.invars[-1]))
 
 
-def _is_read(f: Callable[[Array], Array], x: Array) -> bool:
-    """Whether the value of `f` depends on `x` at all."""
-    program = jax.make_jaxpr(f)(x).jaxpr
+def _is_read(program: Any, variable: Any) -> bool:
+    """Whether the results of a program depend on a variable at all."""
     needed = {id(v) for v in program.outvars}
     for equation in reversed(program.eqns):
         if any(id(v) in needed for v in equation.outvars):
             needed |= {id(v) for v in equation.invars}
-    return id(program.invars[0]) in needed
+    return id(variable) in needed
 
 
 def _named_events(system: System, t: Component, q: Array, u: Array) -> dict[str, Any]:
-    now = Instant(system, t, q, u)
-    found = dict(system.events(t, now.q, now.u_all))
-    return {name: _as_float(found[name], q.dtype) for name in sorted(found)}
+    return _events_at(Instant(system, t, q, u), q.dtype)
+
+
+def _events_at(now: Instant, dtype: Any) -> dict[str, Any]:
+    found = dict(now.system.events(now.t, now.q, now.u_all))
+    return {name: _as_float(found[name], dtype) for name in sorted(found)}
 
 
 def _as_float(event: Any, dtype: Any) -> Any:
@@ -60,22 +59,27 @@ def _as_float(event: Any, dtype: Any) -> Any:
     return jnp.asarray(event, dtype=dtype)
 
 
-def _values(system: System, t: Component, q: Array, u: Array) -> list[Array]:
-    return [e.value if isinstance(e, Crossing) else e for e in _named_events(system, t, q, u).values()]
+class Watched(NamedTuple):
+    """All events (n,), their time derivatives (n,) along the motion, and det C_dep: where that vanishes, the dependent
+    speeds no longer follow from the independent ones."""
+
+    values: Array
+    rates: Array
+    determinant: Array
 
 
 @fused
-def values_and_rates(system: System, t: Component, q: Array, u: Array, u_dot: Array) -> tuple[Array, Array]:
-    """All events (n,) and their time derivatives (n,) along the motion."""
-    q_dot = as_vector(Instant(system, t, q, u).q_dot, q)
-    f = lambda t, q, u: as_vector(_values(system, t, q, u), q)  # noqa: E731
-    return jax.jvp(f, (t, q, u), (jnp.ones_like(t), q_dot, u_dot))
+def watched(system: System, t: Component, q: Array, u: Array, u_dot: Array) -> Watched:
+    """What may end a motion."""
 
+    def read(t: Component, q: Array, u: Array) -> Any:
+        now = Instant(system, t, q, u)
+        events = [e.value if isinstance(e, Crossing) else e for e in _events_at(now, q.dtype).values()]
+        det = determinant(now.C_dep) if now.k else 1.0
+        return as_vector(events, q), (as_vector(now.q_dot, q), as_vector([det], q)[0])
 
-@fused
-def determinant_of_dependent_speeds(system: System, t: Component, q: Array, u: Array) -> Array:
-    """det C_dep: where it vanishes, the dependent speeds no longer follow from the independent ones."""
-    return as_vector([determinant(Instant(system, t, q, u).C_dep)], q)[0]
+    values, slope, (q_dot, det) = jax.linearize(read, t, q, u, has_aux=True)
+    return Watched(values, slope(jnp.ones_like(t), q_dot, u_dot), det)
 
 
 class End(NamedTuple):
@@ -100,7 +104,7 @@ def at_zero(system: System, t: Array, state: State, which: Array, happened: Arra
 
     def measured(t: Array, q: Array, u: Array):
         q_dot, u_dot = rates(t, q, u)
-        g, g_dot = values_and_rates(system, t, q, u, u_dot)
+        g, g_dot, _ = watched(system, t, q, u, u_dot)
         return q_dot, u_dot, g[which], g_dot[which]
 
     def stage(carry: Any, k: Array):

@@ -16,17 +16,17 @@ from .._description.system import State, System
 from .._description.units import units_of
 from .._method.checks import configuration_residual, configuration_tolerance
 from .._method.drift import correction, has_configuration_constraints, projected
-from .._method.equations import dependent_speeds
+from .._method.equations import _dependent_speeds
 from .._method.kane import Instant, checked_inputs
 from .._method.rates import state_rates
 from .._scalars.nan import all_finite, derivative_free_where_not_finite, nan_derivative_where, nan_where
 from .._scalars.reads import compiled
 from .._scalars.types import Component
-from .events import Events, at_zero, determinant_of_dependent_speeds, events_of, values_and_rates
+from .events import Events, at_zero, events_of, watched
 from .kinks import ToKinks
 from .settings import Settings
 from .signals import evaluate, sample_times, signals_are_sound, with_own_times, without_nonsense
-from .stops import AdaptiveToStops, Quantities, ToStops
+from .stops import AdaptiveToStops, Limits, Quantities, ToStops
 from .trajectory import Status, Trajectory
 
 
@@ -100,7 +100,7 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
     (t_reached, t_last), ((q, u), (q_last, u_last)) = jax.lax.stop_gradient(times), states
     reached, t_end, end = jnp.isfinite(t_reached) & valid, t_last[0], State(q_last[0], u_last[0])
 
-    which = cast(Any, solution.controller_state).which if stops else jnp.array(-1)
+    which = cast(Any, solution.controller_state).which.astype(int) if stops else jnp.array(-1)
     status = jnp.where(valid, _status(solution, which, events), Status.INVALID).astype(jnp.int32)
     smooth = status == Status.COMPLETED
     t_end = jnp.where(smooth, ts[-1], jnp.where(valid, t_end, ts[0]))
@@ -124,7 +124,7 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
     if constrained and settings.project:
         q = jax.vmap(lambda t, q: projected(system, t, q))(ts, q)
         end = State(projected(system, t_end, end.q), end.u)
-    u_dep = jax.vmap(lambda t, q, u: dependent_speeds(system, t, q, u))(ts, q, u)
+    u_dep = jax.vmap(lambda t, q, u: _dependent_speeds(system, t, q, u, {}))(ts, q, u)
     inputs = jax.vmap(lambda t, q, u: inputs_at(system, signals, t, q, u, all_of_them=True))(ts, q, u)
     q, u, u_dep, inputs = nan_where(~reached, (q, u, u_dep, inputs), origin)
     t_end, end = nan_derivative_where(~smooth, (t_end, end), origin)
@@ -172,25 +172,15 @@ def _to_stops(controller: Any, vector_field: Any, events: Events, system: System
 
     def watch(t, y, args):
         q, u = y
-        values = rates = jnp.zeros(0, q.dtype)
-        if events.names:
-            u_dot = vector_field(t, y, args)[1] if events.read_speeds else jnp.zeros_like(u)
-            values, rates = values_and_rates(args[0], t, q, u, u_dot)
-        singular = bool(system.dependent_speeds)
-        bound = determinant_of_dependent_speeds(args[0], t, q, u) if singular else jnp.ones((), q.dtype)
-        return Quantities(values, rates, bound)
+        u_dot = vector_field(t, y, args)[1] if events.read_speeds else jnp.zeros_like(u)
+        return Quantities(*watched(args[0], t, q, u, u_dot))
 
     whole = jax.lax.stop_gradient(ts[-1] - ts[0])
     adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
     kind: Any = AdaptiveToStops if adaptive else ToStops
-    return kind(
-        controller=controller,
-        watch=watch,
-        direction=jnp.asarray(events.directions, ts.dtype),
-        resolution=reach,
-        rounding=1e3 * jnp.finfo(ts.dtype).eps * whole,
-        shortest=whole / 1000,
-    )
+    rounding = 1e3 * jnp.finfo(ts.dtype).eps * whole
+    limits = Limits(directions=events.directions, resolution=reach, rounding=rounding, shortest=whole / 1000)
+    return kind(controller=controller, watch=watch, limits=limits)
 
 
 def inputs_at(system: System, signals: Any, t: Component, q: Array, u: Array, all_of_them: bool = False):
