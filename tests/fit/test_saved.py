@@ -21,6 +21,7 @@ from jaxkane.fit import (
     multi_start,
     profile,
     report,
+    trajectories,
 )
 
 t = np.linspace(0.0, 1.0, 11)
@@ -57,6 +58,26 @@ def test_a_fit_comes_back_as_it_was(result, path):
     np.testing.assert_array_equal(again.problem.windows.step, result.problem.windows.step)
     # One can go on with it.
     assert minimize(again.problem, LeastSquares(), start=again.point).cost == pytest.approx(result.cost, rel=1e-9)
+
+
+def test_to_look_at_a_fit_simulates_nothing(path, monkeypatch):
+    import jaxkane.fit._problem.problem as problem
+
+    again = load(path, pose())
+
+    def refuse(*arguments):
+        raise AssertionError("a fit that is looked at was simulated")
+
+    for name in ("starts_of", "blocks_of", "costs_of", "rides_of"):
+        monkeypatch.setattr(problem, name, refuse)
+    assert repr(again) == str(again)
+    assert again.ok is again.identifiability.ok
+    assert again.message
+    assert again.notes
+    assert again.tests
+    assert again.variance_accounted_for
+    with pytest.raises(AssertionError, match="was simulated"):
+        trajectories(again)
 
 
 class Slow(Track):

@@ -65,7 +65,7 @@ def fit(
         (None: no prior).
     - `priors`: (mean, standard deviation) by name, of parameters that were measured elsewhere; names that are not free
         are passed over.
-    - `hold`: inputs that keep each sample until the next, as a digital controller's commands do; the others are linear
+    - `hold`: inputs under a zero-order hold, which keep each sample until the next; the others are linear
         between their samples.
     - `window` [s]: cut the trials into windows of this length, each with its own unknown start (multiple shooting), as
         unstable motions need. By default a trial is one window (single shooting).

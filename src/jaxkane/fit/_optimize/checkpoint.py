@@ -1,4 +1,4 @@
-"""The state of a descent in a file, so that an interrupted one goes on as if nothing had been. Knows no method."""
+"""The state of a descent in a file, so that an interrupted one goes on where it was. Knows no method."""
 
 from __future__ import annotations
 

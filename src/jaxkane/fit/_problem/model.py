@@ -57,7 +57,7 @@ class Nuisance(eqx.Module):
         return jnp.asarray(otherwise, b.dtype)
 
 
-class Held(eqx.Module):
+class ZeroOrderHold(eqx.Module):
     """A signal that keeps each sample until the next: `ts`, `values` (n_t,)."""
 
     ts: Float[Array, " n_t"]
@@ -107,7 +107,7 @@ class Model(eqx.Module):
             bias = self.nuisance.of_trial(b, "bias of input", name, 0.0)
             if name in self.driven:
                 gain = roles.get(("gain", name), 1.0) * self.nuisance.of_trial(b, "gain of input", name, 1.0)
-                kind = Held if name in self.held else Samples
+                kind = ZeroOrderHold if name in self.held else Samples
                 signals[name] = kind(self._times_of(name, window, b, roles), gain * window.inputs[i] + bias)
             elif ("bias of input", name) in self.nuisance.trial:
                 signals[name] = bias

@@ -110,7 +110,7 @@ def nuisance_of(system: System, channels: Sequence[str], driven: Sequence[str], 
 def held_and_delayed(
     system: System, hold: Any, free: Any, nuisance: Nuisance
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Inputs that keep each sample until the next, and those that act with a delay which is to be found."""
+    """Inputs under a zero-order hold, and those that act with a delay which is to be found."""
     items = [free] if isinstance(free, Delay) else free if isinstance(free, (list, tuple)) else ()
     delayed = [name for kind, name in nuisance.trial if kind == "delay of input"]
     delayed += [item.input for item in items if isinstance(item, Delay)]

@@ -1,7 +1,7 @@
 """One fit by several processes: each simulates a share of the windows, all take the same steps.
 
 What a process has found out about its windows, their triangles (which say what J^T J and J^T r say, see `_blocks`), is
-handed to all others. From there on every process does the same with the same numbers, so that none need lead, and the
+handed to all others. From there on every process does the same with the same numbers: there is no main process, and the
 result is that of one process alone.
 """
 

@@ -127,7 +127,7 @@ def _ending(fit: Fit) -> str:
 def _how_sure(fit: Fit) -> str:
     if fit.robust:
         return (
-            "Intervals are built on the errors by trial (clustered), since the residuals are correlated in time "
+            "Intervals are built on the cluster-robust errors (by trial), since the residuals are correlated in time "
             f"(neighbours by {fit.autocorrelation:.2f}); the formal ones take every sample for independent."
         )
     return "Intervals are built on the formal errors, for independent residuals of equal size."

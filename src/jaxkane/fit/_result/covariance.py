@@ -17,7 +17,7 @@ from .._problem.problem import Linearization, Problem
 
 
 def clustered_covariance(problem: Problem, point: Unknowns, at: Linearization) -> np.ndarray:
-    """Covariance (p, p) of the parameters in their units, robust to residuals that are correlated within a trial.
+    """Cluster-robust covariance (p, p) of the parameters in their units, for residuals correlated within a trial.
 
         B (T / (T - 1) sum_t (A_t^T r_t) (A_t^T r_t)^T + P) B,   B = (A^T A)^-1
 

@@ -43,8 +43,8 @@ class Fit:
     - `system`: with the estimates in it. `estimates`, `start`: values by name. Gains and delays are among them.
     - `standard_errors`: by name, formal: from the inverse of J^T J with the nuisance values eliminated, times the
         residuals' variance. They hold for independent residuals of equal scaled size, and a right model.
-    - `clustered_errors`: by name, robust to residuals that are correlated within a trial (sandwich, one cluster a
-        trial); NaN with fewer trials than parameters plus two.
+    - `clustered_errors`: by name, cluster-robust, for residuals that are correlated within a trial (sandwich, one
+        cluster a trial); NaN with fewer trials than parameters plus two.
     - `intervals(level)`: by name. `correlation` (p, p) of the estimates, in the order of `names`.
     - `cost`: sum of squared residuals; `history`: of the cost. `status`, `message`: how it ended, in a word and in
         words.
@@ -167,7 +167,7 @@ class Fit:
 
     @property
     def robust(self) -> bool:
-        """Whether `intervals` use the clustered errors: the residuals are not noise, and there are trials enough."""
+        """Whether `intervals` use the cluster-robust errors: the residuals are no noise, and the trials are enough."""
         known = np.all(np.isfinite(self.clustered_covariance.diagonal()))
         return bool(known and abs(self.autocorrelation) > 0.2)
 
@@ -184,7 +184,7 @@ class Fit:
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Confidence intervals by name, inside a parameter's bounds: symmetric in the free numbers.
 
-        From the clustered errors where `robust`, from the formal ones else; `freedom` says with how many degrees.
+        From the cluster-robust errors where `robust`, from the formal ones else; `freedom` says with how many degrees.
 
         **Raises:** `ValueError` for a level that is not between 0 and 1.
         """
