@@ -1,6 +1,7 @@
 """How fast is jaxkane, against its peers, on this machine? One command measures all of it.
 
     right_hand_side   one evaluation for the bicycle, in a batch: SymPy's lambdify, PyDy's Cython, generated C
+    exported          the same as exported C: generated C
     rides             a thousand rides, and one: scipy's odeint and DOP853 around Cython and C; one and two devices
     sensitivities     all derivatives of a ride: finite differences with C
     first_calls       what a fresh process waits for, and a second one with the cache
@@ -40,6 +41,7 @@ XLA, NATIVE = Setting(), Setting(native=True)
 TWO = (XLA._replace(devices=2), NATIVE._replace(devices=2))
 SETTINGS = {
     "right_hand_side": (XLA, NATIVE),
+    "exported": (NATIVE,),
     "rides": (XLA, NATIVE, *TWO),
     "sensitivities": (XLA, NATIVE),
     "first_calls": (XLA, NATIVE),

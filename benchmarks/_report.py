@@ -11,6 +11,7 @@ from ._figures import Figure
 
 TITLES = {
     "right_hand_side": "One evaluation of the right-hand side",
+    "exported": "The right-hand side as exported C",
     "rides": "Rides of 5 s",
     "sensitivities": "Derivatives of a ride",
     "first_calls": "First calls: trace, compile and run in a fresh process",
