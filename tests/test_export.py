@@ -1,6 +1,7 @@
 """Exported equations, compiled, run or loaded elsewhere, give the library's numbers; what cannot be is named."""
 
 import ctypes
+import functools
 import importlib.util
 import shutil
 import subprocess
@@ -102,10 +103,14 @@ def by_library(system, t, q, u, w, functions):
         rates = jk.coordinate_rates(system, t, q, u), jk.accelerations(system, t, q, u, given(w))
         return jnp.concatenate(rates)
 
-    def jacobian(place):
-        blocks = jax.jit(jax.jacfwd(rates, place))(system, q, u, w)
+    @functools.cache
+    def jacobians():
+        return jax.jit(jax.jacfwd(rates, (0, 1, 2, 3)))(system, q, u, w)
+
+    def jacobian(*places):
         n = len(q) + len(u)
-        return np.concatenate([np.reshape(x, (n, -1)) for x in jax.tree.leaves(blocks)], axis=1)
+        blocks = [np.reshape(x, (n, -1)) for i in places for x in jax.tree.leaves(jacobians()[i])]
+        return np.concatenate(blocks, axis=1)
 
     ways = {
         "rates": lambda: (jk.coordinate_rates(system, t, q, u), jk.accelerations(system, t, q, u, given(w))),
@@ -114,7 +119,7 @@ def by_library(system, t, q, u, w, functions):
         "constraint_jacobian_rate": lambda: [jk.constraint_jacobian_rate(system, t, q, u)],
         "partial_velocities": lambda: jk.partial_velocities(system, t, q, u, given(w)),
         "kinetic_energy": lambda: [jk.kinetic_energy(system, t, q, u)],
-        "state_jacobian": lambda: [jacobian((1, 2))],
+        "state_jacobian": lambda: [jacobian(1, 2)],
         "parameter_jacobian": lambda: [jacobian(0)],
         "input_jacobian": lambda: [jacobian(3)],
     }
@@ -146,7 +151,8 @@ def call(library, name, t, arrays, outputs, real=ctypes.c_double):
 
 
 SYSTEMS = ["DoublePendulum", "Odd", "Bob"]
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in CATALOG if name not in SYSTEMS]
+# Of the catalogue those with most to go wrong; `test_symbolic` has the same formulas of all.
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("Aircraft", "SpatialDoublePendulum", "WhippleBicycle")]
 
 
 # Who is told that something makes the library slow, is told so by other tests.
@@ -513,6 +519,10 @@ def test_what_cannot_be_exported_is_named(monkeypatch, tmp_path):
         jk.export.numpy(Strange)
     with pytest.raises(ValueError, match="'float64' or 'float32'"):
         jk.export.numpy(Strange(), dtype="float16")
+    with pytest.raises(ValueError, match=r"ends with \.c.* got '.*folder'"):
+        jk.export.c(Strange(), tmp_path / "folder")
+    with pytest.raises(TypeError, match=r"Strange is being traced"):
+        jax.jit(lambda m: jk.export.numpy(Strange(mass=m)))(1.0)
     with pytest.raises(ValueError, match=r"ByMatrix: 'rates' .*dot_general.*export.stablehlo"):
         jk.export.numpy(ByMatrix())
     assert not [*tmp_path.iterdir()], "nothing was written"

@@ -21,7 +21,7 @@ from .._scalars.graph import Graph, NotScalarError, unrolled
 from .._scalars.jacobian import jacobian
 from .._scalars.jax_internals import FUSES, ClosedJaxpr, jaxpr_as_fun
 from .._scalars.linear import as_vector, is_written_out
-from .checks import check_system
+from .checks import check_system, is_concrete
 from .equations import (
     constraint_jacobian,
     constraint_jacobian_rate,
@@ -99,8 +99,8 @@ class Formulas:
     `arguments`: what they read. An input node's operands are the argument's place in them, the element's place in it,
     and its size.
 
-    **Raises:** `TypeError` for what is no `System`; `ValueError` for a batch, a description that contradicts itself,
-    and, when a function is asked for, one that there is not or whose operations are none of scalars.
+    **Raises:** `TypeError` for what is no `System`, or traced; `ValueError` for a batch, a description that contradicts
+    itself, and, when a function is asked for, one that there is not or whose operations are none of scalars.
     """
 
     def __init__(self, system: System, dtype: str = "float64"):
@@ -112,6 +112,8 @@ class Formulas:
         batched = in_batches(system)
         if batched:
             raise ValueError(f"{self.name} is a batch: {', '.join(batched)} has leading axes more. Give one of it.")
+        if not is_concrete(system):
+            raise TypeError(f"{self.name} is being traced: write its equations outside of jax.jit, vmap and grad.")
         if FUSES is not None:
             raise ImportError(f"{self.name} cannot be written as formulas: {FUSES}.")
         check_system(system, 0.0, None)

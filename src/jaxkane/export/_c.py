@@ -100,8 +100,8 @@ def c(
 
     **Arguments:**
 
-    - `path`: of the source, "FOLDER/NAME.c"; beside it `NAME.h`, and `NAME_test.c`, a program that compares every
-        function with numbers that JAX computed. The folder is made.
+    - `path`: of the source, "FOLDER/NAME.c", whose folder is made; beside it `NAME.h`, and `NAME_test.c`,
+        a program that compares every function with numbers that JAX computed.
     - `functions`: which; by default rates (q_dot, u_dot), equations (M, f), dependent_speeds, and the derivatives of
         the rates, state_jacobian (by q, u), parameter_jacobian and input_jacobian. There are also
         dependent_accelerations, constraint_jacobian, constraint_jacobian_rate, partial_velocities, kinetic_energy.
@@ -114,15 +114,17 @@ def c(
     as formulas of single numbers, as those of LAPACK for more than 12 speeds.
     """
     path = Path(path)
+    if path.suffix != ".c":
+        raise ValueError(f"`path` is that of the source, which ends with .c: 'generated/bicycle.c'; got {str(path)!r}.")
     formulas = Formulas(system, dtype)
     functions = chosen(formulas, functions)
     module = _Module(formulas, functions, name or path.stem)
-    source = path.with_suffix(".c")
-    written = Written(source.with_suffix(".h"), source, source.with_name(f"{source.stem}_test.c"))
+    written = Written(path.with_suffix(".h"), path, path.with_name(f"{path.stem}_test.c"))
+    header = written.header.name
+    texts = (module.header(), module.source(header), module.test(header))
     path.parent.mkdir(parents=True, exist_ok=True)
-    written.source.write_text(module.source(written.header.name), encoding="utf-8")
-    written.header.write_text(module.header(), encoding="utf-8")
-    written.test.write_text(module.test(written.header.name), encoding="utf-8")
+    for file, text in zip(written, texts, strict=True):
+        file.write_text(text, encoding="utf-8")
     return written
 
 
@@ -253,6 +255,7 @@ static int compare(const char *name, int n, const {type} *found, const {type} *e
     int i;
     for (i = 0; i < n; i++) {{
         const double d = fabs((double)found[i] - (double)expected[i]);
+        if (found[i] == expected[i] || (found[i] != found[i] && expected[i] != expected[i])) continue;
         if (!(d <= difference)) difference = d; /* also where it is not a number */
         if (fabs((double)expected[i]) > size) size = fabs((double)expected[i]);
     }}

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
-import jax.numpy as jnp
+import numpy as np
 
 from .._common.lookup import refuse_unknown
 from .._description.system import System
@@ -54,7 +54,7 @@ def stablehlo(
     if not isinstance(function, str):
         raise TypeError(f"stablehlo exports one function at a time; `function` is its name, got {function!r}.")
     refuse_unknown([function], OFFERED, f"{formulas.name}: there is no function", "there are")
-    u_dep = jnp.zeros(len(formulas.names("u_dep")), formulas.dtype)  # of which no such function knows
+    u_dep = np.zeros(len(formulas.names("u_dep")), formulas.dtype)  # of which no such function knows
 
     def of_one(t, q, u, inputs, parameters):
         return formulas.by_jax(
