@@ -254,6 +254,34 @@ def test_numpy_source_in_float32_stays_there_and_is_written(tmp_path):
     assert_close(found, [*expected["rates"], *expected["state_jacobian"]], rtol)
 
 
+def test_derivatives_where_branches_meet():
+    """Beside and on the edges of `where`, sqrt, sign, max and min: sides that are not taken have no derivative."""
+    rtol = 1e-12
+    system, t, q, u, w = case("Odd")
+    given = dict(zip(system.inputs, w, strict=True))
+    rates = lambda x: jk.accelerations(system, t, x[:2], x[2:], given)  # noqa: E731
+    jacobian = jax.jit(jax.jacfwd(rates))
+    module = {}
+    exec(jk.export.numpy(system, functions=("state_jacobian",)), module)
+    ways = [lambda q: module["state_jacobian"](t, q, u, w)[2:]]
+    if importlib.util.find_spec("casadi"):
+        f = jk.export.casadi(system)
+        J = f.jacobian()
+        numbers = np.concatenate([x.ravel() for x in jk.export.parameters(system).values()])
+
+        def by_casadi(q):
+            blocks = J(t, q, u, w, numbers, *f(t, q, u, w, numbers))
+            return np.hstack([np.array(blocks[6]), np.array(blocks[7])])
+
+        ways.append(by_casadi)
+    for x0 in (-0.4, float(system.θ0), 0.0, 0.25):
+        at = np.array([q[0], x0])
+        expected = np.asarray(jacobian(np.concatenate([at, u])))
+        assert np.all(np.isfinite(expected))
+        for way in ways:
+            assert_close([way(at)], [expected], rtol)
+
+
 # What no number comes of, and which of two zeros, in source that others compile: bit for bit as XLA has it.
 
 X = jnp.array([0.0, -0.0, 1.0, -1.0, np.inf, -np.inf, np.nan])

@@ -27,8 +27,7 @@ def casadi(system: System, function: str = "rates", *, name: str | None = None) 
     velocities V, W (b, 3, n) come as matrices (3 b, n).
 
     Values are those of JAX, but for two things: CasADi's `fmax` and `fmin` drop what is not a number, and it writes 0
-    for 0 * x, also where x is infinite. Its derivative of `jnp.where` is NaN where the derivative of the side that is
-    not taken is; the library's own, state_jacobian and the like, are functions too.
+    for 0 * x, also where x is infinite.
 
     **Arguments:**
 
