@@ -305,7 +305,7 @@ class _Reader:
         collides = np.any(m.geom_contype != 0) and np.any(m.geom_conaffinity != 0)
         disabled = int(m.opt.disableflags)
         off = lambda bit: bool(disabled & int(getattr(self.kinds.mjtDisableBit, bit, 0)))  # noqa: E731
-        has = lambda name, skip=0: bool(np.any(np.asarray(getattr(m, name, 0))[skip:]))  # noqa: E731
+        has = lambda name: bool(np.any(getattr(m, name, 0)))  # noqa: E731 (older versions lack some)
         found = {
             "contacts": (collides or m.npair > 0) and not off("mjDSBL_CONTACT"),
             "limits of joints": has("jnt_limited") and not off("mjDSBL_LIMIT"),
@@ -380,6 +380,8 @@ def _for_mujoco(text: str, floating: bool) -> str:
     for link in robot.findall("link"):
         for shape in [*link.findall("visual"), *link.findall("collision")]:
             link.remove(shape)
+    for inertial in robot.findall("link/inertial"):
+        _turn_back(inertial)
     if floating or roots[0] != "world":
         if "world" in links:
             raise ValueError(f"The link 'world' is not the root, which is {roots[0]!r}: call it otherwise.")
@@ -390,6 +392,25 @@ def _for_mujoco(text: str, floating: bool) -> str:
     compiler = ElementTree.SubElement(ElementTree.SubElement(robot, "mujoco"), "compiler")
     compiler.attrib |= {"fusestatic": "false", "balanceinertia": "false", "discardvisual": "false"}
     return ElementTree.tostring(robot, encoding="unicode")
+
+
+def _turn_back(inertial: ElementTree.Element) -> None:
+    """Resolve an inertia along the link's axes: some versions of MuJoCo pass over the angles it is given in."""
+    origin, tensor = inertial.find("origin"), inertial.find("inertia")
+    angles = [float(x) for x in origin.get("rpy", "0 0 0").split()] if origin is not None else []
+    if origin is None or tensor is None or not any(angles):
+        return
+    c, s = np.cos(angles), np.sin(angles)
+    about_x = np.array([[1, 0, 0], [0, c[0], -s[0]], [0, s[0], c[0]]])
+    about_y = np.array([[c[1], 0, s[1]], [0, 1, 0], [-s[1], 0, c[1]]])
+    about_z = np.array([[c[2], -s[2], 0], [s[2], c[2], 0], [0, 0, 1]])
+    R = about_z @ about_y @ about_x
+    I = np.array([[float(tensor.get(f"i{min(a, b)}{max(a, b)}", 0.0)) for b in "xyz"] for a in "xyz"])
+    turned = R @ I @ R.T
+    for i, a in enumerate("xyz"):
+        for j, b in enumerate("xyz"[i:], start=i):
+            tensor.set(f"i{a}{b}", repr(float(turned[i, j])))
+    origin.set("rpy", "0 0 0")
 
 
 def _mimics(text: str) -> list[Loop | Coupling]:
