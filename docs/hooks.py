@@ -64,6 +64,8 @@ PAGES = {
     "stability": "stability",
     "plot": "pictures",
     "catalog": "catalogue",
+    "convert": "bringing_models",
+    "joints": "bringing_models",
     "data": "identification",
 }
 PAGES |= {"loads": "describing", "rotations": "describing"}
