@@ -67,6 +67,8 @@ PAGES = {
     "convert": "bringing_models",
     "joints": "bringing_models",
     "data": "identification",
+    "symbolic": "symbolic",
+    "export": "export",
 }
 PAGES |= {"loads": "describing", "rotations": "describing"}
 
