@@ -241,6 +241,18 @@ def test_numpy_source_gives_the_numbers_of_the_library(name):
     )
 
 
+def test_names_with_dots_and_spaces_of_mechanisms_of_joints():
+    bar = {"mass": 2.0, "center": (0.0, 0.0, -0.2), "inertia": (0.03, 0.03, 0.002)}
+    hinge = jk.joints.hinge("shoulder", (0, 1, 0), damping=0.1)
+    arm = jk.joints.mechanism([jk.joints.Link("upper arm", joints=hinge, **bar)])
+    module = {}
+    exec(jk.export.numpy(arm, functions=("rates",)), module)
+    heavy = {**module["PARAMETERS"], "mass.upper arm": 3.0}
+    # (I_yy + m z^2) q_ddot = m g_z z sin(q) - c q_dot, with z = -0.2 and g_z = -9.81
+    expected = (3.0 * 9.81 * 0.2 * -np.sin(0.4) - 0.1 * 0.5) / (0.03 + 3.0 * 0.04)
+    np.testing.assert_allclose(module["rates"](0.0, [0.4], [0.5], parameters=heavy)[1], [expected], rtol=1e-14)
+
+
 def test_numpy_source_in_float32_stays_there_and_is_written(tmp_path):
     rtol = 1e-5
     system, t, q, u, w = case("Odd")
@@ -561,6 +573,9 @@ def test_what_cannot_be_exported_is_named(monkeypatch, tmp_path):
             jk.export.casadi(Strange(), ("rates",))
         with pytest.raises(ValueError, match=r"InHalves: .* float32 in between, which CasADi has not"):
             jk.export.casadi(InHalves())
+    monkeypatch.setitem(sys.modules, "flatbuffers", None)
+    with pytest.raises(ImportError, match=r'pip install "jaxkane\[stablehlo\]"'):
+        jk.export.stablehlo(Strange(), tmp_path / "a.stablehlo")
     monkeypatch.setitem(sys.modules, "casadi", None)
     with pytest.raises(ImportError, match=r'pip install "jaxkane\[casadi\]"'):
         jk.export.casadi(Strange())

@@ -264,10 +264,31 @@ def test_what_is_no_linear_model_is_refused():
         jk.symbolic.linearize(CATALOG["LightShaftAndBar"].example())
     with pytest.raises(ValueError, match="has no theta3; did you mean"):
         jk.symbolic.linearize(pendulum, {"theta3": 1})
+    with pytest.raises(ValueError, match="at` says theta2 = theta1, but theta1 has a value of its own"):
+        jk.symbolic.linearize(pendulum, {"theta2": "theta1"})
     with pytest.raises(ValueError, match="no state can be mass"):
         jk.symbolic.linearize(pendulum, states=("mass",))
     with pytest.raises(ValueError, match=r"1 configuration constraints .* 0 are named"):
         jk.symbolic.linearize(Bob(), {"y": -1}, dependent=())
+
+
+def test_what_came_from_sympy_goes_back():
+    """A model of `sympy.physics.mechanics`, made a system, has SymPy's own mass matrix and right side again."""
+    me = pytest.importorskip("sympy.physics.mechanics")
+    q, u = me.dynamicsymbols("q u")
+    m, l, g = sp.symbols("m l g")
+    N, O = me.ReferenceFrame("N"), me.Point("O")
+    O.set_vel(N, 0)
+    A = N.orientnew("A", "Axis", [q, N.z])
+    A.set_ang_vel(N, u * N.z)
+    P = O.locatenew("P", -l * A.y)
+    P.v2pt_theory(O, N, A)
+    kane = me.KanesMethod(N, [q], [u], kd_eqs=[q.diff() - u])
+    kane.kanes_equations([me.Particle("P", P, m)], [(P, -m * g * N.y)])
+    found = jk.symbolic.equations(jk.convert.from_sympy(kane, {m: 1.0, l: 0.5, g: 9.81})).simplified()
+    back = {found.symbols[x.name]: x for x in (m, l, g)} | dict(zip((*found.q, *found.u), (q, u), strict=True))
+    assert sp.simplify(found.M.xreplace(back) - kane.mass_matrix).is_zero_matrix
+    assert sp.simplify(found.f.xreplace(back) - kane.forcing).is_zero_matrix
 
 
 def test_sympy_is_asked_for_by_name(monkeypatch):

@@ -46,10 +46,13 @@ def stablehlo(
 
     **Returns:** the `jax.export.Exported`.
 
-    **Raises:** `ValueError` as `jaxkane.export.c`, but for operations, of which every one can be exported.
+    **Raises:** `ImportError` for a path without flatbuffers, which JAX writes with; `ValueError` as `jaxkane.export.c`,
+    but for operations, of which every one can be exported.
     """
     from jax import export
 
+    if path is not None:
+        _refuse_without_flatbuffers()
     formulas = Formulas(system, dtype)
     if not isinstance(function, str):
         raise TypeError(f"stablehlo exports one function at a time; `function` is its name, got {function!r}.")
@@ -72,3 +75,12 @@ def stablehlo(
             Path(path).parent.mkdir(parents=True, exist_ok=True)
             Path(path).write_bytes(bytes(exported.serialize(vjp_order=derivatives)))
     return exported
+
+
+def _refuse_without_flatbuffers() -> None:
+    try:
+        import flatbuffers  # noqa: F401
+    except ImportError as error:
+        raise ImportError(
+            'JAX writes programs with flatbuffers: pip install "jaxkane[stablehlo]". Without a path none is needed.'
+        ) from error

@@ -95,7 +95,8 @@ class Equations:
             raise ValueError(
                 f"{self.name}: {self.operations['all']} operations are too many for sympy.simplify, which would write "
                 "out each intermediate result wherever it is read. The formulas are `replacements`, evaluated one "
-                "after the other, and what is made of them; jaxkane.symbolic.linearize stays smaller."
+                "after the other, and what is made of them. equations(system, whole=True) has them written out, which "
+                "for a few hundred operations may take minutes; jaxkane.symbolic.linearize stays smaller."
             )
         known: dict[Any, Any] = {}
 

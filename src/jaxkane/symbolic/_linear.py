@@ -162,6 +162,14 @@ class _At:
         known = [*(name for of in moving.values() for name in of), *kinds["parameters"]]
         refuse_unknown(at, known, f"{formulas.name} has no", "it has")
         values = {name: self._value(x) for name, x in at.items()}
+        symbols = {symbol: name for of in moving.values() for name, symbol in of.items()}
+        for name, x in values.items():
+            read = sorted(symbols[s] for s in x.free_symbols if s in symbols)
+            if read:
+                raise ValueError(
+                    f"{formulas.name}: `at` says {name} = {x}, but {', '.join(read)} has a value of its own there. "
+                    "Expressions are of parameters and of symbols that the system does not have."
+                )
         put = {kind: {name: values.get(name, sp.Integer(0)) for name in of} for kind, of in moving.items()}
         variables = [name for of in put.values() for name in of]
         put["u_dep"] = kinds["u_dep"]
