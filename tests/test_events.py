@@ -1,5 +1,6 @@
 """The instant at which a motion ends: exact times, directions, derivatives, batches, and what does not end it."""
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -37,6 +38,8 @@ class Particle(jk.System):
             "ground": {"ground": jk.falling(q["h"])},
             "either": {"ground": q["h"]},
             "none": {},
+            "root": {"low": jk.falling(jnp.sqrt(q["h"] - 0.2) - 0.1)},  # at 0.21 m; no number below 0.2 m
+            "lost": {"low": jnp.sqrt(q["h"] - 0.2) + 1.0},
             "roof": {"a_late": jk.falling(q["h"]), "b_early": jk.falling(q["h"] - 0.1), "c_top": jk.falling(u["v"])},
         }[self.ends]
 
@@ -256,6 +259,48 @@ def test_other_ends_have_no_derivative():
         assert np.isnan(found[:2]).all()
         assert found[2] == 0.0
     assert dropped(100.0, 0.1, Particle(ends="none"), max_steps=3).reason == "max steps"
+
+
+@pytest.mark.parametrize(
+    ("ends", "height", "options"), [("root", 0.21, {"step": 0.07}), ("lost", 0.2, {})], ids=["fixed", "adaptive"]
+)
+def test_an_event_that_is_no_number(ends, height, options):
+    """It is found beside where it is none; if it becomes none before it vanishes, nobody can say what follows."""
+    ride = dropped(1.0, 0.0, Particle(ends=ends), **options)
+    assert ride.reason == {"root": "low", "lost": "step too small"}[ends]
+    np.testing.assert_allclose(ride.t_end, np.sqrt(2 * (1.0 - height) / 9.81), atol=1e-8)
+    reached = np.asarray(TS) <= float(ride.t_end)
+    np.testing.assert_allclose(ride["h"][reached], (1.0 - 4.905 * TS**2)[reached], atol=1e-9)
+    assert np.isnan(ride.q[~reached]).all()
+
+
+def test_a_start_where_an_event_is_no_number():
+    with pytest.raises(ValueError, match="accelerations, rates or events are not finite beside the first state"):
+        dropped(0.1, 0.0, Particle(ends="lost"))
+
+
+def test_the_end_in_single_precision():
+    particle, ts = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (Particle(), TS))
+    start = jk.State(jnp.ones(1, jnp.float32), jnp.zeros(1, jnp.float32))
+    ride = jk.simulate(particle, start, ts)
+    assert ride.reason == "ground"
+    assert ride.t_end.dtype == ride.end.q.dtype == jnp.float32
+    np.testing.assert_allclose(ride.t_end, np.sqrt(2 / 9.81), rtol=1e-5)
+    np.testing.assert_allclose(ride.end.q, 0.0, atol=1e-5)
+
+
+def test_the_end_by_an_implicit_solver():
+    """The bead passes y = 0.3 where cos(t) does; Kvaerno's method solves for the stages of every step."""
+    ride = jk.simulate(Bead(), jk.State(TOP, jnp.ones(1)), TS, solver=diffrax.Kvaerno5())
+    assert ride.reason == "low"
+    np.testing.assert_allclose(ride.t_end, np.arccos(0.3), atol=1e-6)
+
+
+def test_the_end_of_a_stabilized_motion():
+    ride = jk.simulate(Bead(), jk.State(TOP, jnp.ones(1)), TS, stabilize=10.0)
+    assert ride.reason == "low"
+    np.testing.assert_allclose(ride.t_end, np.arccos(0.3), atol=1e-6)
+    np.testing.assert_allclose(ride.end.q, [np.sqrt(0.91), 0.3], atol=1e-6)
 
 
 def test_an_event_that_reads_no_speed_costs_no_accelerations():

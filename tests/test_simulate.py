@@ -1,11 +1,13 @@
 """Motion over time: accuracy, inputs, statuses, gradients, and what is refused."""
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from slopes import differences, slopes
 
 import jaxkane as jk
 from jaxkane.catalog import DoublePendulum, WhippleBicycle
@@ -41,8 +43,6 @@ def test_energy_and_front_contact_over_five_seconds():
 
 
 def test_steps_of_any_solver_agree():
-    import diffrax
-
     fine = jk.simulate(PENDULUM, START, TS, solver=diffrax.Dopri8(), rtol=1e-11, atol=1e-11, adjoint="forward")
     steps = jk.simulate(PENDULUM, START, TS, step=1e-3, adjoint="forward")
     np.testing.assert_allclose(steps.q, fine.q, atol=1e-9)
@@ -186,17 +186,46 @@ def test_gradients_of_a_simulation_against_central_differences(torque, forward, 
     np.testing.assert_allclose(sum(jax.tree.leaves(products)), numeric, rtol=rtol)
 
 
-def test_the_trajectory_says_how_it_is_differentiated():
-    said = []
+NAMES = {"auto": "ForwardMode", "both": "DirectAdjoint", "reverse": "RecursiveCheckpointAdjoint"}
 
-    def final_angle(u):
-        ride = jk.simulate(PENDULUM, jk.State(START.q, u), TS)
-        said.append(ride.adjoint)
-        return ride["theta1"][-1]
 
-    for derivative in (jax.jacfwd, jax.grad):
-        jax.eval_shape(derivative(final_angle), START.u)
-    assert said == ["ForwardMode", "RecursiveCheckpointAdjoint"]
+@pytest.mark.parametrize(
+    ("adjoint", "mode"), [("auto", "forward"), ("both", "forward"), ("reverse", "reverse"), ("both", "reverse")]
+)
+def test_every_adjoint_against_differences(adjoint, mode):
+    """Of a pendulum's length, start and torque, in four steps. The trajectory says how it was done."""
+
+    def read(x, _):
+        torque = {"torque": x[2] * TS[:3]}
+        options = {"adjoint": adjoint, "step": 0.05, "max_steps": 4}
+        ride = jk.simulate(Pendulum(length=x[0]), jk.State(x[1:2], jnp.zeros(1)), TS[:3], torque, **options)
+        assert ride.adjoint == NAMES[adjoint]
+        return ride["angle"][-1] + ride["rate"][1]
+
+    both, x = slopes(read, mode), jnp.array([1.1, 0.4, 3.0])
+    np.testing.assert_allclose(both(x)[0], differences(both, x, 1e-4), rtol=1e-6)
+
+
+def test_a_derivative_forward_of_what_was_compiled_before_says_what_to_do():
+    def read(u):
+        return jk.simulate(Pendulum(), jk.State(jnp.array([0.4]), u), TS[:3], step=0.05, max_steps=4)["angle"][-1]
+
+    u = jnp.array([0.2])
+    too_late = {
+        "jvp of jit": lambda: jax.jvp(jax.jit(read), (u,), (u,)),
+        "jacfwd of jit": lambda: jax.jacfwd(jax.jit(read))(u),
+        "linearize": lambda: jax.linearize(read, u)[1](u),
+        "jit of linearize": lambda: jax.jit(lambda u: jax.linearize(read, u)[1](u)).lower(u),
+        "hessian": lambda: jax.hessian(read)(u),
+    }
+    for derivative in too_late.values():
+        with pytest.raises(TypeError, match=r"Say simulate\(..., adjoint=.forward.\)"):
+            derivative()
+    with pytest.raises(ValueError, match="solves the motion backwards, without its events"):
+        jk.simulate(Pendulum(), jk.State(u, u), TS[:3], adjoint=diffrax.BacksolveAdjoint())
+    seen = jax.jit(lambda u: jax.jvp(jax.vmap(read), (u,), (u,)))(u[None])[1]
+    alone = jax.jit(jax.jacfwd(read))(u) @ u
+    np.testing.assert_allclose(seen, alone[None], rtol=1e-12)
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ Each has a way back, so that where a release takes it away, results stay right a
 |---|---|
 | jaxprs and primitives (`jax.extend`, `jax.interpreters`) | `FUSES` says why; right-hand sides are plain JAX |
 | the frontend attribute that makes one function of a program | XLA cuts the program as it does any other |
+| tracers of a derivative in forward mode | such a derivative must be announced by `adjoint="forward"` |
 | `reset_cache`, equinox's switch of its checks | programs are kept only where the environment says so from the start |
 | `eval_context` | a sweep on a cluster may be refused, since programs that were first traced in a check differ |
 | `process_allgather` | none: a fit by several processes raises ImportError |
@@ -21,6 +22,7 @@ from collections.abc import Callable
 from typing import Any
 
 import jax
+from jax.core import Tracer
 
 FUSES: str | None = None  # why programs cannot be fused, or None
 try:
@@ -64,6 +66,23 @@ def bound(equation: Any, inputs: list[Any]) -> Any:
     """What an equation of a jaxpr does, to other inputs; with its own rules for derivatives, where it has some."""
     primitive = equation.primitive
     return primitive.bind(*inputs, **primitive.get_bind_params(equation.params))
+
+
+def is_moved_forward(x: Any) -> bool:
+    """Whether a derivative in forward mode (`jax.jvp`, `jax.jacfwd`) is under way by `x` that nobody will transpose."""
+    try:
+        from jax.interpreters.ad import JVPTracer
+        from jax.interpreters.partial_eval import JaxprTracer
+    except ImportError:
+        return False
+    while isinstance(x, Tracer) and not isinstance(x, JVPTracer) and hasattr(x, "val"):
+        x = x.val  # of a batch
+    return isinstance(x, JVPTracer) and not isinstance(x.tangent, JaxprTracer)
+
+
+def is_moved_forward_below(x: Any) -> bool:
+    """Whether a derivative of `x` is under way, and one in forward mode of that: `jax.hessian`."""
+    return is_moved_forward(getattr(x, "primal", None))
 
 
 def as_lowering(f: Callable[..., Any]) -> Callable[..., Any]:

@@ -56,6 +56,11 @@ def settings_for(
     default = 1e-8 if ts.dtype == jnp.float64 else 1e-5
     if isinstance(adjoint, str) and adjoint not in ADJOINTS:
         raise ValueError(f"adjoint is one of {', '.join(ADJOINTS)}, or a diffrax adjoint; got {adjoint!r}.")
+    if isinstance(adjoint, diffrax.BacksolveAdjoint):
+        raise ValueError(
+            "adjoint=BacksolveAdjoint() solves the motion backwards, without its events, inputs and samples: its "
+            'derivatives would be those of another motion. Use "reverse", or "forward" for few parameters.'
+        )
     for label, number in (("rtol", rtol), ("atol", atol), ("step", step)):
         if number is not None and not isinstance(number, Tracer):
             _check_number(label, number, lambda x: x > 0, "positive and finite")

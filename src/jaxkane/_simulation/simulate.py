@@ -13,6 +13,7 @@ from .._description.system import State, System
 from .._method.checks import check_state, check_system, is_concrete, with_possible_bodies
 from .._method.diagnose import diagnosis
 from .._scalars.types import Inputs
+from .modes import for_reverse_mode, goes_forward
 from .ride import inputs_at, solve
 from .settings import ADJOINTS, checked_state, checked_times, settings_for
 from .signals import as_signals, with_one_times
@@ -82,16 +83,12 @@ def simulate(
         max_steps=max_steps,
         progress=progress,
     )
-    shared = with_one_times(signals)
-    try:
-        ride = solve(system, state, ts, shared, settings)
-    except TypeError as error:  # as JAX says, too, that a derivative forward through the reverse adjoint is asked for
-        if adjoint != "auto":
-            raise
-        try:
-            ride = solve(system, state, ts, shared, dataclasses.replace(settings, adjoint=ADJOINTS["forward"]()))
-        except TypeError:
-            raise error from None
+    given = (system, state, ts, with_one_times(signals))
+    if adjoint == "auto" and goes_forward(given):
+        settings = dataclasses.replace(settings, adjoint=ADJOINTS["forward"]())
+    if isinstance(settings.adjoint, ADJOINTS["reverse"]):
+        given = for_reverse_mode(given)
+    ride = solve(*given, settings)
     if is_concrete(ride.status) and int(ride.status) == Status.NO_SOLUTION:
         inputs_now = inputs_at(system, signals, ts[0], state.q, state.u)
         raise ValueError(
@@ -100,4 +97,6 @@ def simulate(
     return ride
 
 
-_UNSOLVED = "{}: the solver cannot take a first step: accelerations or rates are not finite beside the first state."
+_UNSOLVED = (
+    "{}: the solver cannot take a first step: accelerations, rates or events are not finite beside the first state."
+)

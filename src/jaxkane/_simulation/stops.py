@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -53,6 +55,9 @@ class ToStops(diffrax.AbstractStepSizeController[Any, Any]):
     the step is taken back, and made anew to just beyond that time; so long, until the step that ends there is one that
     is right by the inner controller's measure. Two crossings within one step are seen where the cubic sees them.
 
+    A step behind which a quantity is no number is halved; where it is as short as the resolution, the motion ends
+    before it as one whose steps became too small, since whether the quantity passed zero cannot be said.
+
     A step over the bound is halved; where it is as short as the shortest, the motion ends before it. It also ends where
     the first step over the bound did, if shorter ones do not pass it: so near to it, what is found is by chance.
 
@@ -96,6 +101,7 @@ class ToStops(diffrax.AbstractStepSizeController[Any, Any]):
         )
         result = diffrax.RESULTS.where(found.again, diffrax.RESULTS.successful, result)
         result = diffrax.RESULTS.where(found.ends, diffrax.RESULTS.event_occurred, result)
+        result = diffrax.RESULTS.where(found.lost, diffrax.RESULTS.dt_min_reached, result)
         next_t0 = jnp.where(found.taken_back, t0, next_t0)
         next_t1 = jnp.where(found.again, found.end, next_t1)
         return keep & ~found.taken_back, next_t0, next_t1, jumped, state, result
@@ -108,11 +114,12 @@ class ToStops(diffrax.AbstractStepSizeController[Any, Any]):
 
 class _Decision(NamedTuple):
     """What becomes of a step: whether it is made `again`, to `end`; is `over` the bound; `ends` the motion; is
-    `taken_back`, for one of these. And the state of the controller that follows, as `Stopping` has it."""
+    `lost`, since a quantity is no number behind it; is `taken_back`, for one of these. And the state of the controller that follows, as `Stopping` has it."""
 
     again: Array
     over: Array
     ends: Array
+    lost: Array
     taken_back: Array
     end: Array
     start: Quantities
@@ -124,6 +131,9 @@ class _Decision(NamedTuple):
 def _decision(limits: Limits, start: Quantities, now: Quantities, t0, t1, which, last, kept) -> _Decision:
     # One function of scalars: as sixty operations it would be as many programs, and a third of XLA's work.
     h = t1 - t0
+    unknown = kept & functools.reduce(operator.or_, [x != x for x in now.values], jnp.array(False))
+    lost = unknown & (h <= limits.resolution)
+    kept &= ~unknown
     first, x = _first(limits, start, now, h)
     crossed = kept & (x <= 1)
     over = kept & (start.bound * now.bound < 0)
@@ -131,13 +141,14 @@ def _decision(limits: Limits, start: Quantities, now: Quantities, t0, t1, which,
     at_start = crossed & (x == 0) & ~over
     there = crossed & ((1 - x) * h <= limits.resolution) & ~over & ~at_start & ~at_bound
     at_start &= ~at_bound
-    again = (crossed | over) & ~there & ~at_start & ~at_bound
-    beyond = jnp.where(over, 0.5 * h, jnp.minimum(x, 1.0) * h + 0.5 * limits.resolution)
-    taken_back = again | at_start | at_bound
+    again = ((crossed | over) & ~there & ~at_start & ~at_bound) | (unknown & ~lost)
+    beyond = jnp.where(over | unknown, 0.5 * h, jnp.minimum(x, 1.0) * h + 0.5 * limits.resolution)
+    taken_back = again | at_start | at_bound | lost
     return _Decision(
         again=again,
         over=over,
         ends=there | at_start | at_bound,
+        lost=lost,
         taken_back=taken_back,
         end=t0 + beyond,
         start=_where(kept & ~taken_back, now, start),
@@ -149,7 +160,10 @@ def _decision(limits: Limits, start: Quantities, now: Quantities, t0, t1, which,
 def _first(limits: Limits, start: Quantities, now: Quantities, h: Array) -> tuple[Array, Array]:
     """Which quantity passes zero first in a step, and where in [0, 1]; infinite if none does."""
     direction = jnp.asarray(limits.directions, h.dtype)
-    x = first_crossing(start.values, h * start.rates, now.values, h * now.rates, direction)
+    # Where a quantity has no rate, as a norm at zero, the chord has to do.
+    chord = now.values - start.values
+    slopes = [jnp.where(jnp.abs(rates) < jnp.inf, h * rates, chord) for rates in (start.rates, now.rates)]
+    x = first_crossing(start.values, slopes[0], now.values, slopes[1], direction)
     # What is to vanish within a rounding error behind the step vanishes at its end.
     coming = (now.values * now.rates < 0) & (direction * now.rates >= 0)
     coming &= jnp.abs(now.values) <= jnp.abs(now.rates) * limits.rounding
