@@ -318,7 +318,8 @@ def test_the_first_crossing_of_cubics():
     p, direction = rng.normal(size=(300, 4)), rng.integers(-1, 2, size=300)
     p[::7, 3] = 0.0
     ends = (p[:, 3], p[:, 2], p.sum(1), 3 * p[:, 0] + 2 * p[:, 1] + p[:, 2], direction.astype(float))
-    found = np.asarray(jax.jit(first_crossing)(*map(jnp.asarray, ends)))
+    of_one = lambda *x: first_crossing(*(y[None] for y in x))[0]  # noqa: E731
+    found = np.asarray(jax.jit(jax.vmap(of_one))(*map(jnp.asarray, ends)))  # each of them is written out
     for coefficients, way, x in zip(p, direction, found):
         roots = np.roots(coefficients)
         roots = np.sort(roots[np.abs(roots.imag) < 1e-9].real)

@@ -113,8 +113,9 @@ class ToStops(diffrax.AbstractStepSizeController[Any, Any]):
 
 
 class _Decision(NamedTuple):
-    """What becomes of a step: whether it is made `again`, to `end`; is `over` the bound; `ends` the motion; is
-    `lost`, since a quantity is no number behind it; is `taken_back`, for one of these. And the state of the controller that follows, as `Stopping` has it."""
+    """What becomes of a step: whether it is made `again`, to `end`; is `over` the bound; `ends` the motion; is `lost`,
+    since a quantity is no number behind it; is `taken_back`, for one of these. And the state of the controller that
+    follows, as `Stopping` has it."""
 
     again: Array
     over: Array
