@@ -109,11 +109,10 @@ def test_a_batch_is_what_its_members_are(n):
     """Whether by QR or by LAPACK, with one leading axis or two, in single precision too."""
     A = np.random.default_rng(n).standard_normal((2, CHUNK + 4, n, n))
     single = np.stack([np.linalg.eigvals(a) for a in A[0, :10]])
-    for found, tolerance in (
-        (jax.jit(eigvals)(A)[0], 1e-12),
-        (jax.vmap(lambda a: eig(a).values)(A[0, :10]), 1e-12),
-        (eigvals(jnp.asarray(A[0], jnp.float32)), 1e-4),
-    ):
+    ways = [(jax.jit(eigvals)(A)[0], 1e-12), (jax.vmap(lambda a: eig(a).values)(A[0, :10]), 1e-12)]
+    if n in (3, 7):  # one of each way
+        ways.append((eigvals(jnp.asarray(A[0], jnp.float32)), 1e-4))
+    for found, tolerance in ways:
         far = np.abs(np.asarray(found)[:10, :, None] - single[:, None, :]).min(axis=1).max(axis=1)
         assert (far < tolerance * np.abs(single).max(axis=1)).all()
     np.testing.assert_allclose(eigvals(A[0, 0]), single[0])

@@ -61,7 +61,8 @@ def simulate(
     **Returns:** a `Trajectory`. A motion that cannot go on ends early, with its reason in `status`.
 
     **Raises:** `ValueError` for wrong shapes or times, an unknown input, coordinates that violate a constraint, a
-    description that contradicts itself, or equations without a finite solution at the first state.
+    description that contradicts itself, or equations without a finite solution at the first state. `TypeError` for a
+    derivative in forward mode through a motion for reverse mode, as in `jax.jacfwd(jax.jit(f))` with "auto".
     """
     state = checked_state(system, state)
     ts = checked_times(ts, state.q.dtype)

@@ -72,7 +72,9 @@ def _sympy() -> Any:
         import sympy  # pyright: ignore[reportMissingImports]
         import sympy.physics.mechanics  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        raise ImportError("Models of SymPy need SymPy: `pip install sympy`, or `pip install 'jaxkane[symbolic]'`.") from error
+        raise ImportError(
+            "Models of SymPy need SymPy: `pip install sympy`, or `pip install 'jaxkane[symbolic]'`."
+        ) from error
     return sympy
 
 
