@@ -5,6 +5,7 @@ import json
 import sys
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -37,6 +38,12 @@ LOOP = """<mujoco model="fourbar"><option><flag contact="disable"/></option><wor
 </worldbody><equality><connect name="pin" body1="b" body2="c" anchor="0.5 0 0.1"/></equality></mujoco>"""
 
 BODY = '<body name="a"><joint name="j" axis="0 1 0"{}/><geom size=".1" mass="1"/></body>'
+
+
+@pytest.fixture(autouse=True)
+def in_a_folder_of_its_own(tmp_path, monkeypatch):
+    """MuJoCo writes a log of what it does not read where it is called."""
+    monkeypatch.chdir(tmp_path)
 
 
 def mjcf(body, rest=""):
@@ -209,6 +216,30 @@ def test_a_file_that_is_no_mechanism(text, words):
 
 
 @needs_mujoco
+def test_what_a_file_switches_off_is_off():
+    two = BODY.format(' stiffness="2" damping="1"') + BODY.replace('"a"', '"b"').replace('"j"', '"k"').format("")
+    rest = '<equality><joint joint1="k" joint2="j"/></equality><actuator><motor joint="j"/></actuator>'
+    flags = " ".join(f'{what}="disable"' for what in "contact gravity spring damper actuation equality".split())
+    system = jk.convert.from_mjcf(mjcf(two, f"<option><flag {flags}/></option>{rest}"), strict=True)
+    assert type(system).__name__ == "Mechanism"
+    there = system.stiffness, system.damping, system.gravity, system.inputs, system.dependent_speeds
+    assert not any(there)
+    with pytest.warns(UserWarning, match="contacts"):
+        on = jk.convert.from_mjcf(mjcf(two, rest))
+    assert on.stiffness
+    assert on.damping
+    assert on.gravity
+    assert on.inputs
+    assert on.dependent_speeds == ("k_rate",)
+
+
+@needs_mujoco
+def test_a_file_that_is_not_there():
+    with pytest.raises(FileNotFoundError, match=r"no file 'nowhere.xml'"):
+        jk.convert.from_mjcf("nowhere.xml")
+
+
+@needs_mujoco
 def test_a_urdf_that_is_none():
     with pytest.raises(ValueError, match="no URDF"):
         jk.convert.from_urdf("<robot><link>")
@@ -220,8 +251,6 @@ def test_a_urdf_that_is_none():
 
 @needs_mujoco
 def test_a_mass_that_was_brought_over_has_a_derivative():
-    import jax
-
     system = jk.convert.from_mjcf(FIGURES["model"])
     q, u = (jnp.array(FIGURES["states"][0][x]) for x in ("q", "u"))
     alpha = lambda m: jk.accelerations(system.replace({"mass.hand": m}), 0.0, q, u)[6]  # noqa: E731

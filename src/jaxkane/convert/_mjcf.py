@@ -95,6 +95,8 @@ def _text(model: Path) -> str:
 
 
 def _compiled(mujoco: Any, model: Path) -> Any:
+    if not _is_text(model) and not os.path.exists(model):
+        raise FileNotFoundError(f"There is no file {os.fspath(model)!r}. The text of a model begins with '<'.")
     try:
         spec = mujoco.MjSpec.from_string(model) if _is_text(model) else mujoco.MjSpec.from_file(os.fspath(model))
         spec.compiler.fusestatic = False
@@ -112,12 +114,17 @@ class _Reader:
         self.name = name or _model_name(model) or "Mechanism"
         self.left_out: list[str] = []
         self.gravity: Any = [float(x) for x in model.opt.gravity]
-        if int(model.opt.disableflags) & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY):
+        if self._is_off("GRAVITY"):
             self.gravity = (0.0, 0.0, 0.0)
         self.bodies = self._names("body", model.nbody)
         self.joints = self._names("joint", model.njnt)
         self.sites: list[Site] = []
         self.loops: list[Loop | Coupling] = []
+
+    def _is_off(self, *flags: str) -> bool:
+        """Whether the model disables one of these; not every version has each."""
+        bits = [int(getattr(self.kinds.mjtDisableBit, f"mjDSBL_{flag}", 0)) for flag in flags]
+        return any(int(self.m.opt.disableflags) & bit for bit in bits)
 
     def _names(self, kind: str, n: int) -> list[str]:
         found: list[str] = []
@@ -186,9 +193,9 @@ class _Reader:
         m, kind, name = self.m, self.m.jnt_type[j], self.joints[j]
         dof, place = int(m.jnt_dofadr[j]), int(m.jnt_qposadr[j])
         common = {
-            "damping": float(m.dof_damping[dof]),
+            "damping": 0.0 if self._is_off("DAMPER", "PASSIVE") else float(m.dof_damping[dof]),
             "armature": float(m.dof_armature[dof]),
-            "stiffness": float(m.jnt_stiffness[j]),
+            "stiffness": 0.0 if self._is_off("SPRING", "PASSIVE") else float(m.jnt_stiffness[j]),
         }
         types = self.kinds.mjtJoint
         if kind in (int(types.mjJNT_HINGE), int(types.mjJNT_SLIDE)):
@@ -212,7 +219,7 @@ class _Reader:
         for j, name in enumerate(self.joints):
             if m.jnt_type[j] in (int(kinds.mjtJoint.mjJNT_HINGE), int(kinds.mjtJoint.mjJNT_SLIDE)):
                 taken.add(f"{name}_rate")
-        for i in range(int(m.nu)):
+        for i in range(0 if self._is_off("ACTUATION") else int(m.nu)):
             own = m.actuator(i).name or f"actuator{i}"
             why = self._why_not(i)
             if why:
@@ -262,7 +269,7 @@ class _Reader:
 
     def _read_equalities(self, taken: set[str]) -> None:
         m, kinds = self.m, self.kinds.mjtEq
-        for i in range(m.neq):
+        for i in range(0 if self._is_off("EQUALITY", "CONSTRAINT") else m.neq):
             kind, data = m.eq_type[i], m.eq_data[i]
             name = m.eq(i).name.replace(".", "_") or f"equality{i}"
             if not m.eq_active0[i]:
@@ -303,13 +310,12 @@ class _Reader:
         """What else is in the model and changes its motion."""
         m = self.m
         collides = np.any(m.geom_contype != 0) and np.any(m.geom_conaffinity != 0)
-        disabled = int(m.opt.disableflags)
-        off = lambda bit: bool(disabled & int(getattr(self.kinds.mjtDisableBit, bit, 0)))  # noqa: E731
+        off = lambda flag: self._is_off(flag, "CONSTRAINT")  # noqa: E731
         has = lambda name: bool(np.any(getattr(m, name, 0)))  # noqa: E731 (older versions lack some)
         found = {
-            "contacts": (collides or m.npair > 0) and not off("mjDSBL_CONTACT"),
-            "limits of joints": has("jnt_limited") and not off("mjDSBL_LIMIT"),
-            "friction of joints": has("dof_frictionloss") and not off("mjDSBL_FRICTIONLOSS"),
+            "contacts": (collides or m.npair > 0) and not off("CONTACT"),
+            "limits of joints": has("jnt_limited") and not off("LIMIT"),
+            "friction of joints": has("dof_frictionloss") and not off("FRICTIONLOSS"),
             "tendons": m.ntendon > 0,
             "damping or stiffness that is not linear": any(has(n) for n in ("dof_dampingpoly", "jnt_stiffnesspoly")),
             "springs that yield": getattr(m, "nplastic", 0) > 0,
@@ -323,7 +329,8 @@ class _Reader:
 
 
 def _model_name(model: Any) -> str:
-    return bytes(model.names[:200]).split(b"\0", 1)[0].decode("utf-8", "replace")
+    name = bytes(model.names[:200]).split(b"\0", 1)[0].decode("utf-8", "replace")
+    return "" if name == "MuJoCo Model" else name  # which is that of a file without one
 
 
 def _other(name: str, taken: Any, ending: str) -> str:
@@ -384,7 +391,8 @@ def _for_mujoco(text: str, floating: bool) -> str:
         _turn_back(inertial)
     if floating or roots[0] != "world":
         if "world" in links:
-            raise ValueError(f"The link 'world' is not the root, which is {roots[0]!r}: call it otherwise.")
+            why = "is the ground: leave out floating=True" if roots[0] == "world" else "is not the root: rename it"
+            raise ValueError(f"The link 'world' of a URDF {why}.")
         ElementTree.SubElement(robot, "link", name="world")
         joint = ElementTree.SubElement(robot, "joint", name="root", type="floating" if floating else "fixed")
         ElementTree.SubElement(joint, "parent", link="world")
