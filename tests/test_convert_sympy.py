@@ -266,6 +266,29 @@ def test_what_a_model_does_not_say_is_named(me):
         jk.convert.from_sympy(q.diff() - u, {})
 
 
+def test_functions_are_those_of_sympy_or_refused_by_name(me):
+    import sympy as sm
+
+    q, u, m = *me.dynamicsymbols("q u"), sm.symbols("m")
+    N, P = me.ReferenceFrame("N"), me.Point("P")
+    P.set_vel(N, u * N.x)
+    make = lambda force: me.KanesMethod(  # noqa: E731
+        N, [q], [u], [q.diff() - u], bodies=[me.Particle("p", P, m)], forcelist=[(P, force * N.x)]
+    )
+    force = sm.Piecewise((-q, sm.And(q > 1, u > 0)), (2 * q, sm.Or(q > 0, u > 5)), (0, True)) + sm.Max(q, u, 0)
+    force += sm.Abs(-q) * sm.sign(u) + sm.atan2(q, u) / sm.sqrt(q) + q ** sm.Rational(3, 2) + 10**20 * q / u**2 + sm.pi
+    system = jk.convert.from_sympy(make(force), {m: sm.Rational(3, 2)})
+    expected = float(force.subs({q: 0.3, u: 0.2})) / 1.5
+    np.testing.assert_allclose(jk.accelerations(system, 0.0, [0.3], [0.2]), [expected], rtol=1e-14)
+    for bad, words in (
+        (sm.gamma(q), "gamma has no counterpart"),
+        (sm.Heaviside(q), "Heaviside has no counterpart"),
+        (sm.Symbol("m", positive=True) * q, "two symbols are called m"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            jk.convert.from_sympy(make(bad), {m: 1.0})
+
+
 def test_without_sympy_the_remedy_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "sympy", None)
     with pytest.raises(ImportError, match="pip install sympy"):

@@ -366,22 +366,35 @@ class _Taker:
         """Inputs, and constants, in the order of their names."""
         words, name = self.words, self.words.name
         known = {*words.q, *words.u, *words.u_dep, *words.u_aux}
-        atoms = lambda kind, among: {x for e in among for x in e.atoms(kind)}  # noqa: E731
-        derivatives = atoms(self.sympy.Derivative, (*self.of_motion, *self.of_loads))
+        atoms = lambda kind, among: {x for e in among for x in e.atoms(*kind)}  # noqa: E731
+        derivatives = atoms([self.sympy.Derivative], (*self.of_motion, *self.of_loads))
         if derivatives:
             raise ValueError(f"{name}: {_listed(derivatives)} follows from no kinematic equation of the model.")
         applied = self.sympy.core.function.AppliedUndef
-        foreign = atoms(applied, self.of_motion) - known
+        unknown = {
+            x.func.__name__
+            for x in atoms([self.sympy.Function, self.sympy.Integral], (*self.of_motion, *self.of_loads))
+            if not isinstance(x, applied) and x.func.__name__ not in (*_FUNCTIONS, "Piecewise")
+        }
+        if unknown:
+            raise ValueError(f"{name}: {_listed(unknown)} has no counterpart here: write it by other functions.")
+        foreign = atoms([applied], self.of_motion) - known
         if foreign:
             raise ValueError(
                 f"{name}: {_listed(foreign)} in the motion is neither coordinate nor speed. What is prescribed in time "
                 "is written as an expression of time; an input stands in loads alone."
             )
-        inputs = sorted(atoms(applied, self.of_loads) - known, key=str)
+        inputs = sorted(atoms([applied], self.of_loads) - known, key=str)
         odd = [x for x in inputs if tuple(x.args) != (self.t,)]
         if odd:
             raise ValueError(f"{name}: {_listed(odd)} is a function of something else than time.")
         symbols = {x for e in (*self.of_motion, *self.of_loads) for x in e.free_symbols} - {self.t}
+        names = [str(x) for x in symbols]
+        twice = {name for name in names if names.count(name) > 1}
+        if twice:
+            raise ValueError(
+                f"{name}: two symbols are called {_listed(twice)}, with other assumptions (as positive=True): make one."
+            )
         return tuple(inputs), tuple(sorted(symbols, key=str))
 
 
@@ -395,7 +408,7 @@ def _listed(things: Any) -> str:
 
 def _values(taker: _Taker, plan: Plan, parameters: Mapping[Any, Any]) -> dict[str, Any]:
     given = {str(symbol): value for symbol, value in parameters.items()}
-    names = list(dict.fromkeys(str(symbol) for symbol in plan.constants))
+    names = [str(symbol) for symbol in plan.constants]
     missing = [name for name in names if name not in given]
     if missing:
         raise ValueError(f"{plan.name}: no value for {', '.join(missing)}: `parameters` gives every symbol a number.")
@@ -408,7 +421,8 @@ def _values(taker: _Taker, plan: Plan, parameters: Mapping[Any, Any]) -> dict[st
             f"{plan.name}: a parameter cannot be called {taken[0]!r}, which a system has, or which holds a dot: give "
             "the symbol another name, by `subs` before."
         )
-    return {name: given[name] for name in names}
+    basic = taker.sympy.Basic
+    return {name: float(given[name]) if isinstance(given[name], basic) else given[name] for name in names}
 
 
 # The system.
@@ -515,6 +529,8 @@ def _vector(frames: Sequence[Frame], values: Sequence[Any], plan: VectorPlan) ->
 
 _FUNCTIONS = {
     "Abs": jnp.abs,
+    "Max": lambda *xs: functools.reduce(jnp.maximum, xs),
+    "Min": lambda *xs: functools.reduce(jnp.minimum, xs),
     "acos": jnp.arccos,
     "acosh": jnp.arccosh,
     "asin": jnp.arcsin,
@@ -562,6 +578,26 @@ def _printer() -> Any:
         def _print_Mul(self, expr: Any) -> str:
             return self.call("_product", expr)
 
+        def _print_Integer(self, expr: Any) -> str:
+            return repr(float(expr))  # exact ones and zeros are dropped where they are floats
+
+        _print_One = _print_Zero = _print_NegativeOne = _print_Integer
+
+        def _print_Pow(self, expr: Any, rational: bool = False) -> str:
+            base, exponent = (self._print(x) for x in expr.args)
+            if expr.exp.is_Integer:
+                return f"({base})**({int(expr.exp)})"
+            return f"sqrt({base})" if expr.exp == _sympy().S.Half else f"({base})**({exponent})"
+
+        def _print_And(self, expr: Any) -> str:
+            return self.call("_both", expr)
+
+        def _print_Or(self, expr: Any) -> str:
+            return self.call("_either", expr)
+
+        def _print_Not(self, expr: Any) -> str:
+            return self.call("_not", expr)
+
         def _print_Piecewise(self, expr: Any) -> str:
             value = "nan"
             for x, condition in reversed(expr.args):
@@ -573,9 +609,6 @@ def _printer() -> Any:
 
         def _print_known(self, expr: Any) -> str:
             return self.call(expr.func.__name__, expr)
-
-        def _print_Function(self, expr: Any) -> str:
-            raise ValueError(f"from_sympy: the function {expr.func.__name__} has no counterpart here.")
 
     for name in _FUNCTIONS:
         setattr(Printer, f"_print_{name}", Printer._print_known)
@@ -590,7 +623,15 @@ def _product(*factors: Component) -> Component:
     return functools.reduce(mul, factors)
 
 
-_ARITHMETIC = {"_sum": _sum, "_product": _product, "_where": jnp.where, "nan": float("nan")}
+_ARITHMETIC = {
+    "_sum": _sum,
+    "_product": _product,
+    "_where": jnp.where,
+    "_both": lambda *conditions: functools.reduce(jnp.logical_and, conditions),
+    "_either": lambda *conditions: functools.reduce(jnp.logical_or, conditions),
+    "_not": jnp.logical_not,
+    "nan": float("nan"),
+}
 
 
 @functools.lru_cache(maxsize=100)
