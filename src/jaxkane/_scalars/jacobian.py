@@ -15,7 +15,7 @@ import numpy as np
 
 from .fuse import without_repetition
 from .graph import Graph, applied, as_constants
-from .jax_internals import ClosedJaxpr, Literal, jaxpr_as_fun
+from .jax_internals import ClosedJaxpr, Literal, jaxpr_as_fun, types_of
 
 Direction = tuple[int, int]  # an argument and the place of the element in it
 
@@ -48,16 +48,17 @@ def jacobian(
                 along[v].flat[element] = graph.constant(1.0, str(aval.dtype))
         for equation in later:
             along.update(zip(equation.outvars, _outputs(equation, along, moves), strict=True))
-        columns.append([moves.instantiated(_read(v, along, moves), str(v.aval.dtype)) for v in jaxpr.outvars])
+        read = [_read(v, along, moves) for v in jaxpr.outvars]
+        columns.append([moves.instantiated(x, str(a.dtype)) for x, a in zip(read, types_of(program)[1], strict=True)])
     return [
         np.stack([column[i] for column in columns], axis=-1) if columns else np.zeros((*aval.shape, 0), np.int64)
-        for i, aval in enumerate(list(program.out_avals))
+        for i, aval in enumerate(types_of(program)[1])
     ]
 
 
 def _tangents(program: ClosedJaxpr, moving: Sequence[int]) -> tuple[ClosedJaxpr, list[Any]]:
     """(inputs, tangents of those that move) -> tangents of the outputs."""
-    specs = [jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type) for a in program.in_avals]
+    specs = [jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type) for a in types_of(program)[0]]
     evaluate = jaxpr_as_fun(program)
 
     def tangents(xs, dxs):

@@ -37,6 +37,11 @@ except ImportError as error:
     jaxpr_as_fun = dce_jaxpr = instantiate_zeros = is_undefined_primal = ad = batching = mlir = missing
 
 
+def types_of(program: Any) -> tuple[list[Any], list[Any]]:
+    """Shapes and dtypes of what a program takes and gives; JAX 0.12 declares them as types without either."""
+    return [*program.in_avals], [*program.out_avals]
+
+
 def new_primitive(
     name: str,
     *,

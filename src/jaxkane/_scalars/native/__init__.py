@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import ctypes
 import functools
-from typing import Any
 
 import jax
 import numpy as np
 
 from ..graph import LIBRARY, Graph, NotScalarError, symbol, unrolled
-from ..jax_internals import ClosedJaxpr
+from ..jax_internals import ClosedJaxpr, types_of
 from .available import is_on, is_wanted, machine, tell, use, why_not
 from .handler import handler_text
 from .llvm import Writer
@@ -34,8 +33,7 @@ class Scalars:
 
     def __init__(self, program: ClosedJaxpr):
         self.graph, inputs = Graph(), []
-        taken: list[Any] = [*program.in_avals]  # `AbstractValue`s without a shape, to the types of JAX 0.12
-        given: list[Any] = [*program.out_avals]
+        taken, given = types_of(program)
         for i, aval in enumerate(taken):
             elements = [self.graph.add("input", (i, e, aval.size), str(aval.dtype)) for e in range(aval.size)]
             inputs.append(np.array(elements, np.int64).reshape(aval.shape))
