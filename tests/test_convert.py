@@ -136,6 +136,37 @@ def test_a_loop_is_closed_rigidly():
 
 
 @needs_mujoco
+@pytest.mark.parametrize(
+    "equality",
+    [
+        '<weld body1="a" body2="b"/>',
+        '<weld body1="b" body2="a" anchor="0.1 0.2 0.3"/>',
+        '<connect body1="a" body2="b" anchor="0.1 0.2 0.3"/>',
+        '<connect body1="a" anchor="0.1 0.2 0.3"/>',
+        '<weld site1="s" site2="s2"/>',
+    ],
+)
+def test_a_loop_is_closed_where_the_file_places_its_bodies(equality):
+    """At qpos0 the bodies meet every equality, as MuJoCo's compiler makes it."""
+    import mujoco
+
+    bodies = '<body name="{}" pos="{}" euler="{}"><freejoint name="{}"/><geom size=".1" mass="1"/>{}</body>'
+    one = bodies.format("a", "0.1 0.2 0.3", "20 30 40", "f", '<site name="s" pos="0 0 .1"/>')
+    # the second site stands where the first does, so that the two may be welded
+    two = bodies.format("b", "0.1 0.2 0.3", "20 30 40", "g", '<site name="s2" pos="0 0 .1"/>')
+    if "site" not in equality:
+        two = bodies.format("b", "-0.3 0.5 1", "-50 10 70", "g", "")
+    text = mjcf(one + two, f"<option><flag contact='disable'/></option><equality>{equality}</equality>")
+    system = jk.convert.from_mjcf(text)
+    qpos = mujoco.MjModel.from_xml_string(text).qpos0.reshape(2, 7)
+    q = np.concatenate([qpos[:, :3], np.roll(qpos[:, 3:], -1, axis=1)], axis=1).ravel()
+    residuals = np.array([float(x) for x in system.configuration_constraints(0.0, q)])
+    assert len(residuals) == (6 if "weld" in equality else 3) + 2  # and two norms
+    np.testing.assert_allclose(residuals, 0.0, atol=1e-14)
+    assert np.abs(system.configuration_constraints(0.0, q + 0.01)[0]) > 1e-4
+
+
+@needs_mujoco
 def test_joints_that_follow_others():
     hinge = '<link name="{0}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="{1}" ixy="0" ixz="0" iyz="0"/>'
     hinge += '</inertial></link><joint name="j{0}" type="revolute"><parent link="base"/><child link="{0}"/>'
