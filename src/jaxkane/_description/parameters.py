@@ -45,7 +45,7 @@ def parameter(
 
 @dataclasses.dataclass(frozen=True)
 class ParameterInfo:
-    """What `parameter` was told: whether the value must be positive, the shape of one value, and its unit."""
+    """What `parameter` was given: whether the value must be positive, the shape of one value, and its unit."""
 
     positive: bool
     shape: tuple[int, ...]
@@ -120,7 +120,7 @@ def leaf_name(path: tuple[Any, ...]) -> str:
 
 
 def declared(system: Any, path: tuple[Any, ...]) -> ParameterInfo:
-    """What `parameter` was told of the field that holds this leaf."""
+    """What `parameter` was given of the field that holds this leaf."""
     found = _UNDECLARED
     for key in path:
         if isinstance(key, jax.tree_util.GetAttrKey):

@@ -37,7 +37,7 @@ def units_of(system: System) -> dict[str, str]:
 
 
 def in_degrees(unit: str) -> bool:
-    """Whether a unit can be told in degrees."""
+    """Whether a unit can be shown in degrees."""
     return unit in ("rad", "rad/s", "rad/s^2")
 
 

@@ -36,7 +36,7 @@ def assemble(
 
     **Arguments:**
 
-    - `q` (n_q,), or a dict by name. What is held, and a first guess of what is moved. Coordinates left out of a dict
+    - `q` (n_q,), or a dict by name. What is held, and an initial guess of what is moved. Coordinates left out of a dict
         start at zero; of four Euler parameters the last starts at one, so that those left out are no rotation.
     - `u` (n_u,), or a dict by name in which speeds left out are zero: the independent speeds. Dependent speeds may be
         given too, and are then compared with what the residuals say.
@@ -179,9 +179,9 @@ def _newton(system: System, q0, t, where: tuple[int, ...], lenient: bool) -> _Fo
     # What is not finite must not enter the linear solver, which would raise for all members of a batch.
     finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((system, q0))]))
     system, q0 = jax.tree.map(lambda x: jnp.where(finite, x, jnp.ones_like(x)), (system, q0))
-    start, settled = _start(system, q0, t, places)
-    settled = settled & lenient
-    n_h = len(settled)
+    start, already_met = _start(system, q0, t, places)
+    already_met = already_met & lenient
+    n_h = len(already_met)
     if len(places) == n_h and not lenient:
         directions = jnp.eye(n_h, dtype=q0.dtype)
     else:  # (h, moved): along the constraints' gradients only
@@ -190,7 +190,7 @@ def _newton(system: System, q0, t, where: tuple[int, ...], lenient: bool) -> _Fo
     def residual(amount, args):
         system, t, start, directions = args
         h = configuration_residual(system, t, start.at[places].add(amount @ directions))
-        return jnp.where(settled, amount, h)
+        return jnp.where(already_met, amount, h)
 
     eps = float(jnp.finfo(q0.dtype).eps)
     newton = optx.Newton(rtol=8 * eps, atol=8 * eps)
@@ -206,7 +206,7 @@ def _newton(system: System, q0, t, where: tuple[int, ...], lenient: bool) -> _Fo
 
 
 def _start(system: System, q0, t, places: np.ndarray):
-    """The first guess (n_q,), and which constraints (h,) are met already and read nothing of what is moved.
+    """The initial guess (n_q,), and which constraints (h,) are met already and read nothing of what is moved.
 
     Where the slopes of the constraints depend on each other and the residuals contradict that, as for two rods in
     line, Newton's method knows no direction: then it starts beside the guess, in what these constraints read.

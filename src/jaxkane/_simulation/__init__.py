@@ -1,1 +1,1 @@
-"""Motion over time: inputs, steps, events, trajectories, and what can be told of them afterwards."""
+"""Motion over time: inputs, steps, events, trajectories, and what is asked of them afterwards."""

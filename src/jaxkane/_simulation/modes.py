@@ -1,4 +1,4 @@
-"""In which mode a motion is differentiated: found out where JAX lets it be seen, and told where it comes too late.
+"""In which mode a motion is differentiated: found out where JAX lets it be seen, and said where it comes too late.
 
 Knows JAX; knows no motions.
 """

@@ -26,7 +26,7 @@ ADJOINTS = {
 
 
 class Settings(eqx.Module):
-    """How to integrate: what `simulate` was told, with its defaults filled in."""
+    """How to integrate: what `simulate` was given, with its defaults filled in."""
 
     rtol: float = eqx.field(static=True)
     atol: float = eqx.field(static=True)

@@ -90,9 +90,9 @@ class Trajectory(eqx.Module):
         if isinstance(self.status, Tracer) or np.ndim(self.status) > 0:
             return f"Trajectory(shape={self.t.shape})"
         steps = int(self.stats["steps"])
-        told = f"Trajectory({self.t.shape[-1]} times to {float(self.t_end):.6g} s in {steps} steps: {self.reason})"
+        text = f"Trajectory({self.t.shape[-1]} times to {float(self.t_end):.6g} s in {steps} steps: {self.reason})"
         advice = _advice(int(self.status), self.reason)
-        return f"{told}. {advice}" if advice else told
+        return f"{text}. {advice}" if advice else text
 
 
 def reason(code: int, events: tuple[str, ...]) -> str:

@@ -58,9 +58,9 @@ def trajectories(
         shown = []
         for name in group:
             y, unit = _in_unit(values[name], known[name], degrees)
-            told = [part for part in (name if len(group) > 1 else "", label) if part]
+            parts = [part for part in (name if len(group) > 1 else "", label) if part]
             y = y.reshape(n, -1)
-            line = ax.plot(t[0], y[0], label=", ".join(told) or None, **members | style)[0]
+            line = ax.plot(t[0], y[0], label=", ".join(parts) or None, **members | style)[0]
             ax.plot(t[1:].T, y[1:].T, **members | style | {"color": line.get_color()})
             _mark_ends(ax, trajectory, t, y, line.get_color())
             shown.append((name, unit))

@@ -87,7 +87,7 @@ def steady_turn(
 
     **Arguments:**
 
-    - `q` (n_q,), `u` (n_u,): a first guess, or dicts by name in which what is left out is zero.
+    - `q` (n_q,), `u` (n_u,): an initial guess, or dicts by name in which what is left out is zero.
     - `inputs`: numbers by name; those left out are zero.
     - `hold`: what is to have a given value: names of coordinates and speeds (dependent ones too), kept at the guess;
         or a dict of names and values. Steady motions come in families; hold as many quantities as the family has
