@@ -15,8 +15,8 @@ Run:      python examples/draw_catalogue.py [--out FOLDER] [--each]
 Appears:  a line for each simulation; catalogue.png: a panel for each system with its name and its place in the book
           (Kamman, Volume II, Unit 5); and catalogue/NAME.html, an animation of each. With --each, also NAME.png for
           each system. The aircraft are drawn ten times too large for the way they fly; what a description leaves open
-          (the length of a column, the rider's back) is drawn as seems likely. Red, green and blue are a body's axes 1, 2
-          and 3; a system that is not in the table `PICTURES` is drawn as `jaxkane.animate` draws it.
+          (the length of a column, the rider's back) is drawn as seems likely. Red, green and blue are a body's axes
+          1, 2 and 3; a system that is not in the table `PICTURES` is drawn as `jaxkane.animate` draws it.
 Takes:    less than a minute, most of it compilation.
 """
 

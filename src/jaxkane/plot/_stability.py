@@ -46,8 +46,8 @@ def eigenvalues(
         ax.plot(x, column.real, color=colors[name], label=name or "real part")
         swings = np.where(np.abs(column.imag) > 1e-9, column.imag, np.nan)
         if np.isfinite(swings).any() and np.nanmax(swings) > 0:
-            told = f"{name}, imaginary" if name else "imaginary part"
-            ax.plot(x, np.where(swings > 0, swings, np.nan), ":", color=colors[name], linewidth=1.2, label=told)
+            label = f"{name}, imaginary" if name else "imaginary part"
+            ax.plot(x, np.where(swings > 0, swings, np.nan), ":", color=colors[name], linewidth=1.2, label=label)
     for border in borders:
         ax.annotate(f"{border:.3g}", (border, low), xytext=(2, 3), textcoords="offset points", fontsize="small")
     ax.set(xlabel=xlabel, ylabel="eigenvalues [1/s]", xlim=(x[0], x[-1]), ylim=(low, high))
