@@ -205,6 +205,23 @@ def test_what_is_left_out_is_said():
 
 
 @needs_mujoco
+def test_groups_of_actuators_that_are_switched_off_are_off():
+    motors = "".join(f'<motor name="m{i}" joint="j" group="{i}"/>' for i in (0, 2, 3))
+    off = '<option actuatorgroupdisable="0 3"><flag contact="disable"/></option>'
+    system = jk.convert.from_mjcf(mjcf(BODY.format(""), f"{off}<actuator>{motors}</actuator>"), strict=True)
+    assert system.inputs == ("m2",)
+
+
+@needs_mujoco
+def test_limits_of_what_actuators_do_to_a_joint_are_said():
+    limited = BODY.format(' actuatorfrcrange="-0.1 0.1" actuatorfrclimited="true"').replace(
+        "<geom ", '<geom contype="0" '
+    )
+    with pytest.warns(UserWarning, match="limits of controls and forces"):
+        jk.convert.from_mjcf(mjcf(limited))
+
+
+@needs_mujoco
 def test_names_that_clash_or_are_missing():
     off = "<option><flag contact='disable'/></option>"
     text = mjcf(

@@ -153,7 +153,7 @@ def test_a_spring_on_a_ball_joint_is_smooth_where_it_rests_and_takes_the_shorter
 # Loops
 
 
-def four_bar(**more):
+def four_bar(across=0.0, **more):
     p = FOUR_BAR["params"]
     rod = lambda l: {  # noqa: E731
         "mass": p["rho"] * l,
@@ -165,7 +165,7 @@ def four_bar(**more):
         Link("l3", "l2", hinge("q2"), (p["l2"], 0, 0), **rod(p["l3"])),
         Link("l4", "l3", hinge("q3"), (p["l3"], 0, 0), **rod(p["l4"])),
     ]
-    sites = [Site("ground", None), Site("end", "l4", (p["l4"], 0, 0))]
+    sites = [Site("ground", None), Site("end", "l4", (p["l4"], 0, across))]
     return mechanism(links, gravity=(0, 0, 0), sites=sites, loops=[Loop("ground", "end")], **more)
 
 
@@ -187,6 +187,11 @@ def test_what_is_dependent_is_found_and_may_be_assembled():
     guess = np.array([state["q"][c] + (0.0 if c == held else 0.05) for c in system.coordinates])
     found = jk.assemble(system, guess, [0.3])
     np.testing.assert_allclose(found.q, [state["q"][c] for c in system.coordinates], rtol=1e-10)
+
+
+def test_a_loop_in_a_plane_that_ends_beside_its_beginning_is_refused():
+    with pytest.raises(ValueError, match=r"Loop\('ground', 'end'\) can never hold: it stays off by 0.1 "):
+        four_bar(across=0.1)
 
 
 @pytest.mark.slow
@@ -292,11 +297,38 @@ def test_a_mechanism_may_be_made_of_traced_numbers():
         ([Link("a", None, hinge("h"), **BAR), Link("b", "a", free("f"), **BAR)], {}, "'b' is free of its parent"),
         ([Link("a", None, hinge("h"), **BAR)], {"actuators": [Actuator("h", "h")]}, "'h' stands in `coordinates` and"),
         ([Link("a", None, hinge("h"))], {}, "no link.*has a mass"),
+        ([Link("a", mass=1.0)], {}, "no link has a joint"),
+        ([Link("a", None, hinge("h"), mass=1, inertia=((1, 0), (0, 1), (0, 0)))], {}, "inertia of 'a'"),
+        ([Link("a", None, hinge("h"), mass=1, inertia=jnp.eye(3) + jnp.eye(3, k=1))], {}, "not symmetric: 1.0 and 0.0"),
+        ([Link("a", None, hinge("h"), mass=1, inertia=np.eye(3, dtype=int) + np.eye(3, k=1))], {}, "not symmetric"),
+        ([Link("a", None, hinge("h"), **BAR)], {"loops": [Coupling(None, "h")]}, "hinges and sliders; None is none"),
+        (
+            [Link("a", None, hinge("h"), **BAR)],
+            {"sites": [Site("s", "a")], "loops": [Loop("s", "s")]},
+            r"Loop\('s', 's'\).*name two",
+        ),
+        (
+            [Link("a", None, hinge("h"), **BAR)],
+            {"sites": [Site("s", "a"), Site("t", "a", (0, 0, 0.5))], "loops": [Loop("s", "t")]},
+            r"Loop\('s', 't'\) can never hold: it stays off by 0.5",
+        ),
+        (
+            [Link("a", None, hinge("h"), **BAR), Link("b", None, hinge("k"), **BAR)],
+            {"loops": [Coupling("k", "h", (0.0, -3.0)), Coupling("k", "h", (0.2, -3.0))]},
+            r"Coupling\('k', 'h'\) can never hold: it stays off by 0.2",
+        ),
     ],
 )
 def test_what_is_wrong_is_named(links, more, words):
     with pytest.raises(ValueError, match=words):
         mechanism(links, **more)
+
+
+def test_an_inertia_matrix_may_be_off_symmetry_by_rounding_errors():
+    turned = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    inertia = turned @ np.diag([0.1, 0.2, 0.25]) @ turned.T
+    assert (inertia != inertia.T).any()
+    assert mechanism([Link("a", None, hinge("h"), mass=1, inertia=inertia)]).inertia["a"]["xy"] == inertia[0, 1]
 
 
 def test_an_axis_has_a_direction():

@@ -220,6 +220,9 @@ class _Reader:
             if m.jnt_type[j] in (int(kinds.mjtJoint.mjJNT_HINGE), int(kinds.mjtJoint.mjJNT_SLIDE)):
                 taken.add(f"{name}_rate")
         for i in range(0 if self._is_off("ACTUATION") else int(m.nu)):
+            group = int(m.actuator_group[i])
+            if 0 <= group <= 30 and int(m.opt.disableactuator) >> group & 1:
+                continue
             own = m.actuator(i).name or f"actuator{i}"
             why = self._why_not(i)
             if why:
@@ -316,6 +319,7 @@ class _Reader:
             "contacts": (collides or m.npair > 0) and not off("CONTACT"),
             "limits of joints": has("jnt_limited") and not off("LIMIT"),
             "friction of joints": has("dof_frictionloss") and not off("FRICTIONLOSS"),
+            "limits of controls and forces": has("jnt_actfrclimited"),
             "tendons": m.ntendon > 0,
             "damping or stiffness that is not linear": any(has(n) for n in ("dof_dampingpoly", "jnt_stiffnesspoly")),
             "springs that yield": getattr(m, "nplastic", 0) > 0,

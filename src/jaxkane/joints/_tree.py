@@ -1,4 +1,4 @@
-"""A mechanism from its links: checks of names and of the tree, parameters, and which speeds of loops are dependent."""
+"""A mechanism from its links: checks of names and of the tree, and parameters."""
 
 from __future__ import annotations
 
@@ -6,10 +6,11 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-import scipy.linalg
+from jax.core import Tracer
 
 from .._common.lookup import not_there
 from ._joints import Hinge, Joint, Shape, Slide, components, is_structural_zero
+from ._loops import with_dependent
 from ._mechanism import (
     MOMENTS,
     ActuatorShape,
@@ -71,6 +72,8 @@ def mechanism(
         tuple(_actuator(_checked(actuator, Actuator), joints, values) for actuator in actuators),
         left_out=tuple(left_out),
     )
+    if not joints:
+        raise ValueError(f"{name}: no link has a joint, so that nothing moves: Link(..., joints=hinge(...)).")
     if not any(link.has_mass for link in shapes):
         raise ValueError(f"{name}: no link that could be moved by a force has a mass: Link(..., mass=1.0).")
     _check_names(structure)
@@ -80,7 +83,7 @@ def mechanism(
         couplings=tuple(x for x in made if isinstance(x, CouplingShape)),
     )
     fields = tuple(_field(name, joints) for name in values)
-    return class_of(_with_dependent(structure, fields, values, dependent), fields)(**values)
+    return class_of(with_dependent(structure, fields, values, dependent), fields)(**values)
 
 
 def _checked(part: Any, kind: type) -> Any:
@@ -144,15 +147,18 @@ def _link(link: Link, values: dict[str, Any]) -> LinkShape:
 
 def _moments(link: Link) -> dict[str, Any]:
     rows = link.inertia
-    if not hasattr(rows, "__len__") or len(rows) != 3:
+    lengths = [np.shape(row) for row in rows] if hasattr(rows, "__len__") else []
+    if lengths not in ([()] * 3, [(3,)] * 3):
         raise ValueError(f"The inertia of {link.name!r} is three moments or a (3, 3) matrix, got {rows!r}.")
-    if not hasattr(rows[0], "__len__"):  # three moments
+    if lengths[0] == ():
         entries = dict(zip(MOMENTS, (*rows, 0.0, 0.0, 0.0), strict=True))
     else:
         entries = {ij: rows["xyz".index(ij[0])]["xyz".index(ij[1])] for ij in MOMENTS}
         for i, j in ((0, 1), (0, 2), (1, 2)):
             a, b = rows[i][j], rows[j][i]
-            if isinstance(a, (int, float)) and isinstance(b, (int, float)) and a != b:
+            if isinstance(a, Tracer) or isinstance(b, Tracer):
+                continue
+            if np.any(np.abs(np.subtract(a, b)) > 1e-9 * (np.abs(a) + np.abs(b))):  # more than rounding errors
                 raise ValueError(f"The inertia matrix of {link.name!r} is not symmetric: {a} and {b}.")
     return {f"inertia.{link.name}.{ij}": x for ij, x in entries.items() if not is_structural_zero(x)}
 
@@ -195,10 +201,12 @@ def _loop(loop: Any, structure: Structure, joints: Mapping[str, Shape]) -> LoopS
         for end in (loop.first, loop.second):
             if end not in sites:
                 raise ValueError("What closes a loop: " + str(not_there(end, sites, "the sites").args[0]))
+        if loop.first == loop.second:
+            raise ValueError(f"Loop({loop.first!r}, {loop.second!r}): a site is always where it is; name two.")
         return LoopShape(loop.first, loop.second, bool(loop.rigid), tuple(range(6 if loop.rigid else 3)))
     _checked(loop, Coupling)
-    for end in (loop.first, loop.second):
-        if end is not None and not isinstance(joints.get(end), (Hinge, Slide)):
+    for end in [loop.first, *([] if loop.second is None else [loop.second])]:
+        if not isinstance(joints.get(end), (Hinge, Slide)):
             raise ValueError(f"A coupling is of hinges and sliders; {end!r} is none.")
     return CouplingShape(loop.first, loop.second, tuple(float(a) for a in loop.coefficients), True)
 
@@ -233,120 +241,3 @@ def _field(name: str, joints: Mapping[str, Shape]) -> Field:
     if len(joint.speeds) == 6:  # newtons and newton metres in one
         return name, positive, "m" if kind == "rest" else ""
     return name, positive, (_OF_SLIDERS if isinstance(joint, Slide) else _OF_HINGES)[kind]
-
-
-# Loops: which residuals count, and what they are solved for.
-
-
-def _with_dependent(
-    structure: Structure, fields: tuple[Field, ...], values: dict[str, Any], dependent: Sequence[str] | None
-) -> Structure:
-    norms = [joint.name + joint.coordinates[-1][0] for joint in structure.joints if len(joint.coordinates) > 1]
-    if not (structure.loops or structure.couplings):
-        return structure._replace(dependent_coordinates=tuple(norms))
-    trial = class_of(structure, fields)(**_numbers(values))
-    C, G = _slopes(trial)  # (k,n) by speeds, (k,n_q) by coordinates
-    kept = _independent_rows(C)
-    names = (*trial.speeds, *trial.dependent_speeds)
-    if dependent is None:
-        follows = [f"{x.first}_rate" for x in structure.couplings]
-        speeds = [names[i] for i in _pivots(C[kept] * [1e3 if name in follows else 1.0 for name in names])]
-        if all(name.endswith("_rate") for name in speeds):
-            coordinates = [*(name.removesuffix("_rate") for name in speeds), *norms]
-        else:
-            coordinates = [trial.coordinates[i] for i in _pivots(np.concatenate([G[kept], _norm_slopes(trial)]))]
-    else:
-        speeds, coordinates = _chosen(structure, dependent, len(kept)), [*dependent, *norms]
-        places = [names.index(s) for s in speeds]
-        if np.linalg.svd(C[kept][:, places], compute_uv=False)[-1] < 1e-9 * np.abs(C).max():
-            raise ValueError(f"`dependent`: what closes the loops cannot be solved for {', '.join(dependent)}.")
-    start, loops = 0, []
-    for loop in structure.loops:
-        loops.append(loop._replace(kept=tuple(i - start for i in kept if start <= i < start + len(loop.kept))))
-        start += len(loop.kept)
-    couplings = [x._replace(is_kept=start + i in kept) for i, x in enumerate(structure.couplings)]
-    return structure._replace(
-        loops=tuple(loops),
-        couplings=tuple(couplings),
-        dependent_speeds=tuple(name for name in names if name in speeds),
-        dependent_coordinates=tuple(name for name in trial.coordinates if name in coordinates),
-    )
-
-
-def _chosen(structure: Structure, dependent: Sequence[str], n: int) -> list[str]:
-    simple = [joint.name for joint in structure.joints if len(joint.speeds) == 1]
-    wrong = [name for name in dependent if name not in simple]
-    if wrong:
-        raise ValueError("`dependent`: " + str(not_there(wrong[0], simple, "the hinges and sliders").args[0]))
-    if len(set(dependent)) != n:
-        raise ValueError(f"`dependent` names {len(set(dependent))} joints, and what closes the loops takes {n}.")
-    return [f"{name}_rate" for name in dependent]
-
-
-def _numbers(values: dict[str, Any]) -> dict[str, Any]:
-    """Numbers for what is traced or a batch: which rows are independent is a matter of structure."""
-    rng = np.random.default_rng(0)
-
-    def number(x: Any) -> float:
-        try:
-            return float(np.ravel(np.asarray(x))[0])
-        except Exception:  # traced: it has no value
-            return float(rng.uniform(0.5, 1.5))
-
-    return {name: number(x) for name, x in values.items()}
-
-
-def _slopes(trial: Mechanism) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of the loops' residuals by all speeds and by all coordinates, near the reference."""
-    rng = np.random.default_rng(1)
-    q = np.array([1.0 if name.endswith("_e4") else 0.0 for name in trial.coordinates])
-    for joint in trial.structure.joints:
-        if len(joint.coordinates) == 1:
-            q[trial.coordinates.index(joint.name)] = joint.reference
-    q = q + rng.uniform(-0.2, 0.2, q.shape)
-    for joint in trial.structure.joints:
-        if len(joint.coordinates) > 1:
-            last = trial.coordinates.index(joint.name + joint.coordinates[-1][0])
-            q[last - 3 : last + 1] /= np.linalg.norm(q[last - 3 : last + 1])
-    n = len(trial.speeds) + len(trial.dependent_speeds)
-
-    def residuals(q: np.ndarray, u: np.ndarray) -> tuple[list[Any], list[Any]]:
-        motion = trial.motion(0.0, list(map(float, q)), list(map(float, u)))
-        return trial._closed(motion.sites, _by_name(trial.coordinates, q), _by_name(trial.speeds, u))
-
-    still = np.zeros(n)
-    c = lambda q, u: np.array([float(x) for x in residuals(q, u)[1]])  # noqa: E731
-    h = lambda q: np.array([float(x) for x in residuals(q, still)[0]])  # noqa: E731
-    C = np.array([c(q, e) - c(q, still) for e in np.eye(n)]).T
-    G = np.array([(h(q + 1e-6 * e) - h(q - 1e-6 * e)) / 2e-6 for e in np.eye(len(q))]).T
-    return C, G
-
-
-def _by_name(names: Sequence[str], x: np.ndarray) -> dict[str, float]:
-    return {name: float(a) for name, a in zip(names, x, strict=True)}
-
-
-def _norm_slopes(trial: Mechanism) -> np.ndarray:
-    rows = []
-    for joint in trial.structure.joints:
-        if len(joint.coordinates) > 1:
-            row = np.zeros(len(trial.coordinates))
-            row[trial.coordinates.index(joint.name + joint.coordinates[-1][0])] = 2.0
-            rows.append(row)
-    return np.array(rows).reshape(len(rows), len(trial.coordinates))
-
-
-def _independent_rows(C: np.ndarray) -> list[int]:
-    R, order = _qr(C.T)
-    rank = int(np.sum(np.abs(np.diag(R)) > 1e-9 * max(abs(R[0, 0]), 1e-300)))
-    return sorted(int(i) for i in order[:rank])
-
-
-def _pivots(A: np.ndarray) -> list[int]:
-    """The columns by which A is best solved, as many as it has rows."""
-    return [int(i) for i in _qr(A)[1][: len(A)]]
-
-
-def _qr(A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    found: Any = scipy.linalg.qr(A, mode="economic", pivoting=True)
-    return found[1], found[2]
