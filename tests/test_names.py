@@ -122,3 +122,20 @@ def test_a_state_of_traced_numbers_in_a_list():
     q = lambda x: jk.State([x, 1], [0.0, 0.0]).q  # noqa: E731
     np.testing.assert_array_equal(jax.jit(jax.jacfwd(q))(0.3), [1.0, 0.0])
     assert jax.eval_shape(q, np.float32(0.3)).dtype == np.float32
+
+
+def test_a_description_that_is_mixed_in_reads_by_name():
+    class Spring:  # no System
+        def loads(self, t, q, u, motion, inputs):
+            return super().loads(t, q, u, motion, inputs), jk.Torque(-5.0 * q["theta1"] * motion.N.z, motion.bodies[0])
+
+    class Mixed(Spring, jk.catalog.DoublePendulum):
+        pass
+
+    class Written(jk.catalog.DoublePendulum):
+        def loads(self, t, q, u, motion, inputs):
+            return super().loads(t, q, u, motion, inputs), jk.Torque(-5.0 * q["theta1"] * motion.N.z, motion.bodies[0])
+
+    mixed, written = (jk.accelerations(kind(), 0.0, [0.3, 0.1], [0.0, 0.0]) for kind in (Mixed, Written))
+    np.testing.assert_array_equal(mixed, written)
+    assert not np.allclose(mixed, jk.accelerations(PENDULUM, 0.0, [0.3, 0.1], [0.0, 0.0]))

@@ -8,7 +8,18 @@ import numpy as np
 import pytest
 from systems import Track
 
-from jaxkane.fit import Iterate, LeastSquares, Optimizer, Problem, Simulation, Trial, fit, minimize
+from jaxkane.fit import (
+    BFGS,
+    GradientDescent,
+    Iterate,
+    LeastSquares,
+    Optimizer,
+    Problem,
+    Simulation,
+    Trial,
+    fit,
+    minimize,
+)
 from jaxkane.fit._optimize.steps import moved
 from jaxkane.fit._problem.blocks import eliminate
 from jaxkane.fit._problem.problem import linearize
@@ -58,6 +69,22 @@ def test_an_optimizer_is_one_class(tmp_path):
     assert (begun.status, begun.cost) == ("interrupted", min(calls))
     resumed = minimize(problem, Part(), checkpoint=path)
     assert resumed.history == pytest.approx(found.history, rel=1e-12)
+
+
+def test_options_that_are_none():
+    problem = Problem.of(Track(), TRIAL, ["gain"], **POSED)
+    for optimizer in (LeastSquares, GradientDescent, BFGS):
+        with pytest.raises(ValueError, match=rf"{optimizer.__name__}: `rtol`.*-1"):
+            optimizer(rtol=-1.0)
+    with pytest.raises(ValueError, match=r"LeastSquares: `damping`.*nan"):
+        LeastSquares(damping=float("nan"))
+    for steps in (-1, 1.5):
+        with pytest.raises(ValueError, match=rf"`steps` is a whole number.*{steps}"):
+            minimize(problem, LeastSquares(), steps=steps)
+    with pytest.raises(TypeError, match=r"`start=` takes a Unknowns, as in start=fit.point"):
+        minimize(problem, LeastSquares(), start={"gain": 1.0})
+    with pytest.raises(TypeError, match=r"minimize takes a Problem, as in minimize\(fit.problem"):
+        minimize(Track(), LeastSquares())
 
 
 def test_the_best_is_kept_where_the_last_is_worse():

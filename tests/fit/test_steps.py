@@ -90,6 +90,13 @@ def test_steps_too_coarse_are_told_or_halved(trial):
     assert len(finer.history) > len(direct.history)
 
 
+def test_a_step_longer_than_a_window_is_one_that_halving_shortens(trial):
+    posed = [Problem.of(GUESS, trial, NAMES, simulation=Simulation(step=x)) for x in (t[-1], 100.0 * t[-1])]
+    errors = [problem.step_errors(problem.start) for problem in posed]
+    np.testing.assert_array_equal(errors[0], errors[1])
+    assert not errors[1] < posed[1].step_tolerance  # NaN where such a step goes nowhere
+
+
 def test_what_says_how_to_integrate(trial):
     assert Problem.of(GUESS, trial, NAMES, simulation=Simulation(atol=1e-9)).model.settings.step is None
     assert Problem.of(GUESS, trial, NAMES, simulation=Simulation(step=1e-3)).model.settings.max_steps is None

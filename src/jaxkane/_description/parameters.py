@@ -35,6 +35,8 @@ def parameter(
         batch.
     - `unit`: as tables and pictures show it; no number is converted.
     """
+    if not isinstance(unit, str):
+        raise TypeError(f'parameter(unit="N m"): a unit is a text for tables, got {unit!r}.')
     if default is dataclasses.MISSING:
         return eqx.field(converter=to_float, metadata={"jaxkane": ParameterInfo(positive, shape or (), unit)})
     # A copy, as NumPy: a list that is changed later must not change the default, and JAX must not start yet.

@@ -41,8 +41,9 @@ class System(eqx.Module):
             if kind in cls.__dict__ and not hasattr(cls.__dict__[kind], "__get__"):  # a property is read of an instance
                 setattr(cls, kind, _checked_names(cls.__name__, kind, cls.__dict__[kind]))
         for method in ("motion", "q_dot", "loads", "configuration_constraints", "events"):
-            if method in cls.__dict__:
-                setattr(cls, method, _named(cls.__dict__[method]))
+            owner = next(base for base in cls.__mro__ if method in base.__dict__)
+            if owner is cls or not issubclass(owner, System):  # a class without a System that is mixed in
+                setattr(cls, method, _named(owner.__dict__[method]))
 
     coordinates: ClassVar[tuple[str, ...]] = ()
     """Names of the generalized coordinates."""

@@ -10,7 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from .._problem.model import Unknowns
-from .._problem.problem import Problem, linearize
+from .._problem.problem import Problem, linearize, refuse_other
 from .._result.result import Fit
 from .checkpoint import Checkpoint
 from .optimizer import Iterate, Optimizer
@@ -47,7 +47,12 @@ def minimize(
     """
     if not isinstance(optimizer, Optimizer):
         raise TypeError(f"`optimizer` is such as GradientDescent(), LeastSquares() or BFGS(); got {optimizer!r}.")
+    refuse_other(problem, Problem, "minimize", "minimize(fit.problem, LeastSquares())")
+    if start is not None:
+        refuse_other(start, Unknowns, "`start=`", "start=fit.point, or change the system's values")
     steps = optimizer.steps if steps is None else steps
+    if not isinstance(steps, int) or steps < 0:
+        raise ValueError(f"`steps` is a whole number that is not negative, got {steps!r}.")
     start = problem.start if start is None else start
     key = {} if checkpoint is None else {"method": optimizer.name, **optimizer.depends_on(problem, steps)}
     file, optimizer = Checkpoint(checkpoint, problem, **key), optimizer.for_steps(steps)

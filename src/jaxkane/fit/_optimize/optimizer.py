@@ -33,6 +33,12 @@ class Optimizer(abc.ABC):
     steps: ClassVar[int]
     """At most, where `minimize` is not asked for another number."""
 
+    def __post_init__(self) -> None:
+        for name in ("rtol", "damping"):
+            value = getattr(self, name, 0.0)
+            if not 0 <= value < float("inf"):
+                raise ValueError(f"{type(self).__name__}: `{name}` is a number that is not negative, got {value}.")
+
     @property
     @abc.abstractmethod
     def name(self) -> str:

@@ -98,8 +98,9 @@ class Problem:
             assembled=assembled,
             outputs=tuple(outputs.items()),
         )
-        if simulation.step is not None:  # one step in all windows
-            windows = eqx.tree_at(lambda w: w.step, windows, jnp.full_like(windows.step, simulation.step))
+        if simulation.step is not None:  # one step in all windows; none is longer than they, so that it can be halved
+            step = jnp.minimum(simulation.step, windows.t[:, -1] - windows.t[:, 0])
+            windows = eqx.tree_at(lambda w: w.step, windows, step)
         if processes:
             check_same(model, windows)
         problem = cls(model, windows, windows.by_trial, trials, places, posed, processes)
