@@ -218,7 +218,8 @@ def test_limits_of_what_actuators_do_to_a_joint_are_said():
         "<geom ", '<geom contype="0" '
     )
     with pytest.warns(UserWarning, match="limits of controls and forces"):
-        jk.convert.from_mjcf(mjcf(limited))
+        jk.convert.from_mjcf(mjcf(limited, '<actuator><motor joint="j"/></actuator>'))
+    jk.convert.from_mjcf(mjcf(limited), strict=True)  # nothing is driven
 
 
 @needs_mujoco

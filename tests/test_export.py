@@ -551,6 +551,12 @@ def test_what_cannot_be_exported_is_named(monkeypatch, tmp_path):
         jk.export.stablehlo(Strange(), function="nothing")
     with pytest.raises(TypeError, match=r"one is \('rates',\)"):
         jk.export.numpy(Strange(), functions="rates")
+    with pytest.raises(ValueError, match=r"`functions` names none"):
+        jk.export.c(Strange(), tmp_path / "a.c", functions=())
+    with pytest.raises(ValueError, match="platforms are of cpu, cuda, rocm, tpu; got .*gpu"):
+        jk.export.stablehlo(Strange(), platforms=("cpu", "gpu"))
+    with pytest.raises(TypeError, match=r"platforms is a sequence of names; one is \('cpu',\)"):
+        jk.export.stablehlo(Strange(), platforms="cpu")
     with pytest.raises(ValueError, match=r"Strange has no dependent speeds.*Leave it out"):
         jk.export.numpy(Strange(), functions=("dependent_speeds",))
     with pytest.raises(ValueError, match="Strange is a batch"):

@@ -266,6 +266,9 @@ def test_what_is_no_linear_model_is_refused():
         jk.symbolic.linearize(pendulum, {"theta3": 1})
     with pytest.raises(ValueError, match="at` says theta2 = theta1, but theta1 has a value of its own"):
         jk.symbolic.linearize(pendulum, {"theta2": "theta1"})
+    for strange in ("1 +", "f(", "theta1 > 1", "I*v", None, [1], float("nan"), float("inf"), "1/0"):
+        with pytest.raises(ValueError, match=r"DoublePendulum: `at` says theta2 = .* neither a finite number nor"):
+            jk.symbolic.linearize(pendulum, {"theta2": strange})
     with pytest.raises(ValueError, match="no state can be mass"):
         jk.symbolic.linearize(pendulum, states=("mass",))
     with pytest.raises(ValueError, match=r"1 configuration constraints .* 0 are named"):

@@ -80,6 +80,8 @@ def __getattr__(name: str) -> _typing.Any:
         thing = getattr(_importlib.import_module("._animate", __name__), name)
         globals()[name] = thing
         return thing
+    if name == "__all__":  # asked for by `from jaxkane import *`
+        return [each for each in __dir__() if not each.startswith("_")]
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
 
 

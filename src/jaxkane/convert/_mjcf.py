@@ -319,7 +319,7 @@ class _Reader:
             "contacts": (collides or m.npair > 0) and not off("CONTACT"),
             "limits of joints": has("jnt_limited") and not off("LIMIT"),
             "friction of joints": has("dof_frictionloss") and not off("FRICTIONLOSS"),
-            "limits of controls and forces": has("jnt_actfrclimited"),
+            "limits of controls and forces": has("jnt_actfrclimited") and m.nu > 0,
             "tendons": m.ntendon > 0,
             "damping or stiffness that is not linear": any(has(n) for n in ("dof_dampingpoly", "jnt_stiffnesspoly")),
             "springs that yield": getattr(m, "nplastic", 0) > 0,

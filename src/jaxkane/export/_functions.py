@@ -21,6 +21,8 @@ def chosen(formulas: Formulas, functions: Sequence[str] | None, usual: Sequence[
     if isinstance(functions, str):
         raise TypeError(f"functions is a sequence of names; one is ({functions!r},).")
     functions = tuple(dict.fromkeys(functions))
+    if not functions:
+        raise ValueError(f"{formulas.name}: `functions` names none; leave it out for the usual ones.")
     refuse_unknown(functions, OFFERED, f"{formulas.name}: there is no function", "there are")
     return functions
 

@@ -12,6 +12,8 @@ from .._common.lookup import refuse_unknown
 from .._description.system import System
 from .._method.formulas import OFFERED, Formulas
 
+PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
+
 
 def stablehlo(
     system: System,
@@ -57,6 +59,11 @@ def stablehlo(
     if not isinstance(function, str):
         raise TypeError(f"stablehlo exports one function at a time; `function` is its name, got {function!r}.")
     refuse_unknown([function], OFFERED, f"{formulas.name}: there is no function", "there are")
+    if isinstance(platforms, str):
+        raise TypeError(f"platforms is a sequence of names; one is ({platforms!r},).")
+    strange = [platform for platform in platforms if platform not in PLATFORMS]
+    if strange or not platforms:
+        raise ValueError(f"platforms are of {', '.join(PLATFORMS)}; got {platforms!r}.")
     u_dep = np.zeros(len(formulas.names("u_dep")), formulas.dtype)  # of which no such function knows
 
     def of_one(t, q, u, inputs, parameters):

@@ -161,7 +161,7 @@ class _At:
         moving = {"t": kinds["t"], **{kind: kinds[kind] for kind in ("q", "u", "inputs")}}
         known = [*(name for of in moving.values() for name in of), *kinds["parameters"]]
         refuse_unknown(at, known, f"{formulas.name} has no", "it has")
-        values = {name: self._value(x) for name, x in at.items()}
+        values = {name: self._value(name, x) for name, x in at.items()}
         symbols = {symbol: name for of in moving.values() for name, symbol in of.items()}
         for name, x in values.items():
             read = sorted(symbols[s] for s in x.free_symbols if s in symbols)
@@ -180,14 +180,30 @@ class _At:
         self.given = given_nodes(formulas, put)
         self.parameters = kinds["parameters"]
 
-    def _value(self, x: Any) -> Any:
+    def _value(self, name: str, x: Any) -> Any:
         """A number, an expression, or a string in which the declared names are the declared symbols."""
         sp = imported()
-        if isinstance(x, float):
-            return exact(x, "float64")
-        value = sp.sympify(x, locals=dict(self.symbols))
+        try:
+            value = exact(x, "float64") if isinstance(x, float) else sp.sympify(x, locals=dict(self.symbols))
+        except (
+            sp.SympifyError,
+            TypeError,
+            AttributeError,
+        ) as error:  # SymPy raises the others for "f(", "1.x" and such
+            raise ValueError(self._no_value(name, x)) from error
+        if not isinstance(value, sp.Expr):
+            raise ValueError(self._no_value(name, x))
         own = {s: sp.Symbol(s.name, real=True) for s in value.free_symbols if s not in self.symbols.values()}
-        return value.xreplace({s: new for s, new in own.items() if not s.is_real})
+        value = value.xreplace({s: new for s, new in own.items() if not s.is_real})
+        if value.has(sp.I, sp.nan, sp.oo, -sp.oo, sp.zoo) or value.is_real is False:
+            raise ValueError(self._no_value(name, x))
+        return value
+
+    def _no_value(self, name: str, x: Any) -> str:
+        return (
+            f"{self.formulas.name}: `at` says {name} = {x!r}, which is neither a finite number nor an expression of "
+            'SymPy; one is {"%s": "-v/radius"}.' % name
+        )
 
     def expressions(self, nodes: np.ndarray) -> Any:
         """An array of nodes (m,) or (m, n) as a matrix."""
