@@ -260,8 +260,6 @@ def test_what_a_model_does_not_say_is_named(me):
     taken = me.Particle("bob", P, sm.Symbol("speeds"))
     with pytest.raises(ValueError, match="cannot be called 'speeds'"):
         jk.convert.from_sympy(make(bodies=[taken]), {"speeds": 1.0})
-    with pytest.raises(ValueError, match="Lagrangian alone"):
-        jk.convert.from_sympy(me.LagrangesMethod(m * q.diff() ** 2 / 2, [q]), {m: 1.0})
     with pytest.raises(TypeError, match="takes a KanesMethod"):
         jk.convert.from_sympy(q.diff() - u, {})
 

@@ -21,8 +21,9 @@ from .._description.bodies import Body, Force, Motion, Torque
 from .._description.parameters import parameter
 from .._description.system import System
 from .._description.vectors import Frame, Point, Vector, inertial
-from .._scalars.components import ZERO3, add, mul
+from .._scalars.components import ZERO3, add, dot, mul, sub
 from .._scalars.types import Component, Scalar
+from ._lagrangian import Inertia, factor, factor_rate, inertia_of
 
 
 def from_sympy(
@@ -40,8 +41,9 @@ def from_sympy(
 
     **Arguments:**
 
-    - `model`: a `KanesMethod`, a `System`, or a `LagrangesMethod` that has its `bodies`. Its bodies and loads are
-        those that it was given, or that `kanes_equations` was called with; no equations need have been formed.
+    - `model`: a `KanesMethod`, a `System`, or a `LagrangesMethod`. Its bodies and loads are those that it was given,
+        or that `kanes_equations` was called with; no equations need have been formed. A Lagrangian without `bodies`
+        gives the motion, and neither points nor frames.
     - `parameters`: a number for every constant symbol, by symbol or by its name. They become the system's parameters.
     - `origin`: the point from which positions count, for `jk.positions` and pictures; of a `System` its fixed point.
         Without one velocities are known, and no positions.
@@ -53,14 +55,20 @@ def from_sympy(
     coordinates and speeds, auxiliary speeds and constraints are the model's.
 
     What a model does not say cannot be had: positions without an origin, units, and constraint forces other than at
-    the points and frames that it names.
+    the points and frames that it names. Of a Lagrangian without bodies none of these is known, and the kinetic energy
+    is 1/2 u.M u; a mass matrix that is not positive definite gives NaN.
 
     **Raises:** `ImportError` without SymPy; `TypeError` for another kind of model; `ValueError` that names a symbol
-    without a value or a value without a symbol, a model without bodies, a point without a velocity, and a function of
-    time in the motion that is neither coordinate nor speed.
+    without a value or a value without a symbol, a KanesMethod without bodies, a point without a velocity, a function of
+    time in the motion that is neither coordinate nor speed, and a Lagrangian that is not quadratic in the rates.
     """
     sympy = _sympy()
     words = _words_of(sympy, model, tuple(dependent), name)
+    if origin is not None and not words.bodies:
+        raise ValueError(
+            f"{name}: positions from {origin} cannot be had, since this Lagrangian has no bodies. Leave `origin` out; "
+            "or give what moves, LagrangesMethod(L, qs, bodies=bodies, frame=N, ...)."
+        )
     taker = _Taker(sympy, words, origin if origin is not None else words.origin)
     plan = taker.plan()
     values = _values(taker, plan, parameters)
@@ -93,7 +101,8 @@ class _Words(NamedTuple):
     configuration: list[Any]
     bodies: list[Any]
     loads: list[Any]
-    forces: list[Any] = []  # along the speeds, beside the loads
+    forces: Sequence[Any] = ()  # along the speeds, beside the loads
+    inertia: Inertia = Inertia()  # instead of bodies
     origin: Any = None
 
 
@@ -155,12 +164,9 @@ def _of_system(mechanics: Any, system: Any, name: str) -> _Words:
 
 def _of_lagrange(sympy: Any, lagrange: Any, dependent: tuple[str, ...], name: str) -> _Words:
     bodies = list(lagrange._bodies or ())
-    if not bodies or lagrange.inertial is None:
-        raise ValueError(
-            f"{name}: a Lagrangian alone does not say which bodies move how, which a system needs. Give both, "
-            "LagrangesMethod(L, qs, bodies=bodies, frame=N, ...)."
-        )
-    q, N = list(lagrange.q), lagrange.inertial
+    if bodies and lagrange.inertial is None:
+        raise ValueError(f"{name}: the inertial frame of the bodies is not known. Give LagrangesMethod(..., frame=N).")
+    q, N = list(lagrange.q), lagrange.inertial or sympy.physics.mechanics.ReferenceFrame("N")
     rates = list(lagrange._qdots)
     wrong = [x for x in dependent if x not in [str(c.func) for c in q]]
     if wrong or len(dependent) != len(lagrange.coneqs):
@@ -170,14 +176,14 @@ def _of_lagrange(sympy: Any, lagrange: Any, dependent: tuple[str, ...], name: st
         )
     speeds = [sympy.Function(f"{c.func}_dot")(*c.args) for c in q]
     to_speeds = dict(zip(rates, speeds))
-    # What stands in L beside the kinetic energy is a potential, whose forces are along the speeds.
-    potential = sum((body.kinetic_energy(N) for body in bodies), sympy.S.Zero) - lagrange._L[0]
-    potential = sympy.expand(sympy.simplify(potential.xreplace(to_speeds)))
-    if potential.has(*speeds):
-        raise ValueError(f"{name}: the Lagrangian is not the kinetic energy of the bodies less a potential of q alone.")
     is_dep = [str(c.func) in dependent for c in q]
     order = [u for u, dep in zip(speeds, is_dep) if not dep], [u for u, dep in zip(speeds, is_dep) if dep]
-    forces = dict(zip(speeds, (-potential.diff(c) for c in q)))
+    coordinate_of = dict(zip(speeds, q))
+    of_speeds = {coordinate_of[u]: u for u in (*order[0], *order[1])}
+    if bodies:
+        inertia = Inertia(forces=_forces_of_potential(sympy, lagrange, bodies, to_speeds, of_speeds, name))
+    else:
+        inertia = inertia_of(sympy, lagrange, of_speeds, name)
     holonomic = list(lagrange._hol_coneqs)
     return _Words(
         name,
@@ -190,9 +196,21 @@ def _of_lagrange(sympy: Any, lagrange: Any, dependent: tuple[str, ...], name: st
         [x.xreplace(to_speeds) for x in lagrange.coneqs],
         holonomic,
         bodies,
-        list(lagrange.forcelist or ()),
-        [forces[u] for u in (*order[0], *order[1])],
+        list(lagrange.forcelist or ()) if bodies else [],
+        inertia.forces,
+        inertia,
     )
+
+
+def _forces_of_potential(
+    sympy: Any, lagrange: Any, bodies: list[Any], to_speeds: dict[Any, Any], of_speeds: dict[Any, Any], name: str
+) -> list[Any]:
+    """What stands in L beside the kinetic energy is a potential, whose forces are along the speeds."""
+    potential = sum((body.kinetic_energy(lagrange.inertial) for body in bodies), sympy.S.Zero) - lagrange._L[0]
+    potential = sympy.expand(sympy.simplify(potential.xreplace(to_speeds)))
+    if potential.has(*of_speeds.values()):
+        raise ValueError(f"{name}: the Lagrangian is not the kinetic energy of the bodies less a potential of q alone.")
+    return [-potential.diff(c) for c in of_speeds]
 
 
 # The description as expressions, and how they are put together again.
@@ -243,6 +261,8 @@ class Plan(NamedTuple):
     bodies: tuple[BodyPlan, ...]
     loads: tuple[LoadPlan, ...]
     forces: tuple[int, ...]
+    inertia: tuple[tuple[int, ...], ...]  # rows of M, of a model without bodies
+    inertia_rates: tuple[tuple[int, ...], ...]
 
 
 class _Taker:
@@ -267,6 +287,8 @@ class _Taker:
         residuals = tuple(place(x) for x in words.residuals)
         configuration = tuple(place(x) for x in words.configuration)
         forces = tuple(self._place(x, self.of_loads) for x in words.forces)
+        inertia = tuple(tuple(place(x) for x in row) for row in words.inertia.M)
+        inertia_rates = tuple(tuple(place(x, self.of_loads) for x in row) for row in words.inertia.M_dot)
         inputs, constants = self._symbols()
         return Plan(
             words.name,
@@ -288,6 +310,8 @@ class _Taker:
             bodies,
             loads,
             forces,
+            inertia,
+            inertia_rates,
         )
 
     def _place(self, expression: Any, among: dict[Any, int] | None = None) -> int:
@@ -485,6 +509,8 @@ class _SympySystem(System):
             I = [_exact(values[i]) for i in body.inertia]
             omega = _vector(frames, values, body.angular_velocity)
             bodies.append(Body(mass, (I[:3], I[3:6], I[6:]), center, frames[body.frame], omega, body.name))
+        for i, w in enumerate(self._of_inertia(values, u)):
+            bodies.append(Body(1.0, 0.0, Point.at(N.vector(w, 0.0, 0.0)), name=f"inertia {i + 1}"))
         taken = {body.name for body in bodies}
         named = {point.name: made for point, made in zip(plan.points, points, strict=True) if point.name not in taken}
         motion = _Made(bodies, [values[i] for i in plan.residuals], points=named)
@@ -508,13 +534,27 @@ class _SympySystem(System):
                 )
             else:
                 loads.append(Force(vector, made.placed[load.point]))
-        for speed, force in zip(u, plan.forces):
+        along = [_exact(values[force]) for force in plan.forces]
+        if plan.inertia:
+            C_dot = factor_rate(_rows(of_motion, plan.inertia), _rows(values, plan.inertia_rates))
+            w = self._of_inertia(of_motion, u)
+            along = [sub(force, dot(row, w[: len(row)])) for force, row in zip(along, C_dot, strict=True)]
+        for speed, force in zip(u, along):
             # a force along a speed is the torque on what turns at that rate alone
-            loads.append(Torque(_exact(values[force]) * made.N.x, self._carrier(made, speed * made.N.x)))
+            loads.append(Torque(force * made.N.x, self._carrier(made, speed * made.N.x)))
         return loads
 
+    def _of_inertia(self, values: Sequence[Any], u: Any) -> list[Component]:
+        """w = C^T u of M = C C^T: the velocities of particles of mass 1 that have this inertia."""
+        C = factor(_rows(values, self._plan.inertia))
+        return [dot([row[i] for row in C[i:]], list(u)[i : len(C)]) for i in range(len(C))]
+
     def _carrier(self, made: _Made, omega: Vector) -> Body:
-        return Body(0.0, 0.0, made.placed[0], made.N, omega, "what the torque acts on")
+        return Body(0.0, 0.0, made.bodies[0].center, made.N, omega, "what the torque acts on")
+
+
+def _rows(values: Sequence[Any], rows: Sequence[Sequence[int]]) -> list[list[Component]]:
+    return [[_exact(values[i]) for i in row] for row in rows]
 
 
 def _exact(x: Any) -> Component:
