@@ -553,7 +553,7 @@ def test_what_cannot_be_exported_is_named(monkeypatch, tmp_path):
         jk.export.numpy(Strange(), functions="rates")
     with pytest.raises(ValueError, match=r"`functions` names none"):
         jk.export.c(Strange(), tmp_path / "a.c", functions=())
-    with pytest.raises(ValueError, match="platforms are of cpu, cuda, rocm, tpu; got .*gpu"):
+    with pytest.raises(ValueError, match=r"platforms are of cpu, cuda, rocm, tpu; got .*gpu"):
         jk.export.stablehlo(Strange(), platforms=("cpu", "gpu"))
     with pytest.raises(TypeError, match=r"platforms is a sequence of names; one is \('cpu',\)"):
         jk.export.stablehlo(Strange(), platforms="cpu")

@@ -7,7 +7,18 @@ import pytest
 from scipy import stats
 from systems import Track
 
-from jaxkane.fit import Free, LeastSquares, Problem, Trial, cross_validate, laplace, minimize, profile
+from jaxkane.fit import (
+    Free,
+    LeastSquares,
+    Problem,
+    Simulation,
+    Trial,
+    cross_validate,
+    fit,
+    laplace,
+    minimize,
+    profile,
+)
 
 TIGHT = 1e-6
 t = np.arange(0.0, 4.0, 0.1)
@@ -279,3 +290,15 @@ def test_as_many_unknowns_as_residuals():
     assert np.isnan(found.variance)
     assert all(not np.isfinite(error) for error in found.standard_errors.values())
     assert any("residuals for" in note for note in found.notes)
+
+
+def test_outputs_are_channels_of_their_own():
+    x, push = 0.4 * t**2, {"push": np.sin(3.0 * t)}
+    fixed = {"simulation": Simulation(step=0.1), "optimizer": LeastSquares()}
+    plain = fit(Track(), Trial(t, {"x": x}, push, sigma=0.1), "gain", **fixed)
+    double = Trial(t, {"double": 2.0 * x}, push, sigma=0.2)
+    found = fit(Track(), double, "gain", outputs={"double": lambda ride: 2.0 * ride["x"]}, **fixed)
+    assert found.estimates["gain"] == pytest.approx(plain.estimates["gain"], rel=1e-9)
+    for wrong in (lambda ride: ride["x"][0], lambda ride: ride["x"][:3], lambda ride: ride.q):
+        with pytest.raises(ValueError, match=r"`outputs`: double is a number for each time, of the shape .n_t,."):
+            fit(Track(), double, "gain", outputs={"double": wrong}, **fixed)

@@ -19,6 +19,8 @@ from jaxkane.fit import (
     Trial,
     fit,
     minimize,
+    multi_start,
+    save_report,
 )
 from jaxkane.fit._optimize.steps import moved
 from jaxkane.fit._problem.blocks import eliminate
@@ -81,6 +83,11 @@ def test_options_that_are_none():
     for steps in (-1, 1.5):
         with pytest.raises(ValueError, match=rf"`steps` is a whole number.*{steps}"):
             minimize(problem, LeastSquares(), steps=steps)
+    for n in (0, -1):
+        with pytest.raises(ValueError, match=rf"`n` is how many initial guesses are tried, one at least; got {n}"):
+            multi_start(problem, n)
+    with pytest.raises(TypeError, match="save_report takes a Fit, as in save_report"):
+        save_report(problem, "fit.html")
     with pytest.raises(TypeError, match=r"`start=` takes a Unknowns, as in start=fit.point"):
         minimize(problem, LeastSquares(), start={"gain": 1.0})
     with pytest.raises(TypeError, match=r"minimize takes a Problem, as in minimize\(fit.problem"):

@@ -94,6 +94,7 @@ pendulum = DoublePendulum(mass=1.0, length=0.5)
         ([trial()], "mass", {"sensor_bias": ("theta2",)}, "`sensor_bias` names theta2"),
         ([trial()], "mass", {"unknown": {"theta1": 0.0}}, "the standard deviation of theta1 must be positive"),
         ([trial()], "mass", {"window": 0.0}, "`window` is a length of time"),
+        ([trial()], "mass", {"outputs": {"theta1": lambda ride: ride["theta2"]}}, "`outputs`: theta1 is a coordinate"),
     ],
 )
 def test_a_bad_problem_is_named(trials, free, options, message):

@@ -101,6 +101,8 @@ def multi_start(
     **Raises:** `ValueError` where no guess can be simulated.
     """
     refuse_other(problem, Problem, "multi_start", "multi_start(fit.problem)")
+    if n < 1:
+        raise ValueError(f"`n` is how many initial guesses are tried, one at least; got {n}.")
     optimizer = LeastSquares() if optimizer is None else optimizer
     rng = np.random.default_rng(seed)
     p = len(problem.parameters.names)

@@ -128,6 +128,11 @@ class Model(eqx.Module):
         outputs, rows = dict(self.outputs), []
         for c in self.channels:
             value = outputs[c](ride) if c in outputs else ride[c]
+            if jnp.shape(value) != ride.t.shape:
+                raise ValueError(
+                    f"`outputs`: {c} is a number for each time, of the shape (n_t,), here {ride.t.shape}; "
+                    f"got the shape {jnp.shape(value)}."
+                )
             gain = self.nuisance.of_trial(b, "gain of sensor", c, 1.0)
             rows.append(gain * value + self.nuisance.of_trial(b, "bias of sensor", c, 0.0))
         return jnp.stack(rows)

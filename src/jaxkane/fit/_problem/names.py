@@ -26,6 +26,9 @@ def checked_trials(system: System, trials: Sequence[Trial], outputs: Mapping[str
     if not trials:
         raise ValueError("There is no trial to fit.")
     named = (*system.coordinates, *system.speeds, *system.dependent_speeds)
+    twice = [name for name in outputs if name in named]
+    if twice:
+        raise ValueError(f"`outputs`: {twice[0]} is a coordinate or a speed of {title}; give the output another name.")
     for trial in trials:
         if not isinstance(trial, Trial):
             raise TypeError(f"`trials` holds jaxkane.fit.Trial, got {type(trial).__name__}.")

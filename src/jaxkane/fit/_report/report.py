@@ -17,6 +17,7 @@ from ..._description.system import System
 from .._analysis.held_back import CrossValidation, cross_validate
 from .._analysis.profile import Profile
 from .._analysis.signs import contrary_signs
+from .._problem.problem import refuse_other
 from .._result.identifiability import combination
 from .._result.result import STATUS, Fit, known_values
 from . import pictures
@@ -67,6 +68,7 @@ def save_report(
 
     **Returns:** the path.
     """
+    refuse_other(fit, Fit, "save_report", 'save_report(fit(...), "fit.html")')
     if cross_validation is True:
         cross_validation = cross_validate(fit)
     title = title or f"Identification of {type(fit.problem.system).__name__}"
