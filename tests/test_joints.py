@@ -274,6 +274,17 @@ def test_a_mechanism_may_be_made_of_traced_numbers():
     np.testing.assert_allclose(jax.vmap(alpha)(jnp.array([1.0, 2.0])), [2 / 0.14, 4 / 0.18], rtol=1e-12)
 
 
+def test_a_loop_may_be_made_of_traced_numbers():
+    def alpha(across):
+        system = four_bar(across, dependent=("q2", "q3"))
+        return jk.accelerations(system, 0.0, [state["q"][x] for x in system.coordinates], [state["u"]["u1"]])[0]
+
+    state = FOUR_BAR["states"][0]
+    expected = alpha(0.0)
+    np.testing.assert_allclose(jax.jit(alpha)(0.0), expected, rtol=1e-12)
+    np.testing.assert_allclose(jax.vmap(alpha)(jnp.zeros(2)), [expected, expected], rtol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("links", "more", "words"),
     [

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
 import numpy as np
 import scipy.linalg
 from jax.core import Tracer
@@ -22,6 +23,17 @@ def with_dependent(
     norms = [joint.name + joint.coordinates[-1][0] for joint in structure.joints if len(joint.coordinates) > 1]
     if not (structure.loops or structure.couplings):
         return structure._replace(dependent_coordinates=tuple(norms))
+    with jax.ensure_compile_time_eval():  # trial numbers are numbers under `jax.jit` too
+        return _with_dependent(structure, fields, values, dependent, norms)
+
+
+def _with_dependent(
+    structure: Structure,
+    fields: tuple[Field, ...],
+    values: dict[str, Any],
+    dependent: Sequence[str] | None,
+    norms: list[str],
+) -> Structure:
     trial = class_of(structure, fields)(**_numbers(values))
     C, G = _slopes(trial)  # (k,n) by speeds, (k,n_q) by coordinates
     kept = _independent_rows(C)
