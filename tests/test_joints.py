@@ -342,6 +342,33 @@ def test_an_inertia_matrix_may_be_off_symmetry_by_rounding_errors():
     assert mechanism([Link("a", None, hinge("h"), mass=1, inertia=inertia)]).inertia["a"]["xy"] == inertia[0, 1]
 
 
+@pytest.mark.parametrize(
+    ("what", "links", "more"),
+    [
+        ("axis of 'h'", lambda x: [Link("a", None, hinge("h", (0, 1, x)), **BAR)], {}),
+        ("reference of 'h'", lambda x: [Link("a", None, slide("h", reference=x), **BAR)], {}),
+        ("orientation of 'a'", lambda x: [Link("a", None, hinge("h"), orientation=("2", (x,)), **BAR)], {}),
+        (
+            "gear of 'T'",
+            lambda x: [Link("a", None, hinge("h"), **BAR)],
+            {"actuators": lambda x: [Actuator("T", "h", x)]},
+        ),
+    ],
+)
+def test_what_is_structure_is_not_traced(what, links, more):
+    def made(x):
+        return mechanism(links(x), **{name: part(x) for name, part in more.items()})
+
+    made(0.1)
+    with pytest.raises(TypeError, match=rf"The {what} is part of the structure.*cannot be traced"):
+        jax.jit(lambda x: made(x).mass["a"])(0.1)
+
+
+def test_a_universal_joint_has_two_axes():
+    with pytest.raises(ValueError, match="two axes, 'h' 3"):
+        universal("h", np.eye(3))
+
+
 def test_an_axis_has_a_direction():
     with pytest.raises(ValueError, match="axis of 'h'"):
         hinge("h", (0, 0, 0))

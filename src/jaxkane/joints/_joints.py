@@ -13,6 +13,7 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 from .. import rotations
 from .._description.bodies import Body, Force, Load, Torque
@@ -224,7 +225,8 @@ def hinge(
     """
     values = _numbers(name, damping=damping, stiffness=stiffness, rest=rest, armature=armature)
     return Joint(
-        (Hinge(name, unit_vector(axis, name), float(reference)),), values | components(f"anchor.{name}", anchor)
+        (Hinge(name, unit_vector(axis, name), _reference(reference, name)),),
+        values | components(f"anchor.{name}", anchor),
     )
 
 
@@ -243,7 +245,11 @@ def slide(
     `damping` [N s/m], `stiffness` [N/m], `rest` [m], `armature` [kg], `reference` [m]: as of `hinge`.
     """
     values = _numbers(name, damping=damping, stiffness=stiffness, rest=rest, armature=armature)
-    return Joint((Slide(name, unit_vector(axis, name), float(reference)),), values)
+    return Joint((Slide(name, unit_vector(axis, name), _reference(reference, name)),), values)
+
+
+def _reference(value: Any, name: str) -> float:
+    return float(exact_numbers(value, f"The reference of {name!r}"))
 
 
 def ball(
@@ -277,6 +283,8 @@ def fixed() -> Joint:
 
 def universal(name: str, axes: Any = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), **more: Any) -> Joint:
     """Two hinges, `name_1` on the carrier and `name_2` on the link, about two axes; `more` as of `hinge`, for both."""
+    if len(axes) != 2:
+        raise ValueError(f"A universal joint has two axes, {name!r} {len(axes)}: give several hinges to a link.")
     return _chain([hinge(f"{name}_{i + 1}", axis, **more) for i, axis in enumerate(axes)])
 
 
@@ -300,11 +308,24 @@ def _chain(joints: Sequence[Joint]) -> Joint:
 
 def unit_vector(axis: Any, name: str) -> Triple:
     """A direction as three floats of length 1; what is zero or one but for rounding is made so."""
-    a = np.asarray(axis, float)
+    a = exact_numbers(axis, f"The axis of {name!r}")
     length = float(np.linalg.norm(a)) if a.shape == (3,) else np.nan
     if not (np.isfinite(length) and length > 0.0):
         raise ValueError(f"The axis of {name!r} is three numbers that are not all zero, got {axis!r}.")
     return tuple(exact(x) for x in a / length)  # type: ignore[return-value]
+
+
+def exact_numbers(values: Any, what: str) -> np.ndarray:
+    """Numbers of a structure, by which programs are kept: nothing is differentiated by them.
+
+    **Raises:** `TypeError` for what is traced.
+    """
+    if any(isinstance(x, Tracer) for x in jax.tree.leaves(values)):
+        raise TypeError(
+            f"{what} is part of the structure, of exact numbers: it cannot be traced, as by jax.jit, jax.grad or "
+            "jax.vmap. Places, masses, inertias, gains, dampers and springs can."
+        )
+    return np.asarray(values, float)
 
 
 def exact(x: float) -> float:

@@ -6,11 +6,12 @@ import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import numpy as np
 
 from .. import rotations
 from ..rotations import Matrix
-from ._joints import Joint, exact
+from ._joints import Joint, exact, exact_numbers
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -109,6 +110,7 @@ def matrix_of(orientation: Any, name: str) -> Matrix | None:
     """
     if orientation is None:
         return None
+    exact_numbers([x for x in jax.tree.leaves(orientation) if not isinstance(x, str)], f"The orientation of {name!r}")
     try:
         if len(orientation) == 2 and isinstance(orientation[0], str):
             R = np.array(_numpy_sequence(*orientation))

@@ -9,7 +9,7 @@ import numpy as np
 from jax.core import Tracer
 
 from .._common.lookup import not_there
-from ._joints import Hinge, Joint, Shape, Slide, components, is_structural_zero
+from ._joints import Hinge, Joint, Shape, Slide, components, exact_numbers, is_structural_zero
 from ._loops import with_dependent
 from ._mechanism import (
     MOMENTS,
@@ -178,7 +178,7 @@ def _actuator(actuator: Actuator, joints: Mapping[str, Shape], values: dict[str,
             f"The actuator {actuator.name!r}: " + str(not_there(actuator.joint, joints, "the joints").args[0])
         )
     joint = joints[actuator.joint]
-    gear = tuple(float(x) for x in np.atleast_1d(np.asarray(actuator.gear, float)))
+    gear = tuple(float(x) for x in np.atleast_1d(exact_numbers(actuator.gear, f"The gear of {actuator.name!r}")))
     if len(gear) != len(joint.speeds):
         raise ValueError(
             f"The gear of the actuator {actuator.name!r} is {len(joint.speeds)} numbers, one for each speed of "
