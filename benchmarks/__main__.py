@@ -11,6 +11,7 @@
     eigenvalues       eigenvalues of ten thousand bicycles: BicycleParameters, numpy
     identification    fits of the bicycle, and whether they can be trusted (four minutes)
     million           a million bicycles, killed on the way (five minutes)
+    swing_up          optimal control by CasADi and IPOPT: opty (one minute)
 
 Every answer is compared before it is timed; a peer that is not installed is named and left out (pip install
 'jaxkane[benchmarks]').
@@ -18,7 +19,7 @@ Every answer is compared before it is timed; a peer that is not installed is nam
 Run:      python -m benchmarks [part ...] [--quick] [--out FOLDER] [--publish]
 Appears:  every figure with its target; results.md, results.json and speed.png in the folder. Parts that were measured
           before, on the same machine with the same versions, stay in the table.
-Takes:    about twenty minutes without the last two parts, which are measured only where they are named; some minutes
+Takes:    about twenty minutes without the last three parts, which are measured only where they are named; some minutes
           with `--quick`, whose figures mean nothing.
 """
 
@@ -49,9 +50,10 @@ SETTINGS = {
     "chains": (XLA, NATIVE),
     "gpu": TWO[:1],
     "million": TWO[1:],
+    "swing_up": (XLA,),
 }
 SCRIPTS = {"eigenvalues": ("eigenvalues.py",), "identification": ("identification.py", "--repetitions", "50")}
-NAMED_ONLY = ("identification", "million")
+NAMED_ONLY = ("identification", "million", "swing_up")
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -21,6 +21,7 @@ TITLES = {
     "million": "A million bicycles",
     "eigenvalues": "Eigenvalues of ten thousand bicycles",
     "identification": "Identification",
+    "swing_up": "Optimal control: a double pendulum swung up",
 }
 
 
