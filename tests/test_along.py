@@ -83,6 +83,7 @@ def test_at_one_time_and_in_a_batch(ride):
         jk.positions(Disc(), ride, [0.0, 0.0], [1.0])
 
 
+@pytest.mark.slow
 def test_derivatives_along_a_trajectory_that_ended():
     def last(push, adjoint):  # the rim where it was last
         system = dataclasses.replace(Disc(), push=push)

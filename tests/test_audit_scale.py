@@ -74,6 +74,7 @@ def test_the_audit_costs_what_the_accelerations_cost(held):
     assert counts[8] - counts[6] < 1.6 * (counts[6] - counts[4])
 
 
+@pytest.mark.slow
 def test_long_and_short_chains_are_audited_alike(monkeypatch):
     """The accelerations in one program or by columns and LAPACK: the same table, forces and multipliers."""
     system = TiltedChain(n=3, held=True)

@@ -41,6 +41,7 @@ SYSTEMS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_both_forms_agree(name, monkeypatch):
     args = SYSTEMS[name]()
@@ -54,6 +55,7 @@ def test_both_forms_agree(name, monkeypatch):
     jax.tree.map(close, *found)
 
 
+@pytest.mark.slow
 def test_a_long_chain_keeps_its_energy():
     chain, _, q, u, _ = at(Chain(n=14), 14)
     assert not linear.is_written_out(14)

@@ -36,6 +36,7 @@ def top(**options):
     return system, jk.simulate(system, state, jnp.linspace(0.0, 5.0, 26), rtol=1e-5, atol=1e-5, **options)
 
 
+@pytest.mark.slow
 def test_stabilized_and_projected_coordinates_do_not_drift():
     free, stabilized, projected = (jk.audit(*top(**how)) for how in ({}, {"stabilize": 10.0}, {"project": True}))
     assert stabilized.drift < 0.3 * free.drift  # what is left is the interpolation between steps
@@ -128,6 +129,7 @@ def spatial_pendulum(**parameters):
     return system, jnp.array(entry.q), jnp.array(entry.u)
 
 
+@pytest.mark.slow
 def test_a_massless_speed_is_refused_by_name():
     # Kamman, Unit 5, Example 6, note 2: a line has no moment of inertia about itself
     system, q, u = spatial_pendulum(I22_1=0.0)

@@ -165,6 +165,7 @@ class Suction(Particle):
         return [*super().loads(t, q, u, motion, inputs), jk.Force(force, motion.bodies[0])]
 
 
+@pytest.mark.slow
 def test_trial_steps_that_are_not_finite():
     """Steps that ended under the ground are thrown away, and leave no NaN in a derivative in either mode."""
 
@@ -216,6 +217,7 @@ class Brake(eqx.Module):
 TOP = jnp.array([0.0, 1.0])
 
 
+@pytest.mark.slow
 def test_what_follows_from_a_motion_that_ends_early():
     """Dependent speeds, a controller's input and projected coordinates, where they were reached; NaN where not."""
 
@@ -247,6 +249,7 @@ def test_speeds_that_become_singular():
     assert np.isnan(ride["vy"][~reached]).all()
 
 
+@pytest.mark.slow
 def test_other_ends_have_no_derivative():
     """`max_steps` is no smooth end: its time has a derivative that is NaN, and so has what was not reached."""
 

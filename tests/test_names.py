@@ -71,6 +71,7 @@ class Undeclared(OnACircle):
     dependent_coordinates = ()
 
 
+@pytest.mark.slow
 def test_dicts_wherever_coordinates_and_speeds_are_taken():
     circle, at, moving = OnACircle(), {"y": -0.8, "x": 0.6}, {"x_dot": 0.5}
     q, u = np.array([0.6, -0.8]), np.array([0.5])

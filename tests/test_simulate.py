@@ -49,6 +49,7 @@ def test_steps_of_any_solver_agree():
     assert steps.stats["steps"] == 1000
 
 
+@pytest.mark.slow
 def test_inputs_of_every_kind():
     forward = {"adjoint": "forward"}
     constant, number = (jk.simulate(PENDULUM, START, TS, {"elbow_torque": x}, **forward) for x in (2.0, jnp.array(2.0)))
@@ -206,6 +207,7 @@ def test_every_adjoint_against_differences(adjoint, mode):
     np.testing.assert_allclose(both(x)[0], differences(both, x, 1e-4), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_derivative_forward_of_what_was_compiled_before_says_what_to_do():
     def read(u):
         return jk.simulate(Pendulum(), jk.State(jnp.array([0.4]), u), TS[:3], step=0.05, max_steps=4)["angle"][-1]

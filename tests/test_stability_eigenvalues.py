@@ -174,6 +174,7 @@ class Inverted(jk.System):
         return jk.weight(motion, -9.81 * motion.N.y), jk.Torque(torque * motion.N.z, motion["rod"])
 
 
+@pytest.mark.slow
 def test_any_parameter_of_any_system():
     """It stands from a spring of m g l on; d/dlength is m g."""
     rtol = 1e-12

@@ -205,6 +205,7 @@ np.testing.assert_allclose(rides.q[:, -1], np.stack([np.cos(angle), np.sin(angle
     assert run.returncode == 0, run.stderr
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_is_survived(rides, folder, tmp_path):
     distributed = pytest.importorskip("distributed")
     workers = {"n_workers": 2, "threads_per_worker": 1, "processes": True, "host": "127.0.0.1"}

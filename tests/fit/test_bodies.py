@@ -79,6 +79,7 @@ def test_what_is_no_body_is_refused():
         parameters_of(BICYCLE, (frame_inertia("B"), "IBxx"))
 
 
+@pytest.mark.slow
 def test_a_free_rotation_is_identified_by_possible_bodies_only():
     # A thin plate turns freely under small known torques: its third moment is nearly the sum of the two others.
     truth, rng = RigidBody(1.0, I11=1.0, I22=2.0, I33=2.97), np.random.default_rng(2)

@@ -39,6 +39,7 @@ def exact_errors(push):
     return np.sqrt(np.diag(np.linalg.inv(information))[:2]), motion
 
 
+@pytest.mark.slow
 def test_a_designed_push_tells_more_and_as_much_as_it_says():
     names, limit = ("gain", "drift"), 0.6
     plan = design(

@@ -54,6 +54,7 @@ def problem(swings):
     return Problem.of(GUESS, swings, ("mass", "length"), sensor_bias=("theta2",), **OPTIONS)
 
 
+@pytest.mark.slow
 def test_jacobian_against_central_differences(swings):
     tolerance = 1e-6
     free = (Free("mass", prior=(1.0, 0.3)), "length", Gain("elbow_torque"))
@@ -167,6 +168,7 @@ def test_steps_into_nowhere_are_halved(problem):
     assert np.isfinite(result.cost)
 
 
+@pytest.mark.slow
 def test_a_parameter_without_influence_is_named(swings):
     # Without inputs only the ratio of gravity and length matters, and the mass not at all.
     quiet = [Trial(s.t, s.measured, sigma=SIGMA, name=s.name) for s in swings]
@@ -184,6 +186,7 @@ def test_a_parameter_without_influence_is_named(swings):
     assert "mass has no influence" in result.message
 
 
+@pytest.mark.slow
 def test_a_start_that_cannot_be_simulated_is_named(swings):
     with pytest.raises(ValueError, match=r"1\.5 s: from 0 to 0\.68 s the initial guess gives no finite residuals"):
         fit(GUESS, swings, "mass", simulation=Simulation(max_steps=1), **OPTIONS)
