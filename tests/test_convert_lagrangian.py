@@ -171,7 +171,11 @@ def test_what_a_lagrangian_does_not_say_is_named():
     P.set_vel(N, me.dynamicsymbols("u") * N.x)
     with pytest.raises(ValueError, match=r"holds u\(t\), which is neither"):
         bring(kinetic, forcelist=loads, frame=N)
+    with pytest.raises(TypeError, match="at a Point or on a ReferenceFrame"):
+        bring(kinetic, forcelist=[(me.Particle("p", P, m), F * N.x)], frame=N)
     with pytest.raises(ValueError, match=r"Derivative\(f\(t\), t\) follows from no kinematic"):
         bring(kinetic * (2 + sm.sin(f)))
+    with pytest.raises(ValueError, match=r"the Lagrangian holds Derivative\(x\(t\), \(t, 2\)\)"):
+        bring(kinetic + x * x.diff(T, 2))
     with pytest.raises(ValueError, match="inertial frame of the bodies"):
         bring(kinetic, bodies=[me.Particle("p", P, m)])

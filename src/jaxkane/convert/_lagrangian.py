@@ -36,12 +36,19 @@ def inertia_of(sympy: Any, lagrange: Any, speeds: dict[Any, Any], name: str) -> 
     **Arguments:** `speeds`: the coordinates with their speeds, in the order of the speeds.
 
     **Raises:** `ValueError` where L is no quadratic function of the rates; for a load without a frame to measure its
-    velocity in, and for one whose velocity is not told by the rates of the coordinates.
+    velocity in, and for one whose velocity is not told by the rates of the coordinates. `TypeError` for a load that
+    acts neither at a point nor on a frame.
     """
     t = sympy.physics.mechanics.dynamicsymbols._t
     to_speeds = {c.diff(t): u for c, u in speeds.items()}
     rate = lambda x: x.diff(t).xreplace(to_speeds)  # noqa: E731
     L, u = lagrange._L[0].xreplace(to_speeds), list(speeds.values())
+    strange = sorted(map(str, L.atoms(sympy.Derivative)))
+    if strange:
+        raise ValueError(
+            f"{name}: the Lagrangian holds {strange[0]}; of derivatives it may hold the first of the coordinates. What "
+            "is prescribed in time is written as an expression of time."
+        )
     M = [[_without(sympy, L.diff(x, y), u, name) for y in u[: i + 1]] for i, x in enumerate(u)]
     # The momenta beside M u: L may hold terms of the first order in the rates, as of a moving frame.
     at_rest = dict.fromkeys(u, sympy.S.Zero)
@@ -69,6 +76,8 @@ def _of_loads(sympy: Any, lagrange: Any, rate: Any, name: str) -> Any:
     for part, vector in lagrange.forcelist:
         if N is None:
             raise ValueError(f"{name}: a load at {part} needs the inertial frame: LagrangesMethod(..., frame=N).")
+        if not isinstance(part, (mechanics.Point, mechanics.ReferenceFrame)):
+            raise TypeError(f"{name}: a load of LagrangesMethod acts at a Point or on a ReferenceFrame, got {part!r}.")
         try:
             v = part.ang_vel_in(N) if isinstance(part, mechanics.ReferenceFrame) else part.vel(N)
         except ValueError as error:
