@@ -453,12 +453,15 @@ def _values(taker: _Taker, plan: Plan, parameters: Mapping[Any, Any]) -> dict[st
 
 
 class _Made(Motion):
-    """A motion that knows the frames and points of the plan by their number."""
+    """A motion that knows the frames and points of the plan by their number, and what torques and forces along speeds
+    act on."""
 
-    __slots__ = ("placed", "turned")
+    __slots__ = ("along_speeds", "placed", "turned", "under_torque")
 
     turned: list[Frame]
     placed: list[Point]
+    under_torque: list[Any]  # a Body for each load; None where it is a force
+    along_speeds: list[Body]
 
 
 class _SympySystem(System):
@@ -515,7 +518,18 @@ class _SympySystem(System):
         named = {point.name: made for point, made in zip(plan.points, points, strict=True) if point.name not in taken}
         motion = _Made(bodies, [values[i] for i in plan.residuals], points=named)
         motion.turned, motion.placed = frames, points
+        self._carry_loads(motion, values, u)
         return motion
+
+    def _carry_loads(self, motion: _Made, values: Sequence[Any], u: Any) -> None:
+        center, N = motion.bodies[0].center, motion.N
+        carrier = lambda omega: Body(0.0, 0.0, center, N, omega, "what the torque acts on")  # noqa: E731
+        motion.under_torque = [
+            carrier(_vector(motion.turned, values, load.angular_velocity)) if load.point is None else None
+            for load in self._plan.loads
+        ]
+        # a force along a speed is the torque on what turns at that rate alone
+        motion.along_speeds = [carrier(speed * N.x) for speed, _ in zip(u, self._plan.forces)]
 
     def loads(self, t, q, u, motion: Any, inputs):
         plan, made = self._plan, motion
@@ -524,33 +538,23 @@ class _SympySystem(System):
         numbers = [getattr(self, str(x)) for x in plan.constants]
         given = [inputs[_name(x)] for x in plan.inputs]
         values = _functions(plan)[1](t, *q, *u, *given, *numbers)
-        of_motion = self._read(q, u, t)
         loads: list[Any] = []
-        for load in plan.loads:
+        for load, body in zip(plan.loads, made.under_torque, strict=True):
             vector = _vector(made.turned, values, load.vector)
-            if load.point is None:
-                loads.append(
-                    Torque(vector, self._carrier(made, _vector(made.turned, of_motion, load.angular_velocity)))
-                )
-            else:
-                loads.append(Force(vector, made.placed[load.point]))
+            loads.append(Torque(vector, body) if load.point is None else Force(vector, made.placed[load.point]))
         along = [_exact(values[force]) for force in plan.forces]
         if plan.inertia:
+            of_motion = self._read(q, u, t)
             C_dot = factor_rate(_rows(of_motion, plan.inertia), _rows(values, plan.inertia_rates))
             w = self._of_inertia(of_motion, u)
             along = [sub(force, dot(row, w[: len(row)])) for force, row in zip(along, C_dot, strict=True)]
-        for speed, force in zip(u, along):
-            # a force along a speed is the torque on what turns at that rate alone
-            loads.append(Torque(force * made.N.x, self._carrier(made, speed * made.N.x)))
+        loads += [Torque(force * made.N.x, body) for force, body in zip(along, made.along_speeds, strict=True)]
         return loads
 
     def _of_inertia(self, values: Sequence[Any], u: Any) -> list[Component]:
         """w = C^T u of M = C C^T: the velocities of particles of mass 1 that have this inertia."""
         C = factor(_rows(values, self._plan.inertia))
         return [dot([row[i] for row in C[i:]], list(u)[i : len(C)]) for i in range(len(C))]
-
-    def _carrier(self, made: _Made, omega: Vector) -> Body:
-        return Body(0.0, 0.0, made.bodies[0].center, made.N, omega, "what the torque acts on")
 
 
 def _rows(values: Sequence[Any], rows: Sequence[Sequence[int]]) -> list[list[Component]]:
