@@ -123,7 +123,6 @@ def test_its_energy_is_half_u_M_u_and_is_kept():
     ride = jk.simulate(system, jk.State([0.8, 0.4], [0.3, 0.5]), jnp.linspace(0.0, 1.0, 101))
     audit = jk.audit(system, ride)
     assert np.abs(audit.energy_error).max() < 1e-6
-    assert not audit.lost_work.any()
     height = -ride.q[:, 0] * np.cos(ride.q[:, 1])
     total = np.array([jk.kinetic_energy(system, 0.0, q, u) for q, u in zip(ride.q[::50], ride.u[::50])])
     total += values["m"] * values["g"] * height[::50] + values["k"] * (ride.q[::50, 0] - values["l"]) ** 2 / 2

@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from .._description.bodies import Motion, flatten_loads
+from .._description.bodies import Motion
 from .._description.system import System
 from .._description.vectors import Frame, Point, virtual
-from .._scalars.components import add, dot, mul, sub
+from .._scalars.components import add, dot, mul
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, solve
 from .._scalars.reads import compiled
@@ -101,18 +101,6 @@ class Reactions(Instant):
         still = (0.0,) * (self.n + self.k)
         c0 = self.residuals(self.t, self.q, still)
         return mul(-1.0, add(self.unbalanced(self.velocities(still)), dot(c0, self.multipliers)))
-
-    def power_without_partial_velocities(self) -> Component:
-        """Power [W] of the loads on velocities that change with the speeds where `loads` reads them, and not where
-        `motion` does: of points and frames that were made anew inside `loads`. Kane's equations do not notice it."""
-        motion = self.motion(self.t, self.q, (0.0,) * (self.n + self.k))
-        at_rest = (self._zero(),) * (self.n + self.k)  # no exact zeros, by which `loads` might divide
-        read_there = flatten_loads(self.system.loads(self.t, self.q, at_rest, motion, self.inputs))
-        total: Component = 0.0
-        for F, here, there in zip(self.load_vectors, self.loads(motion), read_there, strict=True):
-            changes = [sub(a, b) for a, b in zip(here.velocity.components, there.velocity.components, strict=True)]
-            total = add(total, dot(F, changes))
-        return total
 
     def forces_of_parts(self) -> Iterator[tuple[str, Row]]:
         """Forces at the named points, moments at the named frames."""

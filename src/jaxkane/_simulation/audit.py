@@ -34,8 +34,6 @@ class Audit(eqx.Module):
 
     - `t` (n_t,) [s]. `kinetic_energy`, `work` (n_t,) [J]: the work of all loads and of what drives prescribed motions,
         since `t[0]`. `energy_error` (n_t,) [J]: kinetic energy gained, less work.
-    - `lost_work` (n_t,) [J]: of loads on points or frames that do not follow the speeds, since they were made anew
-        inside `loads`: they have a velocity and no partial velocities, so that the motion never felt them.
     - `work_error` [J]: what the quadrature of the work may have cost. Work of forces that are constant in N on mass
         centres (weights) is exact; the power of all else is integrated between the times of the trajectory, by
         polynomials through eight of them. More times, a smaller error; the solver's tolerances are not seen here.
@@ -53,7 +51,6 @@ class Audit(eqx.Module):
     kinetic_energy: np.ndarray
     work: np.ndarray
     work_error: float
-    lost_work: np.ndarray
     linear_momentum: np.ndarray
     angular_momentum: np.ndarray
     configuration_residuals: np.ndarray
@@ -93,7 +90,6 @@ class Audit(eqx.Module):
             ("kinetic energy", f"{self.kinetic_energy.min():.4g} to {self.kinetic_energy.max():.4g} J", ""),
             ("work of loads", f"{self.work.min():.4g} to {self.work.max():.4g} J", f"+- {self.work_error:.1e} J"),
             ("energy balance", f"{self.energy_balance:.1e}", energy),
-            *self._loads_without_effect(),
             ("linear momentum", *_conservation(self.linear_momentum)),
             ("angular momentum", *_conservation(self.angular_momentum)),
         ]
@@ -106,13 +102,6 @@ class Audit(eqx.Module):
         if self.velocity_residuals.size:
             lines.append(("condition of C_dep", *_condition(self.condition_C_dep)))
         return lines
-
-    def _loads_without_effect(self) -> list[tuple[str, str, str]]:
-        lost = _relative(self.lost_work, self.kinetic_energy, self.work, self.lost_work)
-        if lost <= 1e-9:
-            return []
-        words = f"{_verdict(lost, 1e-9, 1e-6)}: loads on points or frames that were made anew in `loads` move nothing"
-        return [("work that nothing felt", f"{_largest(self.lost_work):.1e} J", words)]
 
     def __str__(self) -> str:
         lines = self.lines()
@@ -187,7 +176,6 @@ def audit(system: System, trajectory: Trajectory) -> Audit:
         kinetic_energy=now["T"],
         work=work,
         work_error=work_error,
-        lost_work=_cumulative_integral(ts, now["lost"], ORDERS[0]),
         linear_momentum=now["p"],
         angular_momentum=now["H"],
         configuration_residuals=now["h"],
@@ -224,7 +212,6 @@ def _measured(system, t, q, u, inputs, u_dot):
         "force": [load and as_vector(_in_N(load.vector), q) for load in at_centers],
         "place": [load and as_vector(places.of(load.point), q) for load in at_centers],
         "prescribed": as_vector([now.power_of_prescribed_motions()], q)[0],
-        "lost": as_vector([now.power_without_partial_velocities()], q)[0],
         "p": as_vector(p, q),
         "H": as_vector(H, q),
         "h": configuration_residual(system, t, q),
