@@ -61,6 +61,7 @@ def operations(f, system, *more):
     return len(program.program.jaxpr.eqns), program.is_plain
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("held", [False, True])
 def test_the_audit_costs_what_the_accelerations_cost(held):
     """It is one plain program, so that nothing is computed twice; and no longer than a right-hand side."""

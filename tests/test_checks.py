@@ -245,6 +245,7 @@ def test_one_rule_for_inertias_that_no_body_can_have(asked):
         asked(AnyInertia(1.0, -0.1, 1.0))
 
 
+@pytest.mark.slow
 def test_in_a_batch_bodies_that_cannot_be_have_a_status():
     # possible, rounded, measured, refused, negative
     I33 = np.array([2.0, 2.003, 2.1, 2.2, -0.1])

@@ -298,6 +298,7 @@ def test_a_urdf_that_is_none():
         jk.convert.from_urdf('<robot name="r"><link name="a"/><link name="b"/></robot>')
 
 
+@pytest.mark.slow
 @needs_mujoco
 def test_a_mass_that_was_brought_over_has_a_derivative():
     system = jk.convert.from_mjcf(FIGURES["model"])

@@ -116,6 +116,7 @@ def test_a_lagrangian_alone_accelerates_as_in_sympy(name):
     assert jk.positions(system, 0.3, q, u) == {}  # it does not say where anything is
 
 
+@pytest.mark.slow
 def test_its_energy_is_half_u_M_u_and_is_kept():
     _, values, system = brought("elastic_pendulum")
     kinetic = values["m"] * (0.3**2 + 0.8**2 * 0.5**2) / 2

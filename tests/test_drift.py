@@ -146,6 +146,7 @@ def test_a_massless_speed_is_refused_by_name():
     assert rides.reason == ["no solution", "completed"]
 
 
+@pytest.mark.slow
 def test_locked_angles_are_met_by_an_event_or_an_error_with_advice():
     system, q, u = spatial_pendulum()
     with pytest.raises(ValueError, match=r"theta11, theta12, theta13 are not finite.*Euler parameters"):

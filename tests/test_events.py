@@ -69,6 +69,7 @@ def test_a_dropped_particle(options):
     assert np.isnan(ride["drive"][~reached]).all()
 
 
+@pytest.mark.slow
 def test_second_derivatives_of_the_end():
     """By the velocity at the start, against the formula."""
     h, g = jnp.array(1.0), jnp.array(9.81)
@@ -127,6 +128,7 @@ def test_a_start_on_zero():
         assert np.isnan(at_once.q[1:]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("ends", "options"), [("ground", {}), ("either", {"step": 0.5})], ids=["falling-adaptive", "either-fixed"]
 )
@@ -138,6 +140,7 @@ def test_down_and_up_again_within_a_step(ends, options):
     np.testing.assert_allclose(ride.t_end, (1 - np.sqrt(1 - 2 * 5.19 * 0.08)) / 5.19, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_earlier_of_several_events_in_one_step():
     ride = dropped(1.0, 1.0, Particle(ends="roof"), step=2.0)
     assert ride.reason == "c top"
@@ -239,6 +242,7 @@ def test_what_follows_from_a_motion_that_ends_early():
         assert np.isnan(found[2:]).all()
 
 
+@pytest.mark.slow
 def test_speeds_that_become_singular():
     """The bead's horizontal speed vanishes at a quarter of a turn: the motion ends before."""
     ride = jk.simulate(Bead(ends=False), jk.State(TOP, jnp.ones(1)), TS)
@@ -282,6 +286,7 @@ def test_a_start_where_an_event_is_no_number():
         dropped(0.1, 0.0, Particle(ends="lost"))
 
 
+@pytest.mark.slow
 def test_the_end_in_single_precision():
     particle, ts = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (Particle(), TS))
     start = jk.State(jnp.ones(1, jnp.float32), jnp.zeros(1, jnp.float32))
@@ -292,6 +297,7 @@ def test_the_end_in_single_precision():
     np.testing.assert_allclose(ride.end.q, 0.0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_end_by_an_implicit_solver():
     """The bead passes y = 0.3 where cos(t) does; Kvaerno's method solves for the stages of every step."""
     ride = jk.simulate(Bead(), jk.State(TOP, jnp.ones(1)), TS, solver=diffrax.Kvaerno5())
@@ -299,6 +305,7 @@ def test_the_end_by_an_implicit_solver():
     np.testing.assert_allclose(ride.t_end, np.arccos(0.3), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_end_of_a_stabilized_motion():
     ride = jk.simulate(Bead(), jk.State(TOP, jnp.ones(1)), TS, stabilize=10.0)
     assert ride.reason == "low"
@@ -333,6 +340,7 @@ def test_the_first_crossing_of_cubics():
         np.testing.assert_allclose(x, crossings[0] if crossings else np.inf, atol=0.02)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
 def test_derivatives_by_times_of_samples(mode):
     """Two signals, one of whose kinks stand at one time; the times of the ride itself; against central differences."""

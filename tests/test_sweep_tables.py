@@ -66,6 +66,7 @@ def test_xarray(rides):
     assert (data["status"] == jk.Status.COMPLETED).all()
 
 
+@pytest.mark.slow
 def test_a_table_with_labels_and_a_function_of_its_own():
     table = {"rider": ["a", "b", "c"], "push": [0.1, 0.2, 0.3], "length": [1, 2, 3]}
 

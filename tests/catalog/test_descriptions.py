@@ -6,6 +6,7 @@ import pathlib
 import pytest
 
 from jaxkane import catalog
+from jaxkane.catalog import _entry
 
 FILES = sorted(pathlib.Path(catalog.__file__).parent.glob("*.py"))
 ROOMS_BELOW = {"_common", "_scalars", "rotations", "_description", "loads", ""}
@@ -26,6 +27,17 @@ def test_every_system_is_exported_and_listed():
     systems = {name for name in vars(catalog) if isinstance(vars(catalog)[name], type) and name != "Entry"}
     assert systems == set(catalog.CATALOG)
     assert len({entry.book for entry in catalog.CATALOG.values()}) == 15  # seven examples and eight exercises
+
+
+def test_an_entry_is_registered_in_the_books_order(monkeypatch):
+    found = {}
+    monkeypatch.setattr(_entry, "CATALOG", found)
+    later = _entry.entry("Exercise 5.1", "an example", q=(0.0,), u=(0.0,), operations=1)(catalog.BarWithPiston)
+    _entry.entry("Example 1", "another", q=(0.0,), u=(0.0,), operations=1, conservative=False)(catalog.DoublePendulum)
+    assert later is catalog.BarWithPiston
+    assert list(found) == ["DoublePendulum", "BarWithPiston"]
+    assert found["BarWithPiston"].example is catalog.BarWithPiston
+    assert not found["DoublePendulum"].conservative
 
 
 @pytest.mark.parametrize("name", catalog.CATALOG)

@@ -68,7 +68,12 @@ class Example:
 _example = functools.cache(Example)
 
 
-@pytest.fixture(params=list(CATALOG))
+# One of each kind is enough for a plain run; CI asks all of them.
+QUICK = {"DoublePendulum", "RigidBody", "BarWithPiston", "DiskAndBar", "SpinningTop"}
+SLOW = pytest.mark.slow
+
+
+@pytest.fixture(params=[name if name in QUICK else pytest.param(name, marks=SLOW) for name in CATALOG])
 def example(request):
     return _example(request.param)
 

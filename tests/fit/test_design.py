@@ -39,6 +39,11 @@ def exact_errors(push):
     return np.sqrt(np.diag(np.linalg.inv(information))[:2]), motion
 
 
+def test_a_criterion_that_is_none_is_refused():
+    with pytest.raises(ValueError, match=r"`criterion` is 'D' or 'A', got 'E'"):
+        design(Track(), t, push, C, ("gain",), sigma=SIGMA, initial={"x": 0.1}, criterion="E")
+
+
 @pytest.mark.slow
 def test_a_designed_push_tells_more_and_as_much_as_it_says():
     names, limit = ("gain", "drift"), 0.6
@@ -63,6 +68,7 @@ def test_a_designed_push_tells_more_and_as_much_as_it_says():
     assert list(plan.standard_errors.values()) == pytest.approx(of_fit, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_the_gradient_of_a_plan_against_differences():
     known = {name: np.asarray(x) for name, x in push(C, jnp.asarray(t)).items()}
     trial = Trial(t, {"x": 0.0 * t}, known, sigma=SIGMA, initial={"x": 0.1})

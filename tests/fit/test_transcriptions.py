@@ -150,6 +150,7 @@ def test_delays_gains_rates_and_gaps(result):
     assert steps.min() < 0.021
 
 
+@pytest.mark.slow
 def test_other_data_and_guesses_compile_nothing(result, runs, problem):
     import jaxkane.fit._problem.model as model
 
@@ -269,6 +270,7 @@ def test_inputs_that_share_their_times_share_their_kinks(options, kinks, anew, m
     assert [(times.shape[0], several) for times, several in seen] == [(kinks, anew)]
 
 
+@pytest.mark.slow
 def test_kinks_that_are_shared_move_together():
     # x(1) = int (1 - t) f(t - s) dt for a delay s; by parts, its slope at s = 0 is -int (1 - t) f'(t) dt.
     t = np.linspace(0.0, 1.0, 5)

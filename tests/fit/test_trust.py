@@ -58,6 +58,7 @@ def again(problem, trials):
     return minimize(other, LeastSquares())
 
 
+@pytest.mark.slow
 def test_intervals_hold_the_truth_as_often_as_they_say(problem):
     level, hits, n = 0.8, np.zeros(3), 40
     rng = np.random.default_rng(11)
