@@ -3,12 +3,22 @@
 from __future__ import annotations
 
 import functools
+import operator
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .jax_internals import Jaxpr, Literal
+
+OPERATORS: dict[str, Callable[..., Any]] = {
+    "add": operator.add,
+    "sub": operator.sub,
+    "mul": operator.mul,
+    "div": operator.truediv,
+    "neg": operator.neg,
+}
+"""Arithmetic, by JAX's names of it, for whatever has Python's operators."""
 
 CALLS = ("jit", "pjit")
 # Programs within programs, and the parameter that holds them. A rule for derivatives has been used before, or is not.

@@ -19,6 +19,7 @@ from jax.core import Tracer
 
 from .components import add, is_exact, mul, sub
 from .fuse import is_plain, without_repetition
+from .graph import OPERATORS
 from .jax_internals import FUSES, ClosedJaxpr, Literal, bound, settings
 from .reads import on_forget, settling, version_of
 
@@ -114,15 +115,7 @@ def _evaluated(equation: Any, xs: Sequence[Any]) -> Sequence[Any]:
 
 
 _OF_TWO = {"add": add, "sub": sub, "mul": mul}
-_OF_EXACT: dict[str, Callable[..., Any]] = {
-    "add": lambda x, y: x + y,
-    "sub": lambda x, y: x - y,
-    "mul": lambda x, y: x * y,
-    "div": lambda x, y: x / y,
-    "neg": lambda x: -x,
-    "abs": abs,
-    "square": lambda x: x * x,
-}
+_OF_EXACT: dict[str, Callable[..., Any]] = {**OPERATORS, "abs": abs, "square": lambda x: x * x}
 
 
 def _with_exact(equation: Any, xs: Sequence[Any]) -> Any:

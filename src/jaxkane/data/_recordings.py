@@ -227,12 +227,8 @@ def _with_rates(trial: Trial, step: float = 0.002, window: int = 25) -> Trial:
     for name, y in trial.measured.items():
         slopes = np.asarray(savgol_filter(np.interp(even, trial.t, y), window, 3, deriv=1, delta=step))
         rates[name.replace("angle", "rate")] = np.interp(trial.t, even, slopes)
-    return _with_start(trial, rates)
+    return trial.begun(rates)
 
 
 def _with_median_speed(trial: Trial) -> Trial:
-    return _with_start(trial, {"speed": float(np.median(trial.initial["speed"]))})
-
-
-def _with_start(trial: Trial, initial: Mapping[str, Any]) -> Trial:
-    return Trial(trial.t, trial.measured, trial.inputs, sigma=trial.sigma, initial=initial, name=trial.name)
+    return trial.begun({"speed": float(np.median(trial.initial["speed"]))})

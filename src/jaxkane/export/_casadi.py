@@ -10,7 +10,7 @@ import numpy as np
 from .._common.lookup import refuse_unknown
 from .._description.system import System
 from .._method.formulas import OFFERED, Formulas
-from .._scalars.graph import NotScalarError, needed
+from .._scalars.graph import OPERATORS, NotScalarError, needed
 from .._scalars.written import as_objects
 from ._names import in_ascii
 
@@ -73,11 +73,7 @@ def _matrix(ca: Any, nodes: np.ndarray, objects: dict[int, Any]) -> Any:
 def table(ca: Any) -> dict[str, Any]:
     own = "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp expm1 log log1p erf sqrt floor".split()
     return {name: getattr(ca, name) for name in own} | {
-        "add": lambda x, y: x + y,
-        "sub": lambda x, y: x - y,
-        "mul": lambda x, y: x * y,
-        "div": lambda x, y: x / y,
-        "neg": lambda x: -x,
+        **OPERATORS,
         "rem": ca.fmod,
         "pow": lambda x, y: x**y,
         "exp2": lambda x: 2**x,

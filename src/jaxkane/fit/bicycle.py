@@ -134,4 +134,4 @@ def _with_wheel_rate(ride: Trial, bicycle: WhippleBicycle) -> Trial:
         initial["rear_wheel_rate"] = -initial.pop("speed") / float(bicycle.rR)
     elif "rear_wheel_rate" not in initial and "rear_wheel_rate" not in ride.measured:
         raise ValueError(f"{ride.name}: a ride needs its speed: Trial(..., initial={{'speed': v}}) [m/s].")
-    return Trial(ride.t, ride.measured, ride.inputs, sigma=ride.sigma, initial=initial, name=ride.name)
+    return ride.begun(initial)

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from .._method.formulas import Formulas
+from .._scalars.graph import OPERATORS
 
 
 def imported() -> Any:
@@ -94,11 +95,7 @@ def table() -> dict[str, Any]:
     sp = imported()
     own = "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp log erf sqrt floor".split()
     return {name: getattr(sp, name) for name in own} | {
-        "add": lambda x, y: x + y,
-        "sub": lambda x, y: x - y,
-        "mul": lambda x, y: x * y,
-        "div": lambda x, y: x / y,
-        "neg": lambda x: -x,
+        **OPERATORS,
         "rem": lambda x, y: sp.sign(x) * sp.Mod(sp.Abs(x), sp.Abs(y)),  # of the sign of x
         "pow": lambda x, y: x**y,
         "exp2": lambda x: 2**x,

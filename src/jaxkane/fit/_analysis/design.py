@@ -167,7 +167,7 @@ class _Plan:
         rides = dataclasses.replace(problem, windows=found.windows).trajectories(problem.start)
         moves = _joined(problem, [np.concatenate([ride.q, ride.u], axis=1).T for ride in rides])
         known = dict(zip((*problem.system.coordinates, *problem.system.speeds), moves, strict=True))
-        return Trial(self.t, trial.measured, trial.inputs, sigma=self.sigma, initial=known, name="plan")
+        return trial.begun(known)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -147,6 +147,10 @@ class Trial:
             name=self.name,
         )
 
+    def begun(self, initial: Mapping[str, Any]) -> Trial:
+        """The same, with another `initial`."""
+        return Trial(self.t, self.measured, self.inputs, sigma=self.sigma, initial=initial, name=self.name)
+
     def __repr__(self) -> str:
         span = f"{len(self.t)} times from {self.t[0]:g} to {self.t[-1]:g} s"
         return f"Trial({self.name!r}, {span}: {', '.join(self.measured)})"
