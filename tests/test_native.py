@@ -35,6 +35,11 @@ OPERATIONS = dict(
     "pow": lambda x: (4 + x) ** 1.7,
     "atan2": lambda x: jnp.arctan2(x, x[::-1]),
     "rem": lambda x: jax.lax.rem(x, jnp.asarray(0.7, x.dtype)),
+    "mod": lambda x: [jnp.mod(x, 0.7), jnp.mod(x, -0.7), x // 0.7],
+    "whole numbers": lambda x: [jnp.ceil(x), jnp.trunc(3 * x), jnp.round(3 * x), jax.lax.round(3 * x), jnp.round(x, 1)],
+    "halves": lambda x: [f(jnp.round(5 * x) + 0.5) for f in (jnp.round, jax.lax.round)],
+    "largest": lambda x: [jnp.max(x), jnp.min(x), jnp.prod(x), jnp.max(jnp.outer(x, x), axis=1)],
+    "any and all": lambda x: [jnp.any(x > 0.5), jnp.all(x > -0.5), (x > 0.0) == (x < 0.5), (x > 0.0) != (x < 0.5)],
     "integer powers": lambda x: [jax.lax.integer_pow(x, n) for n in (-3, -1, 0, 2, 7)],
     "max and min": lambda x: [jnp.maximum(x, x[::-1]), jnp.minimum(x, 0.1), jnp.clip(x, -0.5, 0.5)],
     "comparisons": lambda x: [x < x[::-1], x <= 0.0, x > 0.0, x >= x, x == x[::-1], x != x],
@@ -148,13 +153,15 @@ def test_batches_of_batches():
 
 @pytest.mark.usefixtures("native")
 def test_what_cannot_be_written_is_left_to_xla():
-    f = fused(lambda x: jnp.round(x) + jnp.sin(x))
+    whole = lambda x: x.astype(jnp.int32).astype(x.dtype)  # noqa: E731
+    f = fused(lambda x: whole(x) + jnp.sin(x))
     fuse._told.clear()
-    with pytest.raises(native_kernels.NotScalarError, match="round"):
-        native_kernels.Scalars(jax.make_jaxpr(jnp.round)(1.0))
-    with pytest.warns(UserWarning, match="uses round of float64, which native kernels do not know") as told:
-        found = jax.jit(f)(1.7), *jax.jit(jax.vmap(f))(jnp.array([1.7, 2.2]))
-    np.testing.assert_allclose(found, np.round([1.7, 1.7, 2.2]) + np.sin([1.7, 1.7, 2.2]))
+    with pytest.raises(native_kernels.NotScalarError, match="convert_element_type of float64"):
+        native_kernels.Scalars(jax.make_jaxpr(whole)(jnp.array(1.0)))
+    match = "uses convert_element_type of float64, which native kernels do not know"
+    with pytest.warns(UserWarning, match=match) as told:
+        found = jax.jit(f)(jnp.array(1.7)), *jax.jit(jax.vmap(f))(jnp.array([1.7, 2.2]))
+    np.testing.assert_allclose(found, np.floor([1.7, 1.7, 2.2]) + np.sin([1.7, 1.7, 2.2]))
     assert len(told) == 1
 
 

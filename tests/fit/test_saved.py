@@ -5,6 +5,7 @@ import pytest
 from systems import Cart, Track
 
 import jaxkane as jk
+from jaxkane._common.digest import differences
 from jaxkane.fit import (
     GradientDescent,
     LeastSquares,
@@ -23,6 +24,7 @@ from jaxkane.fit import (
     report,
     trajectories,
 )
+from jaxkane.fit._problem.state_file import described
 
 t = np.linspace(0.0, 1.0, 11)
 PUSH = np.sin(3.0 * t)
@@ -115,6 +117,13 @@ def test_a_fit_of_another_problem_is_refused(path):
     ):
         with pytest.raises(ValueError, match=rf"a.npz is the fit of another problem. It differs in .*{message}"):
             load(path, other)
+
+
+def test_a_fixed_parameter_that_differs_is_named():
+    there, here = (
+        described(pose(Track(gain=gain), free=["drift"], simulation=Simulation(step=0.1))) for gain in (1.0, 2.5)
+    )
+    assert differences(there, here) == "fixed parameter gain (1.0 there, 2.5 here)"
 
 
 def test_a_file_that_is_no_fit_is_named(path, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
@@ -190,6 +191,14 @@ def flatten_residuals(given: Any, what: str) -> tuple[Component, ...]:
         raise TypeError(f"{what} are numbers and Vectors in a list, got {given!r}.{hint}") from None
 
 
+_moments = itertools.count()
+
+
+def now() -> int:
+    """A number that is larger each time, by which a motion is told from one that was made before."""
+    return next(_moments)
+
+
 class Motion:
     """What `System.motion` returns: bodies, velocity residuals, and the frames and points that others ask for.
 
@@ -203,7 +212,7 @@ class Motion:
     **Raises:** `ValueError` where one name stands for two of these; `TypeError` for what is no body, point or frame.
     """
 
-    __slots__ = ("N", "_named", "bodies", "constraints", "frames", "points", "vanishing")
+    __slots__ = ("N", "_named", "bodies", "constraints", "frames", "made", "points", "vanishing")
 
     def __init__(
         self,
@@ -222,6 +231,7 @@ class Motion:
         self.points = dict(points or {})
         self.frames = dict(frames or {})
         self._named = self._by_name()
+        self.made = now()
         self.N: Frame = self.bodies[0].center.velocity.frame.root
         for name, part in (*self.points.items(), *self.frames.items()):
             part.name = name

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
-import jax
 from jaxtyping import Array, Float
 
+from .._common.lookup import refuse_unknown
 from .._scalars.types import Component
 from .bodies import Motion
 from .parameters import check_fields, check_parameter, parameter_info, to_float
-from .values import Values
+from .prepared import METHODS, NAMES, Kind, checked_names, checked_units
 
 
 class State(eqx.Module):
@@ -27,7 +26,7 @@ class State(eqx.Module):
     u: Float[Array, "*batch n_u"] = eqx.field(converter=to_float)
 
 
-class System(eqx.Module):
+class System(eqx.Module, metaclass=Kind):
     """A mechanism: its array leaves are its parameters, its methods describe it.
 
     A subclass names its coordinates and speeds, and writes `motion`; and, where it needs them, `loads`, `q_dot`,
@@ -37,13 +36,13 @@ class System(eqx.Module):
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
         super().__init_subclass__(**kwargs)
-        for kind in NAMES:
-            if kind in cls.__dict__ and not hasattr(cls.__dict__[kind], "__get__"):  # a property is read of an instance
-                setattr(cls, kind, _checked_names(cls.__name__, kind, cls.__dict__[kind]))
-        for method in ("motion", "q_dot", "loads", "configuration_constraints", "events"):
+        for kind in (*NAMES, "units"):
+            if kind in cls.__dict__:
+                setattr(cls, kind, cls.__dict__[kind])
+        for method in METHODS:
             owner = next(base for base in cls.__mro__ if method in base.__dict__)
             if owner is cls or not issubclass(owner, System):  # a class without a System that is mixed in
-                setattr(cls, method, _named(owner.__dict__[method]))
+                setattr(cls, method, owner.__dict__[method])
 
     coordinates: ClassVar[tuple[str, ...]] = ()
     """Names of the generalized coordinates."""
@@ -91,6 +90,11 @@ class System(eqx.Module):
         """Residuals that are zero in every possible configuration."""
         return ()
 
+    def implied_constraints(self, t: Component, q: Any) -> Sequence[Component]:
+        """Residuals that are zero wherever the configuration constraints are: those of a closed loop that follow from
+        the others. Nothing is solved for them; a state that does not meet them is refused."""
+        return ()
+
     def events(self, t: Component, q: Any, u: Any) -> Mapping[str, Any]:
         """Signed, smooth quantities by name; a simulation ends, with that name as its status, when one passes zero.
 
@@ -100,22 +104,20 @@ class System(eqx.Module):
         return {}
 
 
-NAMES = ("coordinates", "speeds", "dependent_speeds", "auxiliary_speeds", "dependent_coordinates", "inputs")
 _FOUND_BY_NAME = tuple(kind for kind in NAMES if kind != "dependent_coordinates")  # these are coordinates
-
-
-def _checked_names(system: str, kind: str, given: Any) -> tuple[str, ...]:
-    if isinstance(given, str):
-        raise TypeError(f"{system}.{kind} is a tuple of names; {given!r} is a string. One name is ({given!r},).")
-    if not isinstance(given, (tuple, list)) or not all(isinstance(name, str) and name for name in given):
-        raise TypeError(f"{system}.{kind} is a tuple of names, such as ('angle',); got {given!r}.")
-    return tuple(given)
 
 
 def _check_names(system: System) -> None:
     """Refuse names that stand for two things."""
     name = type(system).__name__
-    names = {kind: _checked_names(name, kind, getattr(system, kind)) for kind in NAMES}
+    names = {kind: checked_names(name, kind, getattr(system, kind)) for kind in NAMES}
+    units = checked_units(name, system.units)
+    if "units" in vars(type(system)):  # those that are inherited may name what this class has not
+        refuse_unknown(
+            units,
+            [each for named in names.values() for each in named],
+            f"{name}.units names what is no coordinate, speed or input:",
+        )
     owners: dict[str, str] = {}
     for kind in _FOUND_BY_NAME:
         for each in names[kind]:
@@ -131,44 +133,3 @@ def _check_names(system: System) -> None:
             f"{name}.dependent_coordinates names coordinates, each once: {', '.join(strange)} is none, or stands there "
             f"twice. The coordinates are: {have}."
         )
-
-
-_ASKED_FOR_A_VALUE = (
-    jax.errors.TracerArrayConversionError,
-    jax.errors.TracerIntegerConversionError,
-    jax.errors.ConcretizationTypeError,
-)
-
-
-def _named(method: Callable[..., Any]) -> Callable[..., Any]:
-    """A method of a description whose `q` and `u` may be any sequence, and are read by place and by name."""
-
-    @functools.wraps(method)
-    def call(self: System, t: Component, q: Any, *rest: Any, **more: Any) -> Any:
-        q = _values(q, self.coordinates, f"{type(self).__name__}: q")
-        if rest:
-            names = (*self.speeds, *self.dependent_speeds, *self.auxiliary_speeds)
-            rest = (_values(rest[0], names, f"{type(self).__name__}: u", len(self.auxiliary_speeds)), *rest[1:])
-        try:
-            return method(self, t, q, *rest, **more)
-        except _ASKED_FOR_A_VALUE as error:
-            raise TypeError(
-                f"{type(self).__name__}.{method.__name__} asks for the value of a number that has none while the "
-                "description is traced: time, coordinates, speeds, parameters, and what follows from them. Write "
-                "jnp.sin for np.sin and math.sin, jnp.where(a > b, x, y) for `if`, jnp.maximum and jnp.minimum for max "
-                "and min, and neither float() nor .item(). A number that a description counts with, as that of its "
-                "links, is a static field: `links: int = equinox.field(static=True)`."
-            ) from error
-
-    return call
-
-
-def _values(values: Any, names: Sequence[str], label: str, n_optional: int = 0) -> Values:
-    if isinstance(values, Values) and values.names == tuple(names):
-        return values
-    items = list(values)
-    if len(items) == len(names) - n_optional:
-        items += [0.0] * n_optional  # auxiliary speeds are zero in the motion
-    if len(items) != len(names):
-        raise ValueError(f"{label} must have {len(names)} entries ({', '.join(names)}), got {len(items)}.")
-    return Values(items, names)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 
-from .._common.lookup import refuse_unknown
 from .system import System
 
 
@@ -19,15 +18,9 @@ def unit_of(name: str, declared: Mapping[str, str]) -> str:
 
 
 def units_of(system: System) -> dict[str, str]:
-    """Units by name that a system declares; and of speeds that are the rates of such coordinates.
-
-    **Raises:** `ValueError` for a unit of what is no coordinate, speed or input.
-    """
+    """Units by name that a system declares; and of speeds that are the rates of such coordinates."""
     speeds = (*system.speeds, *system.dependent_speeds)
     names = (*system.coordinates, *speeds, *system.auxiliary_speeds, *system.inputs)
-    if "units" in vars(type(system)):  # those that are inherited may name what this class has not
-        wrong = f"{type(system).__name__}.units names what is no coordinate, speed or input:"
-        refuse_unknown(system.units, names, wrong)
     units = {name: unit for name, unit in system.units.items() if name in names}
     if type(system).q_dot is System.q_dot:
         for coordinate, speed in zip(system.coordinates, speeds, strict=False):

@@ -17,7 +17,13 @@ from .._scalars.nan import nan_where
 from .._scalars.reads import compiled
 from .._scalars.types import Component
 from .check_description import MOST_REMEMBERED, structure_of, with_trial_numbers
-from .checks import check_system, configuration_residual, is_concrete
+from .checks import (
+    check_system,
+    configuration_residual,
+    configuration_tolerance,
+    implied_residual,
+    is_concrete,
+)
 from .equations import dependent_speeds
 from .kane import as_array
 
@@ -40,7 +46,7 @@ def assemble(
         start at zero; of four Euler parameters the last starts at one, so that those left out are no rotation.
     - `u` (n_u,), or a dict by name in which speeds left out are zero: the independent speeds. Dependent speeds may be
         given too, and are then compared with what the residuals say.
-    - `t`: time [s].
+    - `t`: time [s], one finite number.
     - `free`: names of the coordinates that are moved. By default `system.dependent_coordinates`; of a system that
         names none, those left out of the dict `q`, or all of an array. Where more are moved than there are constraints,
         the nearest along the constraints' gradients is taken. All others are held.
@@ -51,6 +57,7 @@ def assemble(
     Under a trace the coordinates, and all their derivatives, become NaN instead.
     """
     name = type(system).__name__
+    _check_time(name, t)
     plan = _plan(system, q, free)
     q0 = as_array(plan.guess | dict(q) if isinstance(q, Mapping) else q, system.coordinates, f"{name}: q")
     given: dict[str, Any] = {}
@@ -69,6 +76,14 @@ def assemble(
             u_dep = dict(zip(system.dependent_speeds, dependent_speeds(system, t, q0, u0), strict=True))
             _check_dependent_speeds(name, given, u_dep)
     return State(q0, u0)
+
+
+def _check_time(name: str, t: Any) -> None:
+    is_number = not isinstance(t, (str, bytes, type(None))) and np.shape(t) == ()
+    if not is_number or (not isinstance(t, jax.Array) and np.asarray(t).dtype.kind not in "iuf"):
+        raise TypeError(f"{name}: the time `t` is one number [s], got {t!r}.")
+    if is_concrete(t) and not np.isfinite(np.asarray(t)):
+        raise ValueError(f"{name}: the time t = {t} is not finite.")
 
 
 class _Plan(NamedTuple):
@@ -169,6 +184,7 @@ class _Found(NamedTuple):
     q: Any  # NaN where it is not good
     good: Any  # the constraints are met, and determine what was moved
     remainder: Any  # largest residual
+    follows: Any  # largest of those that follow from these
     slope: Any  # smallest singular value of the residuals' derivatives along what was moved
     steps: Any
 
@@ -200,9 +216,10 @@ def _newton(system: System, q0, t, where: tuple[int, ...], lenient: bool) -> _Fo
     h = configuration_residual(system, t, q)
     derivatives = jax.jacfwd(residual)(jax.lax.stop_gradient(solution.value), jax.lax.stop_gradient(args))
     slope = jnp.linalg.svd(derivatives, compute_uv=False)[-1]
-    good = finite & jnp.all(_met(h)) & (slope > eps**0.6)
+    follows = jnp.max(jnp.abs(implied_residual(system, t, q)), initial=0.0)
+    good = finite & jnp.all(_met(h)) & (slope > eps**0.6) & (follows <= configuration_tolerance(q0.dtype))
     q = nan_where(~good, q, origin)
-    return _Found(q, good, jnp.max(jnp.abs(h)), slope, solution.stats["num_steps"])
+    return _Found(q, good, jnp.max(jnp.abs(h)), follows, slope, solution.stats["num_steps"])
 
 
 def _start(system: System, q0, t, places: np.ndarray):
@@ -238,6 +255,12 @@ def _why_not(system: System, q0, plan: _Plan, found: _Found) -> str:
         return (
             f"{name}: {held} does not satisfy the configuration constraints (the largest residual is "
             f"{float(found.remainder):.3g}), and nothing is left to be moved.{more}"
+        )
+    if float(found.follows) > configuration_tolerance(q0.dtype) >= float(found.remainder):
+        return (
+            f"{name}: the configuration constraints can be met, but what should follow from them is off by "
+            f"{float(found.follows):.3g}: with these parameters the loop cannot be closed. The ends of a loop in a "
+            "plane are at one height across it."
         )
     if float(found.remainder) < 1e-3 and not float(found.slope) > 1e-6:
         return (

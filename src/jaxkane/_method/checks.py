@@ -15,11 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from .._description.bodies import flatten_residuals
 from .._description.parameters import in_batches
 from .._description.system import State, System
 from .._scalars.fuse import fused
 from .._scalars.jax_internals import concretely
-from .._scalars.linear import stack
+from .._scalars.linear import as_vector, stack
 from .._scalars.nan import nan_where
 from .check_description import check_description
 from .check_description import configuration_residual as configuration_residual
@@ -154,6 +155,25 @@ def _minors(A: Any) -> list[Any]:
     return [A[i, i] * A[j, j] - A[i, j] * A[j, i] for i, j in ((0, 1), (0, 2), (1, 2))]
 
 
+@fused
+def _implied_residual(system: System, t: Any, q: Any):
+    residuals = system.implied_constraints(t, tuple(q[i] for i in range(len(q))))
+    return as_vector(flatten_residuals(residuals, f"{type(system).__name__}: the residuals of implied_constraints"), q)
+
+
+def implied_residual(system: System, t: Any, q: Any) -> Any:
+    """Residuals (h,) that follow from the configuration constraints."""
+    if type(system).implied_constraints is System.implied_constraints:
+        return jnp.zeros(0, q.dtype)
+    return _implied_residual(system, t, q)
+
+
+def configuration_is_met(system: System, t: Any, q: Any) -> Any:
+    """Whether the configuration constraints are met, and what follows from them."""
+    residuals = jnp.concatenate([configuration_residual(system, t, q), implied_residual(system, t, q)])
+    return jnp.all(jnp.abs(residuals) <= configuration_tolerance(residuals.dtype))
+
+
 def check_state(system: System, t: Any, q: Any) -> None:
     """Refuse coordinates that violate a configuration constraint, with the residual."""
     if not is_concrete(system, t, q):
@@ -165,6 +185,12 @@ def check_state(system: System, t: Any, q: Any) -> None:
             f"{type(system).__name__}: the coordinates violate the configuration constraints by "
             f"{np.array2string(np.asarray(residual), precision=3)}. Find {adjust} with jaxkane.assemble(system, q, u)."
         )
+    implied = implied_residual(system, t, q)
+    if implied.size and not np.max(np.abs(implied)) <= configuration_tolerance(implied.dtype):
+        raise ValueError(
+            f"{type(system).__name__}: what follows from the configuration constraints is violated by "
+            f"{np.array2string(np.asarray(implied), precision=3)}: with these parameters the loop cannot be closed."
+        )
 
 
 def met_or_refused(system: System, t: Any, q: Any, left_out: Sequence[str]) -> Any:
@@ -175,7 +201,7 @@ def met_or_refused(system: System, t: Any, q: Any, left_out: Sequence[str]) -> A
     residual = configuration_residual(system, t, q)
     if not residual.size:
         return q
-    met = jnp.max(jnp.abs(residual)) <= configuration_tolerance(residual.dtype)
+    met = configuration_is_met(system, t, q)
     if is_concrete(met) and not met:
         raise ValueError(
             f"{type(system).__name__}: with {', '.join(left_out)} left out of q, and taken as zero, the configuration "

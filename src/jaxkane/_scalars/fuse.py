@@ -47,10 +47,11 @@ from .reads import on_forget, settling, version_of
 # What one compiled function may hold: elementwise work and the moving of scalars. Calls into libraries (LAPACK) may not
 # be compiled so, and loops would gain nothing.
 _PLAIN = frozenset(
-    "abs acos acosh add add_any and asin asinh atan atan2 atanh broadcast_in_dim cbrt clamp concatenate "
-    "convert_element_type copy copy_p cos cosh div eq erf exp exp2 expm1 floor ge gt integer_pow is_finite jit le log "
-    "log1p logistic lt max min mul ne neg not or pad pjit pow reduce_sum rem reshape rev round rsqrt select_n sign sin "
-    "sinh slice split sqrt square squeeze stack stop_gradient sub tan tanh transpose unstack xor".split()
+    "abs acos acosh add add_any and asin asinh atan atan2 atanh broadcast_in_dim cbrt ceil clamp concatenate "
+    "convert_element_type copy copy_p cos cosh div eq erf exp exp2 expm1 floor ge gt integer_pow is_finite jit le "
+    "log log1p logistic lt max min mul ne neg not or pad pjit pow reduce_and reduce_max reduce_min reduce_or "
+    "reduce_prod reduce_sum rem reshape rev round rsqrt select_n sign sin sinh slice split sqrt square squeeze "
+    "stack stop_gradient sub tan tanh transpose unstack xor".split()
 )
 _LARGEST_SUM = 64  # XLA may hand larger ones to a library
 _MOST_LANES = 128  # in XLA's hands: with more, intermediates no longer stay in the cache
@@ -454,5 +455,5 @@ def _foreign(program: Jaxpr, is_ours: bool = False) -> Iterator[tuple[str, bool]
             yield from _foreign(inner.jaxpr, is_ours or BY_LAPACK in equation.params.get("name", ""))
         elif name not in _PLAIN:
             yield name, not is_ours
-        elif name == "reduce_sum" and getattr(equation.invars[0].aval, "size", 0) > _LARGEST_SUM:
-            yield f"a sum of more than {_LARGEST_SUM}", not is_ours
+        elif name.startswith("reduce_") and getattr(equation.invars[0].aval, "size", 0) > _LARGEST_SUM:
+            yield f"{name} of more than {_LARGEST_SUM}", not is_ours

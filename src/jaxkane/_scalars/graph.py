@@ -8,6 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from jax.lax import RoundingMethod
 
 from .jax_internals import Jaxpr, Literal
 
@@ -35,6 +36,7 @@ SIMPLE = frozenset("sqrt abs floor max min".split())
 LIBRARY = frozenset(
     "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp exp2 expm1 log log1p pow cbrt erf".split()
 )
+_OF_MANY = {"reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul", "reduce_and": "and", "reduce_or": "or"}
 _COMMUTES = frozenset("add mul max min and or xor".split())
 _SAME = frozenset("copy copy_p stop_gradient optimization_barrier".split())
 
@@ -173,8 +175,18 @@ def _operation(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.nda
         raise NotScalarError(f"{name} of {x_dtype}")
     one = _full((), 1.0, graph, dtype) if dtype in FLOATS else xs[0]
     match name:
+        case "eq" | "ne" if x_dtype == "bool":  # as jnp.mod asks whether two signs differ
+            differ = each("xor", *xs)
+            return [differ if name == "ne" else each("xor", differ, _full((), True, graph, "bool"))]
+        case "convert_element_type" if dtype == x_dtype:
+            return [xs[0]]
         case "neg":
             return [each(name, xs[0])]
+        case "ceil":
+            return [each("neg", each("floor", each("neg", xs[0])))]
+        case "round":
+            to_even = params["rounding_method"] == RoundingMethod.TO_NEAREST_EVEN
+            return [_rounded(xs[0], to_even, each, graph, dtype)]
         case "sign":
             zero = _full((), 0.0, graph, dtype)
             positive, negative = each("gt", xs[0], zero, dtype="bool"), each("lt", xs[0], zero, dtype="bool")
@@ -196,9 +208,11 @@ def _operation(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.nda
         case "clamp":
             return [each("min", each("max", xs[1], xs[0]), xs[2])]
         case "convert_element_type" if dtype in FLOATS:
-            return [xs[0] if x_dtype == dtype else each("convert", xs[0])]
+            return [each("convert", xs[0])]
         case "reduce_sum":
-            return [_summed(xs[0], params["axes"], each, _full((), 0.0, graph, dtype))]
+            return [_reduced("add", xs[0], params["axes"], each, _full((), 0.0, graph, dtype))]
+        case "reduce_max" | "reduce_min" | "reduce_prod" | "reduce_and" | "reduce_or" if xs[0].size:
+            return [_reduced(_OF_MANY[name], xs[0], params["axes"], each)]
     if name in LOGIC and dtype == "bool":
         return [each(name, *xs)]
     if name in COMPARISONS and x_dtype in FLOATS:
@@ -258,9 +272,23 @@ def _power(x: np.ndarray, y: int, each: Callable[..., np.ndarray], one: np.ndarr
     return found if y >= 0 else each("div", one, found)
 
 
-def _summed(x: np.ndarray, axes: Iterable[int], each: Callable[..., np.ndarray], zero: np.ndarray) -> np.ndarray:
+def _rounded(x: np.ndarray, to_even: bool, each: Callable[..., np.ndarray], graph: Graph, dtype: str) -> np.ndarray:
+    """The nearest whole number; of two that are as near the even one, or else that farther from zero."""
+    half, one = _full((), 0.5, graph, dtype), _full((), 1.0, graph, dtype)
+    below = each("floor", x)
+    rest, halved = each("sub", x, below), each("mul", half, below)
+    even = each("eq", halved, each("floor", halved), dtype="bool")
+    down = even if to_even else each("lt", x, _full((), 0.0, graph, dtype), dtype="bool")
+    down = each("and", each("eq", rest, half, dtype="bool"), down, dtype="bool")
+    down = each("or", each("lt", rest, half, dtype="bool"), down, dtype="bool")
+    return each("select", down, below, each("add", below, one))
+
+
+def _reduced(
+    operation: str, x: np.ndarray, axes: Iterable[int], each: Callable[..., np.ndarray], *first: np.ndarray
+) -> np.ndarray:
     for axis in sorted(axes, reverse=True):
-        x = functools.reduce(lambda a, b: each("add", a, b), np.moveaxis(x, axis, 0), zero)
+        x = functools.reduce(lambda a, b: each(operation, a, b), [*first, *np.moveaxis(x, axis, 0)])
     return x
 
 

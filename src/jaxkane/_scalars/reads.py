@@ -218,6 +218,8 @@ class _Walk:
     def function(self, f: types.FunctionType) -> None:
         self.say("function", f.__qualname__)
         self.reads.functions.append((f, f.__code__, f.__defaults__, f.__kwdefaults__))
+        if "__wrapped__" in vars(f):  # which IPython's autoreload changes, and not the closure
+            self.reads.named.append((vars(f), "__wrapped__", f.__wrapped__))
         cells = f.__closure__ or ()
         if _is_library(f.__globals__.get("__name__") or "__main__"):
             # Of a library's decorator, what it decorates.

@@ -14,7 +14,7 @@ from .._common.lookup import not_there
 from .._description.parameters import parameter_info
 from .._description.system import State, System
 from .._description.units import units_of
-from .._method.checks import configuration_residual, configuration_tolerance
+from .._method.checks import configuration_is_met
 from .._method.drift import correction, has_configuration_constraints, projected
 from .._method.equations import _dependent_speeds
 from .._method.kane import Instant, checked_inputs
@@ -191,8 +191,7 @@ def inputs_at(system: System, signals: Any, t: Component, q: Array, u: Array, al
 
 def _is_valid(system: System, state: State, ts: Array, signals: Any) -> Array:
     positive = [jnp.all(getattr(system, name) > 0) for name, info in parameter_info(system).items() if info.positive]
-    residual = configuration_residual(system, ts[0], state.q)
-    consistent = jnp.all(jnp.abs(residual) <= configuration_tolerance(residual.dtype))
+    consistent = configuration_is_met(system, ts[0], state.q)
     # A window of a fit may stand still at its last time.
     rising = jnp.all(ts[1:] >= ts[:-1]) & (ts[-1] > ts[0])
     return jnp.all(

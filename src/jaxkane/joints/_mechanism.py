@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
-from .._common.lookup import hint
+from .._common.lookup import hint, not_there
 from .._description.bodies import Body, Force, Motion
 from .._description.parameters import parameter, parameter_info
 from .._description.system import System
@@ -51,6 +51,10 @@ class LoopShape(NamedTuple):
     second: str
     rigid: bool
     kept: tuple[int, ...]  # of its residuals
+
+    @property
+    def size(self) -> int:
+        return 6 if self.rigid else 3
 
 
 class CouplingShape(NamedTuple):
@@ -167,8 +171,19 @@ class Mechanism(System):
         norms = [x for joint in self.structure.joints for x in joint.norm(own(joint))]
         if not (self.structure.loops or self.structure.couplings):
             return norms
+        return [*self._apart(t, q, left_out=False), *norms]
+
+    def implied_constraints(self, t, q):
+        structure = self.structure
+        all_kept = all(len(loop.kept) == loop.size for loop in structure.loops)
+        if all_kept and all(coupling.is_kept for coupling in structure.couplings):
+            return []
+        return self._apart(t, q, left_out=True)
+
+    def _apart(self, t: Any, q: Any, left_out: bool) -> list[Any]:
+        """How far what closes the loops is from closing them: the residuals that count, or those that follow."""
         still = dict.fromkeys((*self.speeds, *self.dependent_speeds), 0.0)
-        return [*self._closed(self.motion(t, q, tuple(still.values())).sites, q, still)[0], *norms]
+        return self._closed(self.motion(t, q, tuple(still.values())).sites, q, still, left_out)[0]
 
     def _forces(self, joint: Shape, q: list[Component], u: list[Component], inputs: Any) -> list[Component]:
         """Forces along the joint's speeds [N or N m]: of its spring, damper and actuators."""
@@ -194,8 +209,11 @@ class Mechanism(System):
         xx, yy, zz, xy, xz, yz = (self._read(f"inertia.{link}.{ij}") for ij in MOMENTS)
         return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
 
-    def _closed(self, sites: dict[str, tuple[Frame, Point]], q: Any, u: Any) -> tuple[list[Any], list[Any]]:
-        """What closes the loops: residuals of the configuration, and of the velocities."""
+    def _closed(
+        self, sites: dict[str, tuple[Frame, Point]], q: Any, u: Any, left_out: bool = False
+    ) -> tuple[list[Any], list[Any]]:
+        """What closes the loops: residuals of the configuration, and of the velocities; or those that are left out,
+        since they follow."""
         h: list[Any] = []
         c: list[Any] = []
         for loop in self.structure.loops:
@@ -206,10 +224,11 @@ class Mechanism(System):
                 x, y, z = (axis.components_in(A) for axis in (B.x, B.y, B.z))
                 apart = (*apart, z[1], x[2], y[0])  # cosines between axes that are across
                 parting = (*parting, *(B.angular_velocity - A.angular_velocity).components_in(A))
-            h += [apart[i] for i in loop.kept]
-            c += [parting[i] for i in loop.kept]
+            rows = [i for i in range(loop.size) if (i in loop.kept) != left_out]
+            h += [apart[i] for i in rows]
+            c += [parting[i] for i in rows]
         for coupling in self.structure.couplings:
-            if coupling.is_kept:
+            if coupling.is_kept != left_out:
                 value, slope = _polynomial(coupling.coefficients, q[coupling.second] if coupling.second else 0.0)
                 h.append(q[coupling.first] - value)
                 rate = mul(slope, u[f"{coupling.second}_rate"]) if coupling.second else 0.0
@@ -247,20 +266,50 @@ def _polynomial(coefficients: tuple[float, ...], x: Component) -> tuple[Componen
     return value, slope
 
 
+class Named(dict[str, Any]):
+    """Parameters by name. One that is zero in the structure is none, and is refused as such."""
+
+    def __init__(self, of: str, structure: Structure):
+        super().__init__()
+        self._of, self._structure = of, structure
+
+    def __missing__(self, name: str) -> Any:
+        kind, *parts = self._of.split(".")
+        if name not in (_PARTS_OF[kind](self._structure) if not parts else (*"xyz", *MOMENTS)):
+            raise not_there(name, self, f"`{self._of}`")
+        raise KeyError(
+            f"{self._structure.name} has no parameter {self._of}.{name}: it was written as 0 where the mechanism was "
+            "made, and is part of its structure, which cannot be changed. Give jax.numpy.zeros(()) there."
+        )
+
+
 def _view(kind: str) -> property:
-    def read(self: Mechanism) -> dict[str, Any]:
-        found: dict[str, Any] = {}
+    def read(self: Mechanism) -> Named:
+        found = Named(kind, self.structure)
         for field in dataclasses.fields(self):
             first, *parents, last = field.name.split(".")
             if first == kind:
                 inside = found
-                for parent in parents:
-                    inside = inside.setdefault(parent, {})
+                for i, parent in enumerate(parents):
+                    inside = inside.setdefault(parent, Named(".".join((kind, *parents[: i + 1])), self.structure))
                 inside[last] = getattr(self, field.name)
         return found
 
     return property(read, doc=f"The parameters `{kind}.NAME`, by name.")
 
+
+_OF_LINKS, _OF_JOINTS, _OF_ACTUATORS = (
+    lambda structure: [link.name for link in structure.links],
+    lambda structure: [joint.name for joint in structure.joints],
+    lambda structure: [actuator.name for actuator in structure.actuators],
+)
+_PARTS_OF: dict[str, Callable[[Structure], Sequence[str]]] = {
+    **dict.fromkeys(("mass", "center", "inertia", "position"), _OF_LINKS),
+    **dict.fromkeys(("anchor", "damping", "stiffness", "rest", "armature"), _OF_JOINTS),
+    **dict.fromkeys(("gain", "offset", "position_gain", "velocity_gain"), _OF_ACTUATORS),
+    "site": lambda structure: [site.name for site in structure.sites],
+    "gravity": lambda structure: ("x", "y", "z"),
+}
 
 for _kind in KINDS.split():
     setattr(Mechanism, _kind, _view(_kind))

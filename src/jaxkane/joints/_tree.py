@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -60,6 +60,19 @@ def mechanism(
     **Raises:** `ValueError` for names that stand for two things or hold a dot, a parent that is not there, links in a
     circle, and whatever has not the numbers that it should.
     """
+    for what, given, kind in (
+        ("links", links, "Link"),
+        ("actuators", actuators, "Actuator"),
+        ("sites", sites, "Site"),
+        ("loops", loops, "Loop"),
+    ):
+        if isinstance(given, str) or not isinstance(given, Iterable):
+            raise TypeError(
+                f"mechanism: `{what}` is a list, such as [{kind}(...), ...], of one thing too; got a "
+                f"{type(given).__name__}."
+            )
+    if isinstance(dependent, str):
+        raise TypeError(f"mechanism: `dependent` is a list of names, such as [{dependent!r}]; got {dependent!r}.")
     values: dict[str, Any] = components("gravity", gravity)
     links = _in_order([_checked(link, Link) for link in links])
     shapes = tuple(_link(link, values) for link in links)

@@ -30,6 +30,9 @@ class _Respeeded(System):
     def configuration_constraints(self, t, q):
         return self.inner.configuration_constraints(t, q)
 
+    def implied_constraints(self, t, q):
+        return self.inner.implied_constraints(t, q)
+
     def events(self, t, q, u):
         return self.inner.events(t, q, self._in_order(u))
 

@@ -53,6 +53,12 @@ def members_of(system: Any, state: Any, inputs: Inputs, table: Table | None, ts:
     if table is not None and not columns:
         lengths["table"] = len(table)
     if not jax.tree.leaves(members):
+        if table is not None:
+            raise ValueError(
+                f"sweep: the columns of `table` ({', '.join(table.columns)}) are text, which labels a member and "
+                "changes nothing: all members would be the same. Give a column of numbers; numbers that were read as "
+                "text are converted by numpy.asarray(column, float)."
+            )
         raise ValueError(
             "sweep: nothing here is a batch. Give a `table`, or a parameter, state.q, state.u or an input a leading "
             "axis; for one motion call jaxkane.simulate."

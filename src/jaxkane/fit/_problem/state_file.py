@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 
 from ..._common.digest import digest
 from ..._common.whole_file import write_whole
+from ..._description.parameters import leaf_name
 from .problem import Problem
 
 
@@ -63,6 +65,7 @@ def described(problem: Problem) -> dict[str, Any]:
     numbers, rest = eqx.partition(model, eqx.is_array)
     window = jax.tree.map(lambda x: x[0], problem.windows)
     point = problem.start
+    fixed, guessed = _fixed_and_guessed(problem)
 
     def residuals(numbers, window, z, b, x):
         model = eqx.combine(numbers, rest)
@@ -79,7 +82,21 @@ def described(problem: Problem) -> dict[str, Any]:
         "atol": settings.atol,
         "max_steps": settings.max_steps,
         "solver": type(settings.solver).__name__,
-        "initial guesses, priors": digest(jax.tree.leaves(numbers)),
+        "fixed parameter": {name: _told(x) for name, x in fixed.items()},
+        "initial guesses, priors": digest(jax.tree.leaves(dataclasses.replace(numbers, system=guessed))),
         "data": digest(jax.tree.leaves(problem.windows)),
         "program": digest(jax.make_jaxpr(residuals)(numbers, window, point.z[0], point.b[0], point.x)),
     }
+
+
+def _fixed_and_guessed(problem: Problem) -> tuple[dict[str, Any], list[Any]]:
+    """Of the numbers of the system: those that the fit leaves as they are, by name; those that it starts from."""
+    moved = {number for entry in problem.parameters.entries for number, *_ in entry.targets}
+    leaves = jax.tree_util.tree_leaves_with_path(problem.system)
+    arrays = [(i, leaf_name(path), x) for i, (path, x) in enumerate(leaves) if eqx.is_array(x)]
+    return {name: x for i, name, x in arrays if i not in moved}, [x for i, _, x in arrays if i in moved]
+
+
+def _told(x: Any) -> Any:
+    """A number as it is, an array by its digest."""
+    return digest(x) if np.ndim(x) else float(x)

@@ -1,0 +1,128 @@
+"""How names and methods of a system's class are prepared: checked, and reading `q` and `u` by name.
+
+Knows classes and what they are given; knows no mechanism.
+"""
+
+from __future__ import annotations
+
+import functools
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+
+from .._scalars.types import Component
+from .bodies import Motion, now
+from .values import Values
+
+if TYPE_CHECKING:
+    from .system import System
+
+METHODS = ("motion", "q_dot", "loads", "configuration_constraints", "implied_constraints", "events")
+NAMES = ("coordinates", "speeds", "dependent_speeds", "auxiliary_speeds", "dependent_coordinates", "inputs")
+
+
+def _prepared(system: str, name: str, value: Any) -> Any:
+    """What a class gets under a name: checked, if it holds names or units; reading by name, if it is a method."""
+    if hasattr(value, "__get__") and not callable(value):  # a property is read of an instance
+        return value
+    if name in NAMES:
+        return checked_names(system, name, value)
+    if name == "units":
+        return checked_units(system, value)
+    return _named(value) if name in METHODS and callable(value) else value
+
+
+def checked_units(system: str, given: Any) -> Mapping[str, str]:
+    if not isinstance(given, Mapping):
+        raise TypeError(f'{system}.units is a dict of texts by name, as {{"angle": "rad"}}; got {given!r}.')
+    for name, unit in given.items():
+        if not (isinstance(name, str) and isinstance(unit, str)):
+            raise TypeError(f'{system}.units has texts by name, as {{"angle": "rad"}}; got {name!r}: {unit!r}.')
+    return given
+
+
+def checked_names(system: str, kind: str, given: Any) -> tuple[str, ...]:
+    if isinstance(given, str):
+        raise TypeError(f"{system}.{kind} is a tuple of names; {given!r} is a string. One name is ({given!r},).")
+    if not isinstance(given, (tuple, list)) or not all(isinstance(name, str) and name for name in given):
+        raise TypeError(f"{system}.{kind} is a tuple of names, such as ('angle',); got {given!r}.")
+    return tuple(given)
+
+
+class Kind(type(eqx.Module)):
+    """The class of all classes of systems.
+
+    What is set on a class that stands already, as `Pendulum.loads = f` in a notebook, is prepared as what stands in its
+    body.
+    """
+
+    def __new__(mcs, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **kwargs: Any) -> Any:
+        # Of a class made by `type(name, bases, members)` Python would say that equinox has made it.
+        module = sys._getframe(1).f_globals.get("__name__", "__main__")
+        return super().__new__(mcs, name, bases, {"__module__": module, **namespace}, **kwargs)
+
+    def __setattr__(cls, name: str, value: Any) -> None:
+        super().__setattr__(name, _prepared(cls.__name__, name, value))
+
+
+_ASKED_FOR_A_VALUE = (
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+    jax.errors.ConcretizationTypeError,
+)
+
+
+def _named(method: Callable[..., Any]) -> Callable[..., Any]:
+    """A method of a description whose `q` and `u` may be any sequence, and are read by place and by name."""
+    if getattr(method, "reads_by_name", None) is method:  # what decorates such a method has a copy of this, and is none
+        return method
+
+    @functools.wraps(method)
+    def call(self: System, t: Component, q: Any, *rest: Any, **more: Any) -> Any:
+        method = vars(call)["__wrapped__"]  # IPython's autoreload changes what stands there, and no closure
+        q = _values(q, self.coordinates, f"{type(self).__name__}: q")
+        if rest:
+            names = (*self.speeds, *self.dependent_speeds, *self.auxiliary_speeds)
+            rest = (_values(rest[0], names, f"{type(self).__name__}: u", len(self.auxiliary_speeds)), *rest[1:])
+        began = now()
+        try:
+            found = method(self, t, q, *rest, **more)
+        except jax.errors.UnexpectedTracerError as error:
+            raise TypeError(kept_from_a_trace(type(self).__name__)) from error
+        except _ASKED_FOR_A_VALUE as error:
+            raise TypeError(
+                f"{type(self).__name__}.{method.__name__} asks for the value of a number that has none while the "
+                "description is traced: time, coordinates, speeds, parameters, and what follows from them. Write "
+                "jnp.sin for np.sin and math.sin, jnp.where(a > b, x, y) for `if`, jnp.maximum and jnp.minimum for max "
+                "and min, and neither float() nor .item(). A number that a description counts with, as that of its "
+                "links, is a static field: `links: int = equinox.field(static=True)`."
+            ) from error
+        if isinstance(found, Motion) and found.made < began:
+            raise TypeError(kept_from_a_trace(type(self).__name__))
+        return found
+
+    vars(call)["reads_by_name"] = call
+    return call
+
+
+def kept_from_a_trace(system: str) -> str:
+    """What is wrong where a description returns what it made at other coordinates, in another trace."""
+    return (
+        f"{system}: its description returns what it has kept from an earlier call (in a global, an attribute or a "
+        "cache): a motion, a frame, a point or a number that belongs to other coordinates. Make all that follows from "
+        "t, q, u and the parameters anew in every call."
+    )
+
+
+def _values(values: Any, names: Sequence[str], label: str, n_optional: int = 0) -> Values:
+    if isinstance(values, Values) and values.names == tuple(names):
+        return values
+    items = list(values)
+    if len(items) == len(names) - n_optional:
+        items += [0.0] * n_optional  # auxiliary speeds are zero in the motion
+    if len(items) != len(names):
+        raise ValueError(f"{label} must have {len(names)} entries ({', '.join(names)}), got {len(items)}.")
+    return Values(items, names)

@@ -1,0 +1,238 @@
+"""What is easily done wrong, and used to be computed in silence or refused in words of Python and JAX."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane._description.units import units_of
+from jaxkane.joints import Actuator, Link, Loop, Site, hinge, mechanism
+
+TS = jnp.linspace(0.0, 0.2, 3)
+BAR = {"mass": 1.0, "center": (0.5, 0.0, 0.0), "inertia": (0.01, 0.1, 0.1)}
+
+
+class Pendulum(jk.System):
+    mass: jk.Scalar = jk.parameter(2.0)
+    coordinates = ("angle",)
+    speeds = ("rate",)
+    inputs = ("torque",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        L = N.rotate(3, q["angle"], u["rate"], "L")
+        return jk.Motion([jk.Body(self.mass, 0.0, O.fixed(-1.0 * L.y), name="bob")], frames={"L": L})
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+
+
+def fresh():
+    """A class of its own for every test that changes one."""
+    return type("Pendulum", (Pendulum,), {})
+
+
+def acceleration(system, q=(0.3,), u=(0.5,)):
+    return float(jk.accelerations(system, 0.0, jnp.array(q), jnp.array(u))[0])
+
+
+# What is set on a class that stands already.
+
+
+def damped(self, t, q, u, motion, inputs):
+    return jk.Torque(-u["rate"] * motion.N.z, motion["L"])
+
+
+def halved(self, t, q, u):
+    motion = Pendulum.motion(self, t, q, u)
+    return jk.Motion([jk.Body(0.5 * self.mass, 0.0, motion["bob"].center, name="bob")], frames=motion.frames)
+
+
+def test_methods_set_on_a_class_read_by_name():
+    """Moment about the pivot: m l^2 = 2 kg m^2; the torque is -0.5 N m."""
+    kind = fresh()
+    pendulum = kind()
+    assert acceleration(pendulum) == pytest.approx(-9.81 * np.sin(0.3), rel=1e-12)
+    kind.loads = damped
+    assert acceleration(pendulum) == pytest.approx(-0.25, rel=1e-12)
+    kind.motion = halved
+    assert acceleration(pendulum) == pytest.approx(-0.5, rel=1e-12)
+    kind.loads = Pendulum.loads  # prepared already
+    assert acceleration(pendulum) == pytest.approx(-9.81 * np.sin(0.3), rel=1e-12)
+    assert kind.loads is Pendulum.loads
+
+    @functools.wraps(Pendulum.loads)
+    def doubled(self, t, q, u, motion, inputs):  # reads by name itself, although what it decorates does so too
+        return (Pendulum.loads(self, t, q, u, motion, inputs), jk.Torque(-q["angle"] * motion.N.z, motion["L"]))
+
+    kind.loads = doubled
+    assert acceleration(pendulum) == pytest.approx(-9.81 * np.sin(0.3) - 0.3, rel=1e-12)
+
+
+def test_an_autoreload_puts_in_new_methods():
+    """As IPython's does it: what a method was made from changes in its `__dict__`, and its closure cannot."""
+    old, new = fresh(), fresh()
+    old.loads, new.loads = Pendulum.loads.__wrapped__, damped
+    pendulum = old()
+    assert acceleration(pendulum) == pytest.approx(-9.81 * np.sin(0.3), rel=1e-12)
+    autoreload = pytest.importorskip("IPython.extensions.autoreload")
+    autoreload.update_class(old, new)
+    assert acceleration(pendulum) == pytest.approx(-0.25, rel=1e-12)
+
+
+def test_names_and_units_set_on_a_class_are_checked():
+    kind = fresh()
+    with pytest.raises(TypeError, match=r"Pendulum.coordinates is a tuple of names; 'angle' is a string"):
+        kind.coordinates = "angle"
+    kind.coordinates = ["angle"]
+    assert kind.coordinates == ("angle",)
+    with pytest.raises(TypeError, match=r"Pendulum.units is a dict of texts by name.*got 'rad'"):
+        kind.units = "rad"
+
+
+@pytest.mark.parametrize(
+    ("units", "error", "match"),
+    [
+        ({"angle": 3}, TypeError, r"has texts by name.*got 'angle': 3"),
+        ({"angle": None}, TypeError, r"got 'angle': None"),
+        ({3: "rad"}, TypeError, r"got 3: 'rad'"),
+        (["angle"], TypeError, r"is a dict of texts by name.*got \['angle'\]"),
+        ({"angel": "rad"}, ValueError, r"names what is no coordinate, speed or input: angel; did you mean 'angle'"),
+    ],
+)
+def test_units_are_texts_of_names_that_there_are(units, error, match):
+    with pytest.raises(error, match=match):
+        type("Pendulum", (Pendulum,), {"units": units})()
+
+
+def test_units_that_are_inherited_may_name_more():
+    base = type("Base", (Pendulum,), {"units": {"angle": "rad", "torque": "N m"}})
+    assert units_of(type("Free", (base,), {"inputs": ()})()) == {"angle": "rad", "rate": "rad/s"}
+
+
+# What a description keeps from an earlier call.
+
+KEPT = {}
+
+
+def keeping(part):
+    """A description that holds on to a part of its motion."""
+
+    def motion(self, t, q, u):
+        made = Pendulum.motion(self, t, q, u)
+        if part == "motion":
+            return KEPT.setdefault("motion", made)
+        center = KEPT.setdefault("center", made.bodies[0].center)
+        return jk.Motion([jk.Body(self.mass, 0.0, center, name="bob")], frames=made.frames)
+
+    return type("Keeping", (Pendulum,), {"motion": motion})
+
+
+@pytest.mark.parametrize("part", ["motion", "center"])
+def test_what_is_kept_from_an_earlier_call_is_refused(part):
+    KEPT.clear()
+    pendulum = keeping(part)()
+    with pytest.raises(TypeError, match=r"Keeping: its description returns what it has kept from an earlier call"):
+        [acceleration(pendulum, q=(angle,)) for angle in (0.3, 0.4)]
+    with pytest.raises(TypeError, match=r"Keeping: its description returns what it has kept from an earlier call"):
+        jk.simulate(pendulum, jk.State([0.3], [0.0]), TS)
+
+
+def test_a_motion_of_numbers_that_was_kept_is_refused():
+    """Which would be a motion that does not depend on the coordinates."""
+    KEPT.clear()
+    pendulum = keeping("motion")()
+    pendulum.motion(0.0, [0.3], [0.1])
+    with pytest.raises(TypeError, match="what it has kept from an earlier call"):
+        pendulum.motion(0.0, [0.4], [0.1])
+
+
+# Mechanisms.
+
+
+def four_bar(across):
+    """A parallelogram in the plane across y; `across` is how far its ends are apart there."""
+    links = [
+        Link(name, parent, hinge(f"q{i + 1}", (0, 1, 0)), position=(float(i > 0), 0, 0), **BAR)
+        for i, (name, parent) in enumerate([("a", None), ("b", "a"), ("c", "b")])
+    ]
+    sites = [Site("end", "c", (1.0, 0, 0)), Site("ground", None, (1.5, across, 0))]
+    return mechanism(links, sites=sites, loops=[Loop("end", "ground")])
+
+
+def test_a_loop_that_cannot_be_closed_any_more_is_refused():
+    system = four_bar(jnp.zeros(()))
+    broken = system.replace({"site.ground.y": 0.1})
+    state = jk.assemble(system, {"q1": 0.9})
+    match = r"Mechanism: the configuration constraints can be met, but what should follow from them is off by 0.1"
+    with pytest.raises(ValueError, match=match):
+        jk.assemble(broken, {"q1": 0.9})
+    with pytest.raises(ValueError, match=r"what follows from the configuration constraints is violated by \[-?0.1"):
+        jk.simulate(broken, state, TS)
+
+    found = jax.jit(lambda y: jk.assemble(system.replace({"site.ground.y": y}), {"q1": 0.9}).q)
+    np.testing.assert_allclose(found(0.0), state.q, atol=1e-12)
+    assert np.all(np.isnan(found(0.1)))
+
+
+@pytest.mark.slow
+def test_a_member_whose_loop_cannot_be_closed_is_invalid():
+    system = four_bar(jnp.zeros(()))
+    apart = np.linspace(0.0, 0.1, 2)
+    members = jk.sweep.sweep(system.replace({"site.ground.y": apart}), jk.assemble(system, {"q1": 0.9}), TS)
+    assert list(members.reason) == ["completed", "invalid"]
+
+
+def test_a_mechanism_of_one_link_is_a_list():
+    link = Link("a", joints=hinge("q"), **BAR)
+    with pytest.raises(TypeError, match=r"mechanism: `links` is a list, such as \[Link\(...\), ...\]"):
+        mechanism(link)
+    with pytest.raises(TypeError, match=r"`actuators` is a list, such as \[Actuator\(...\), ...\].*got a Actuator"):
+        mechanism([link], actuators=Actuator("motor", "q"))
+    with pytest.raises(TypeError, match=r"`dependent` is a list of names, such as \['q'\]"):
+        mechanism([link], dependent="q")
+    assert mechanism(x for x in [link]).coordinates == ("q",)
+
+
+def test_a_parameter_that_is_zero_in_the_structure_says_so():
+    arm = mechanism([Link("a", joints=hinge("q", damping=0.1), **BAR)])
+    assert arm.damping["q"] == 0.1
+    assert arm.center["a"]["x"] == 0.5
+    for read, name in (
+        (lambda: arm.armature["q"], "armature.q"),
+        (lambda: arm.center["a"]["z"], "center.a.z"),
+        (lambda: arm.inertia["a"]["xy"], "inertia.a.xy"),
+        (lambda: arm.gravity["x"], "gravity.x"),
+    ):
+        with pytest.raises(KeyError, match=rf"has no parameter {name}: it was written as 0.*jax.numpy.zeros"):
+            read()
+    with pytest.raises(KeyError, match=r"There is no 'p' in `damping`; there are q"):
+        arm.damping["p"]
+    with pytest.raises(KeyError, match=r"There is no 'a' in `armature`"):
+        arm.armature["a"]
+
+
+# Times and tables.
+
+
+@pytest.mark.parametrize(
+    ("t", "error", "match"),
+    [
+        (float("nan"), ValueError, "the time t = nan is not finite"),
+        ("x", TypeError, r"the time `t` is one number \[s\], got 'x'"),
+        (None, TypeError, r"the time `t` is one number \[s\], got None"),
+        (np.zeros(2), TypeError, r"the time `t` is one number"),
+        (1j, TypeError, r"the time `t` is one number"),
+    ],
+)
+def test_the_time_of_an_assembly_is_a_number(t, error, match):
+    with pytest.raises(error, match=f"Pendulum: {match}"):
+        jk.assemble(Pendulum(), {}, t=t)
+
+
+def test_a_table_of_labels_alone_is_refused():
+    with pytest.raises(ValueError, match=r"columns of `table` \(label\) are text, .* all members would be the same"):
+        jk.sweep.sweep(Pendulum(), jk.State([0.1], [0.0]), TS, table={"label": ["a", "b"]})
