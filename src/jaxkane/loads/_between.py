@@ -1,25 +1,14 @@
-"""Loads that people expect: springs, dampers, actuators and friction between points and between frames.
-
-Each returns a tuple of `Force`s or `Torque`s, with the reaction on the other end, for `System.loads`:
-
-    def loads(self, t, q, u, motion, inputs):
-        P, Q = motion["P"], motion["Q"]
-        return jk.loads.spring(P, Q, self.stiffness, self.length), jk.weight(motion, -9.81 * motion.N.y)
-
-A follower needs no function of its own: `jk.Force(10.0 * B.x, P)` turns with the frame B. Where a law is not linear,
-give a function of the extension, the rate or the angle in the place of the coefficient: `lambda x: k * x + k3 * x**3`.
-"""
+"""Springs, dampers, actuators, friction and drag between points and between frames. Knows loads; knows no mechanism."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-import jax.numpy as jnp
-
-from ._description.bodies import Body, Force, Torque
-from ._description.vectors import Frame, Point, Vector
-from ._scalars.components import component, is_zero
-from ._scalars.types import Component
+from .._description.bodies import Body, Force, Torque
+from .._description.vectors import Frame, Point, Vector
+from .._scalars.components import component, is_zero
+from .._scalars.types import Component
+from ._laws import coulomb, smooth_abs
 
 Law = Component | Callable[[Component], Component]
 
@@ -87,35 +76,67 @@ def friction(
     P: Point | Body,
     Q: Point | Body | None,
     normal_force: Component,
-    coefficient: Component,
+    coefficient: Law,
     normal: Vector | None = None,
     *,
     speed: Component = 1e-2,
 ) -> tuple[Force, ...]:
     """Coulomb friction at P, smoothed where the sliding changes its direction.
 
-        F = -coefficient * normal_force * v / sqrt(v . v + speed^2),   v the velocity of P relative to Q
+        F = -coefficient * normal_force * v / |v|,   |v| = sqrt(v . v + speed^2),   v the velocity of P relative to Q
 
-    **Arguments:** `Q`: the point of the other body, None for the ground; `normal_force` [N], not negative; `normal`: a
-    Vector across the surface, of any length, of which v is cleared; `speed` [m/s]: well above it friction is Coulomb's,
-    below it viscous, so that nothing sticks: it creeps. The equations become stiff as it falls.
+    **Arguments:**
+
+    - `Q`: the point of the other body, None for the ground.
+    - `normal_force` [N], not negative.
+    - `coefficient`, or a function |v| [m/s] -> coefficient, as a Stribeck curve:
+        `lambda v: 0.3 + 0.2 * jnp.exp(-((v / 0.05) ** 2))`.
+    - `normal`: a Vector across the surface, of any length, of which v is cleared.
+    - `speed` [m/s]: well above it friction is Coulomb's, from which it differs by speed^2 / (2 v^2) of itself; below it
+        is viscous, so that nothing sticks: it creeps. The equations become stiff as it falls.
     """
     P = _point(P)
     v = P.velocity if Q is None else P.velocity - _point(Q).velocity
     if normal is not None:
         normal = normal.normalize()
         v = v - v.dot(normal) * normal
-    F = -(coefficient * normal_force) * (v / jnp.sqrt(v.dot(v) + speed**2))
+    sliding = smooth_abs(v, speed)
+    mu = coefficient(sliding) if callable(coefficient) else coefficient
+    F = -(mu * normal_force) * (v / sliding)
     return (Force(F, P),) if Q is None else (Force(F, P), Force(-F, _point(Q)))
 
 
 def torsional_friction(
     on: Frame | Body, reaction_on: Frame | Body | None, axis: Vector, torque: Component, *, rate: Component = 1e-2
 ) -> tuple[Torque]:
-    """Dry friction in a hinge along `axis`, smoothed: T = -torque * w / sqrt(w^2 + rate^2) [N m], w [rad/s]."""
-    axis = axis.normalize()
-    w = _rate(on, reaction_on).dot(axis)
-    return (Torque(-torque * w / jnp.sqrt(w * w + rate**2) * axis, on, reaction_on),)
+    """Dry friction in a hinge along `axis`, smoothed: T = -torque * w / sqrt(w^2 + rate^2) [N m], w [rad/s].
+
+    Other laws of friction go into `torsional_damper`: `lambda w: jk.loads.stribeck(w, 0.3, 0.5, 0.1)`.
+    """
+    return torsional_damper(on, reaction_on, axis, lambda w: coulomb(w, torque, width=rate))
+
+
+def drag(
+    P: Point | Body,
+    coefficient: Component,
+    linear: Component = 0.0,
+    *,
+    wind: Vector | None = None,
+    speed: Component = 1e-6,
+) -> tuple[Force]:
+    """The drag of a fluid at P: turbulent, and laminar.
+
+        F = -(linear + coefficient |v|) v,   v the velocity of P relative to the fluid
+
+    Turbulent drag is half of density * drag coefficient * frontal area [N s^2/m^2] (White, *Fluid Mechanics*, chapter
+    7), which holds above a Reynolds number of about a thousand; `linear` [N s/m] is Stokes's, of slow motion.
+
+    **Arguments:** `wind`: the fluid's velocity [m/s], a Vector, None for still air; `speed` [m/s]: |v| stands for
+    sqrt(v . v + speed^2), whose derivative is finite at rest too: there it is linear + coefficient * speed.
+    """
+    P = _point(P)
+    v = P.velocity if wind is None else P.velocity - wind
+    return (Force(-(linear + coefficient * smooth_abs(v, speed)) * v, P),)
 
 
 def _law(law: Law, x: Component) -> Component:

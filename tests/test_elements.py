@@ -1,0 +1,367 @@
+"""Laws of friction, drag, stops and backlash, motors and rotors: limits, signs, slopes, and closed forms of motions."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane.loads import coulomb, dc_motor, dead_zone, lag, lugre, quadratic, smooth_abs, smooth_sign, stribeck
+
+RTOL = 1e-12
+V = np.array([-3.0, -0.4, -0.07, -0.011, 0.0, 0.011, 0.07, 0.4, 3.0])  # rates [m/s]
+
+
+def sharp_stribeck(v, exponent):
+    return (0.3 + 0.2 * np.exp(-((np.abs(v) / 0.1) ** exponent))) * np.sign(v)
+
+
+LAWS = {
+    "coulomb": (lambda v, width: coulomb(v, 0.7, width=width), lambda v: 0.7 * np.sign(v)),
+    "stribeck": (lambda v, width: stribeck(v, 0.3, 0.5, 0.1, width=width), lambda v: sharp_stribeck(v, 2.0)),
+    "tustin": (
+        lambda v, width: stribeck(v, 0.3, 0.5, 0.1, exponent=1.0, width=width),
+        lambda v: sharp_stribeck(v, 1.0),
+    ),
+    "bo": (lambda v, width: stribeck(v, 0.3, 0.5, 0.1, exponent=0.5, width=width), lambda v: sharp_stribeck(v, 0.5)),
+    "quadratic": (lambda v, width: quadratic(v, 0.8), lambda v: 0.8 * v * np.abs(v)),
+    "gap": (
+        lambda v, width: dead_zone(v, -0.2, 0.2, width=width),
+        lambda v: np.sign(v) * np.maximum(np.abs(v) - 0.2, 0.0),
+    ),
+}
+PAIRS = pytest.mark.parametrize(("law", "sharp"), LAWS.values(), ids=LAWS)
+
+
+# Laws, as functions of numbers.
+
+
+@PAIRS
+def test_laws_resist_alike_both_ways_and_never_drive(law, sharp):
+    found = np.asarray(law(jnp.array(V), 0.01))
+    np.testing.assert_allclose(found, -found[::-1], atol=1e-15)
+    assert np.all(found * V >= 0.0)
+    assert found[4] == 0.0
+
+
+@PAIRS
+def test_laws_tend_to_the_sharp_ones_with_the_square_of_the_width(law, sharp):
+    v = np.array([-3.0, -0.4, -0.07, 0.07, 0.4, 3.0])
+    errors = [np.abs(np.asarray(law(jnp.array(v), width)) - sharp(v)) for width in (2e-4, 1e-4)]
+    assert np.all(errors[0] < 1e-5)
+    large = errors[1] > 1e-13
+    np.testing.assert_allclose(errors[0][large] / errors[1][large], 4.0, rtol=1e-3)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
+@PAIRS
+def test_all_slopes_are_finite_at_rest_too(law, sharp, dtype):
+    v = jnp.array(V, dtype)
+    f = lambda v: law(v, 0.01)  # noqa: E731
+
+    @jax.jit
+    def slopes(v):
+        return jax.vmap(jax.jacfwd(f))(v), jax.vmap(jax.grad(f))(v), jax.vmap(jax.hessian(f))(v)
+
+    forward, reverse, second = slopes(v)
+    assert forward.dtype == dtype
+    eps = float(jnp.finfo(dtype).eps)
+    np.testing.assert_allclose(forward, reverse, rtol=100 * eps, atol=100 * eps)
+    assert np.all(np.isfinite(second))
+    step = 1e-6
+    if dtype == jnp.float64:
+        np.testing.assert_allclose(forward, (f(v + step) - f(v - step)) / (2 * step), rtol=1e-5, atol=2e-6)
+
+
+def test_slopes_at_rest_are_what_they_should_be():
+    at_rest = lambda law: float(jax.grad(law)(0.0))  # noqa: E731
+    assert at_rest(lambda v: coulomb(v, 0.7, width=0.02)) == pytest.approx(0.7 / 0.02, rel=RTOL)
+    level = 0.3 + 0.2 * np.exp(-((0.02 / 0.1) ** 2))
+    assert at_rest(lambda v: stribeck(v, 0.3, 0.5, 0.1, width=0.02)) == pytest.approx(level / 0.02, rel=RTOL)
+    assert at_rest(lambda v: quadratic(v, 0.8)) == 0.0
+    inside = 1.0 - 0.2 / np.hypot(0.2, 0.01)
+    assert at_rest(lambda x: dead_zone(x, -0.2, 0.2, width=0.01)) == pytest.approx(inside, rel=1e-10)
+
+
+def test_smoothing_is_off_by_what_is_stated():
+    x, width = np.array([0.5, 2.0, 30.0]), 1e-3
+    np.testing.assert_allclose(np.asarray(smooth_abs(jnp.array(x), width)) - x, width**2 / (2 * x), rtol=1e-4)
+    np.testing.assert_allclose(1 - np.asarray(smooth_sign(jnp.array(x), width)), width**2 / (2 * x**2), rtol=1e-4)
+    assert float(smooth_abs(jnp.array(0.0), width)) == pytest.approx(width, rel=RTOL)
+
+
+def test_a_stribeck_curve_has_its_peak_before_it_falls():
+    v = jnp.linspace(1e-4, 1.0, 4000)
+    force = stribeck(v, 0.3, 0.5, 0.1, width=1e-4)
+    assert float(jnp.max(force)) == pytest.approx(0.5, rel=1e-3)
+    assert float(force[-1]) == pytest.approx(0.3, rel=1e-8)
+    assert np.all(np.diff(np.asarray(force)[50:1500]) < 0)
+
+
+def test_ends_of_an_interval():
+    """At an end the depth is width / 2; far from both, x - end but for width^2 / 4 of its inverse distance."""
+    one, other = (lambda x: dead_zone(x, None, 1.5, width=1e-3)), (lambda x: dead_zone(x, -0.5, None, width=1e-3))
+    both = lambda x: dead_zone(x, -0.5, 1.5, width=1e-3)  # noqa: E731
+    x = jnp.array([-2.5, 0.5, 1.5, 3.5])
+    np.testing.assert_allclose(one(x), [0.0, 0.0, 5e-4, 2.0], atol=3e-7)
+    np.testing.assert_allclose(other(x), [-2.0, 0.0, 0.0, 0.0], atol=3e-7)
+    np.testing.assert_allclose(both(x), one(x) + other(x), atol=1e-15)
+    assert np.all(np.diff(np.asarray(both(jnp.linspace(-1.0, 2.0, 3001)))) > 0)
+    with pytest.raises(ValueError, match="give one end at least"):
+        dead_zone(1.0, None, None)
+
+
+# Bristles.
+
+BRISTLES = {"stiffness": 1e4, "kinetic": 1.0, "static": 1.5, "falloff": 0.01}
+
+
+def level(v):
+    return 1.0 + 0.5 * np.exp(-((v / 0.01) ** 2))
+
+
+def test_bristles_at_a_steady_rate_are_the_stribeck_curve():
+    v = np.array([-0.5, -0.02, 0.003, 0.2])
+    z = np.sign(v) * level(v) / 1e4
+    force, z_dot = lugre(jnp.array(v), jnp.array(z), damping=30.0, viscous=0.4, **BRISTLES)
+    np.testing.assert_allclose(z_dot, 0.0, atol=1e-15)
+    np.testing.assert_allclose(force, np.sign(v) * level(v) + 0.4 * v, rtol=RTOL)
+
+
+def test_bristles_at_rest_are_a_spring_and_a_damper():
+    force = lambda v, z: lugre(v, z, damping=30.0, viscous=0.4, **BRISTLES)  # noqa: E731
+    (dv, dz), (z_dot_v, z_dot_z) = jax.jacfwd(force, (0, 1))(0.0, 0.0)
+    assert (float(dv), float(dz)) == pytest.approx((30.4, 1e4), rel=RTOL)
+    assert (float(z_dot_v), float(z_dot_z)) == (1.0, 0.0)
+    back = jax.jacrev(force, (0, 1))(0.0, 1e-5)
+    np.testing.assert_allclose(back, jax.jacfwd(force, (0, 1))(0.0, 1e-5))
+
+
+def test_bristles_bend_no_farther_than_static_friction_bends_them():
+    """Where |z| = static / stiffness, z_dot is not outwards, whatever the rate."""
+    v = jnp.linspace(-2.0, 2.0, 401)
+    for side in (-1.0, 1.0):
+        _, z_dot = lugre(v, jnp.full(401, side * 1.5e-4), damping=30.0, **BRISTLES)
+        assert np.all(side * np.asarray(z_dot) <= 1e-15)
+
+
+def test_bristles_give_back_no_more_than_they_took_up_to_the_stated_damping():
+    """force v - d/dt (stiffness z^2 / 2) = a y^2 - damping a v y + damping v^2, a = |v| / level, y = stiffness z."""
+    v, z = (x.ravel() for x in np.meshgrid(np.linspace(-0.3, 0.3, 41), np.linspace(-1.5e-4, 1.5e-4, 601)))
+
+    def gained(share):
+        damping = share * 4.0 * level(v) / np.maximum(np.abs(v), 1e-3)
+        force, z_dot = lugre(jnp.array(v), jnp.array(z), damping=jnp.array(damping), **BRISTLES)
+        return np.asarray(force) * v - 1e4 * z * np.asarray(z_dot)
+
+    assert gained(1.0).min() > -1e-12
+    assert gained(0.1).min() > -1e-15
+    assert gained(1.3).min() < -1e-3
+
+
+# In systems: decoupled coordinates, each with a closed form.
+
+
+class Bench(jk.System):
+    """A block that slides to a halt, a ball that falls in air, and a motor that starts; they do not feel each other."""
+
+    friction: jk.Scalar = jk.parameter(0.4)
+    air: jk.Scalar = jk.parameter(0.3)
+    constant: jk.Scalar = jk.parameter(0.05)
+    coordinates = ("block", "ball", "shaft")
+    speeds = ("block_rate", "ball_rate", "shaft_rate")
+    inputs = ("voltage",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        block, ball = O.moving(q[0] * N.x, u[0] * N.x), O.moving(q[1] * N.z, u[1] * N.z)
+        spinning = jk.loads.rotor(2e-4, N.y, u[2], N, O)
+        return jk.Motion([jk.Body(2.0, 0.0, block, name="block"), jk.Body(1.5, 0.0, ball, name="ball"), spinning])
+
+    def loads(self, t, q, u, motion, inputs):
+        torque = dc_motor(inputs["voltage"], u["shaft_rate"], self.constant, 2.0)
+        return (
+            jk.loads.friction(motion["block"], None, 2.0 * 9.81, self.friction, speed=0.05),
+            jk.loads.drag(motion["ball"], self.air),
+            jk.Force(1.5 * 9.81 * motion.N.z, motion["ball"]),
+            jk.Torque(torque * motion.N.y, motion["rotor"]),
+        )
+
+
+TS = np.linspace(0.0, 0.5, 26)
+
+
+@pytest.fixture(scope="module")
+def bench():
+    state = jk.State({}, {"block_rate": 1.5})
+    return jk.simulate(Bench(), state, TS, {"voltage": 12.0}, rtol=1e-11, atol=1e-11)
+
+
+def test_a_block_slides_as_far_as_smoothed_friction_lets_it(bench):
+    """x = integral of |v| dv / (mu g), |v| = sqrt(v^2 + w^2): its energy goes into friction; and the same of time."""
+    v, w, a = bench["block_rate"], 0.05, 0.4 * 9.81
+    path = lambda v: (v * np.hypot(v, w) + w**2 * np.arcsinh(v / w)) / (2 * a)  # noqa: E731
+    np.testing.assert_allclose(bench["block"], path(1.5) - path(v), atol=1e-9)
+    time = lambda v: (np.hypot(v, w) - w * np.arctanh(w / np.hypot(v, w))) / a  # noqa: E731
+    moving = v > 1e-3
+    np.testing.assert_allclose(bench.t[moving], time(1.5) - time(v[moving]), atol=1e-8)
+    assert 0.0 < v[-1] < 1e-3  # it creeps
+
+
+def test_a_ball_falls_with_the_square_of_its_speed(bench):
+    """v = v_end tanh(g t / v_end), v_end^2 = m g / c."""
+    v_end = np.sqrt(1.5 * 9.81 / 0.3)
+    np.testing.assert_allclose(bench["ball_rate"], v_end * np.tanh(9.81 * TS / v_end), rtol=1e-8)
+    np.testing.assert_allclose(
+        bench["ball"], v_end**2 / 9.81 * np.log(np.cosh(9.81 * TS / v_end)), rtol=1e-7, atol=1e-9
+    )
+
+
+def test_a_motor_starts_in_its_time_constant(bench):
+    """w = V / k (1 - exp(-t / T)), T = J R / k^2 = 0.16 s."""
+    np.testing.assert_allclose(bench["shaft_rate"], 240.0 * (1 - np.exp(-TS / 0.16)), rtol=1e-8)
+
+
+def test_slopes_of_a_system_at_rest(kernels):
+    """By hand: d a / d v of the block is -mu g / width, of the ball -c width / m, of the motor -k^2 / (R J)."""
+    system, zeros = Bench(), jnp.zeros(3)
+
+    @jax.jit
+    def found(system, u):
+        f = lambda s, u: jk.accelerations(s, 0.0, zeros, u, {"voltage": 12.0})  # noqa: E731
+        return f(system, u), jax.jacfwd(f, 1)(system, u), jax.jacrev(f)(system, u)
+
+    value, by_speeds, by_parameters = found(system, zeros)
+    np.testing.assert_allclose(value, [0.0, 9.81, 0.05 * 12.0 / 2.0 / 2e-4], rtol=RTOL)
+    np.testing.assert_allclose(np.diag(by_speeds), [-0.4 * 9.81 / 0.05, -0.3e-6 / 1.5, -6.25], rtol=1e-10)
+    np.testing.assert_allclose(by_parameters.friction, 0.0, atol=1e-15)
+    u = jnp.array([[0.02, -2.0, 5.0], [-1.0, 3.0, 0.0]])
+    value, by_speeds, by_parameters = jax.vmap(found, (None, 0))(system, u)
+    v, w = np.asarray(u), np.hypot(np.asarray(u)[:, 0], 0.05)
+    np.testing.assert_allclose(value[:, 0], -0.4 * 9.81 * v[:, 0] / w, rtol=RTOL)
+    np.testing.assert_allclose(value[:, 1], 9.81 - 0.2 * v[:, 1] * np.abs(v[:, 1]), rtol=1e-11)
+    np.testing.assert_allclose(by_speeds[:, 0, 0], -0.4 * 9.81 * 0.05**2 / w**3, rtol=1e-10)
+    np.testing.assert_allclose(by_parameters.air[:, 1], -v[:, 1] * np.abs(v[:, 1]) / 1.5, rtol=1e-10)
+
+
+def test_a_system_in_single_precision(by_xla):
+    small = jax.tree.map(lambda x: x.astype(jnp.float32), Bench())
+    u = jnp.array([0.02, -2.0, 5.0], jnp.float32)
+    q = jnp.zeros(3, jnp.float32)
+    volts = {"voltage": jnp.float32(12.0)}
+    found = jk.accelerations(small, jnp.float32(0.0), q, u, volts)
+    assert found.dtype == jnp.float32
+    expected = jk.accelerations(Bench(), 0.0, q.astype(float), u.astype(float), {"voltage": 12.0})
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+
+
+def test_a_stribeck_curve_of_a_sliding_point_and_in_a_hinge():
+    class Sliding(jk.System):
+        coordinates, speeds = ("x", "angle"), ("v", "w")
+
+        def motion(self, t, q, u):
+            N, O = jk.inertial()
+            B = N.rotate(3, q[1], u[1])
+            P = O.moving(q[0] * N.x, u[0] * N.x)
+            return jk.Motion([jk.Body(1.0, 0.0, P, name="sled"), jk.Body(1.0, (1.0, 1.0, 2.0), O, B, name="arm")])
+
+        def loads(self, t, q, u, motion, inputs):
+            mu = lambda v: 0.3 + 0.2 * jnp.exp(-((v / 0.1) ** 2))  # noqa: E731
+            law = lambda w: stribeck(w, 0.3, 0.5, 0.1) + 0.02 * w  # noqa: E731
+            return (
+                jk.loads.friction(motion["sled"], None, 1.0, mu),
+                jk.loads.torsional_damper(motion["arm"], None, 2.0 * motion.N.z, law),
+            )
+
+    u = np.array([0.12, -0.12])
+    sliding, turning = jk.accelerations(Sliding(), 0.0, jnp.zeros(2), jnp.array(u))
+    expected = float(stribeck(jnp.array(0.12), 0.3, 0.5, 0.1))
+    assert float(sliding) == pytest.approx(-expected, rel=RTOL)
+    assert float(turning) == pytest.approx((expected + 0.02 * 0.12) / 2.0, rel=RTOL)
+
+
+def test_a_gear_with_play_turns_its_link_beyond_the_gap_only():
+    class Gear(jk.System):
+        coordinates, speeds = ("motor", "link"), ("motor_rate", "link_rate")
+
+        def motion(self, t, q, u):
+            N, O = jk.inertial()
+            L = N.rotate(3, q["link"], u["link_rate"])
+            link = jk.Body(1.0, (1.0, 1.0, 0.5), O, L, name="link")
+            return jk.Motion([link, jk.loads.rotor(1e-4, N.z, u["motor_rate"], N, O)])
+
+        def loads(self, t, q, u, motion, inputs):
+            N, twist = motion.N, q["motor"] / 50.0 - q["link"]
+            torque = 200.0 * dead_zone(twist, -0.01, 0.01, width=1e-6)
+            return jk.Torque(torque * N.z, motion["link"]), jk.Torque(-torque / 50.0 * N.z, motion["rotor"])
+
+    at = jax.jit(jax.vmap(lambda motor: jk.accelerations(Gear(), 0.0, jnp.stack([motor, 0.0 * motor]), jnp.zeros(2))))
+    twist = np.array([-0.03, -0.009, 0.0, 0.009, 0.03])
+    torque = 200.0 * np.array([-0.02, 0.0, 0.0, 0.0, 0.02])
+    motor, link = at(jnp.array(50.0 * twist)).T
+    np.testing.assert_allclose(link, torque / 0.5, atol=1e-7)
+    np.testing.assert_allclose(motor, -torque / 50.0 / 1e-4, atol=1e-5)
+
+
+# Rotors.
+
+
+class Arms(jk.System):
+    """Two arms in a plane, the second driven by a geared motor on the first; J is its rotor's."""
+
+    J: jk.Scalar = jk.parameter(3e-4, positive=True)
+    ratio: jk.Scalar = jk.parameter(40.0)
+    coordinates = ("q1", "q2")
+    speeds = ("u1", "u2")  # relative angles
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, q[0], u[0])
+        B = A.rotate(3, q[1], u[1])
+        arms = [jk.Body(0.0, (0.0, 0.0, I), O, F, name=n) for I, F, n in ((0.5, A, "first"), (0.2, B, "second"))]
+        return jk.Motion([*arms, jk.loads.rotor(self.J, A.z, self.ratio * u[1], A, arms[0])])
+
+
+def test_the_reflected_inertia_of_a_geared_rotor():
+    """2 T = 0.5 u1^2 + 0.2 (u1 + u2)^2 + J (u1 + ratio u2)^2."""
+    M = jk.mass_matrix(Arms(), 0.0, jnp.array([0.3, 0.2]), jnp.array([1.0, 2.0]))
+    J, N = 3e-4, 40.0
+    np.testing.assert_allclose(M, [[0.7 + J, 0.2 + J * N], [0.2 + J * N, 0.2 + J * N**2]], rtol=RTOL)
+    slope = jax.jacfwd(lambda J: jk.mass_matrix(Arms(J=J), 0.0, jnp.zeros(2), jnp.zeros(2)))(3e-4)
+    np.testing.assert_allclose(slope, [[1.0, N], [N, N**2]], rtol=RTOL)
+
+
+class Gimbal(jk.System):
+    """A flywheel on an oblique axis in a frame that turns about two axes: as a rotor, or in a frame of its own."""
+
+    coordinates = ("yaw", "tilt", "spin")
+    speeds = ("yaw_rate", "tilt_rate", "spin_rate")
+    spins = False
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        F = N.rotate(3, q[0], u[0]).rotate(1, q[1], u[1])
+        case = jk.Body(1.0, (0.3, 0.2, 0.4), O, F, name="case")
+        axis = 2.0 * F.x + F.y - F.z
+        if not self.spins:
+            return jk.Motion([case, jk.loads.rotor(0.05, axis, u[2], case, O)])
+        S = F.rotate(axis, q[2], u[2])
+        a = np.array([2.0, 1.0, -1.0]) / np.sqrt(6.0)
+        wheel = jk.Body(0.0, 0.05 * np.outer(a, a), O, S, name="wheel")  # the axis has the same components in F and S
+        return jk.Motion([case, wheel])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Torque(0.1 * motion.N.x, motion["case"])
+
+
+def test_a_rotor_feels_its_carrier_turn():
+    spinning = type("Spinning", (Gimbal,), {"spins": True})()
+    for q, u in (((0.3, 0.5, 0.2), (1.0, -2.0, 30.0)), ((0.0, -1.0, 4.0), (0.5, 0.7, -80.0))):
+        at = jnp.array(q), jnp.array(u)
+        found, expected = (jk.accelerations(system, 0.0, *at) for system in (Gimbal(), spinning))
+        np.testing.assert_allclose(found, expected, rtol=1e-11)
+    jk.assemble(Gimbal(), {}, {})  # the moments (0.05, 0, 0) are no body's, but a rotor's
+
+
+def test_a_lag_follows_its_command():
+    assert lag(0.5, 2.0, 0.25) == 6.0
