@@ -14,6 +14,7 @@ from .._common.lookup import refuse_unknown
 from .._description.system import State, System
 from .._scalars.jax_internals import concretely
 from .._scalars.nan import nan_where
+from .._scalars.numbers import derivative_in_numbers, in_numbers, is_in_numbers
 from .._scalars.reads import compiled
 from .._scalars.types import Component
 from .check_description import MOST_REMEMBERED, structure_of, with_trial_numbers
@@ -134,8 +135,8 @@ def _euler_parameters(system: System) -> list[tuple[int, ...]]:
         rng = np.random.default_rng(0)
         probe = rng.uniform(0.2, 0.9, len(system.coordinates)).astype(jnp.result_type(float))
         with concretely():
-            residuals = configuration_residual(*with_trial_numbers((system, np.zeros((), probe.dtype), probe), rng))
-        values = np.abs(np.asarray(residuals))
+            trial = with_trial_numbers((system, np.zeros((), probe.dtype), probe), rng)
+            values = np.abs(in_numbers(configuration_residual, *trial))
         found = _EULER_PARAMETERS[structure] = [
             (i, i + 1, i + 2, i + 3)
             for i, square in enumerate(np.convolve(probe**2, np.ones(4), "valid") if len(probe) > 3 else ())
@@ -157,20 +158,22 @@ def _solve_configuration(system: System, q0, t, plan: _Plan):
             f"coordinates ({', '.join(plan.moved)})."
         )
     places = tuple(system.coordinates.index(c) for c in plan.moved)
-    found = _newton(system, q0, t, places, plan.lenient)
-    if is_concrete(system, found.q, t) and not bool(found.good):
+    concrete = is_concrete(system, q0, t)
+    in_python = concrete and is_in_numbers(configuration_residual, system, t, q0)
+    found = (_newton_in_numbers if in_python else _newton)(system, q0, t, places, plan.lenient)
+    if concrete and not bool(found.good):
         raise ValueError(_why_not(system, q0, plan, found))
     return found.q
 
 
 def _met(residuals):
     """Which constraints are met."""
-    return jnp.abs(residuals) <= float(jnp.finfo(residuals.dtype).eps) ** 0.6
+    return abs(residuals) <= float(jnp.finfo(residuals.dtype).eps) ** 0.6
 
 
 def _flat(slopes):
     """Which slopes are no more than rounding."""
-    return jnp.abs(slopes) <= float(jnp.finfo(slopes.dtype).eps) ** 0.9
+    return abs(slopes) <= float(jnp.finfo(slopes.dtype).eps) ** 0.9
 
 
 def _slopes(system: System, t, q, places: np.ndarray):
@@ -211,7 +214,7 @@ def _newton(system: System, q0, t, where: tuple[int, ...], lenient: bool) -> _Fo
     eps = float(jnp.finfo(q0.dtype).eps)
     newton = optx.Newton(rtol=8 * eps, atol=8 * eps)
     args = (system, t, start, directions)
-    solution = optx.root_find(residual, newton, jnp.zeros(n_h, q0.dtype), args, max_steps=64, throw=False)
+    solution = optx.root_find(residual, newton, jnp.zeros(n_h, q0.dtype), args, max_steps=_MOST_STEPS, throw=False)
     q = start.at[places].add(solution.value @ directions)
     h = configuration_residual(system, t, q)
     derivatives = jax.jacfwd(residual)(jax.lax.stop_gradient(solution.value), jax.lax.stop_gradient(args))
@@ -223,20 +226,88 @@ def _newton(system: System, q0, t, where: tuple[int, ...], lenient: bool) -> _Fo
 
 
 def _start(system: System, q0, t, places: np.ndarray):
-    """The initial guess (n_q,), and which constraints (h,) are met already and read nothing of what is moved.
+    """The initial guess (n_q,), and which constraints (h,) are met already and read nothing of what is moved."""
+    q, system = jax.lax.stop_gradient((q0, system))
+    here, there = jax.lax.map(lambda q: _slopes(system, t, q, places), jnp.stack([q, _elsewhere(q)]))
+    directions = jnp.linalg.svd(here, full_matrices=True)[:2]
+    beside, already_met = _of_slopes(jnp, configuration_residual(system, t, q), directions, there)
+    return q0.at[places].add(beside.astype(q0.dtype)), already_met
+
+
+def _elsewhere(q):
+    """Coordinates at no special place."""
+    return q + np.random.default_rng(0).uniform(0.3, 0.7, q.shape).astype(q.dtype)
+
+
+def _of_slopes(xp: Any, h, directions, there):
+    """What is moved before Newton's method begins (moved,), and which constraints (h,) are met already and read
+    nothing of what is moved; from the residuals, U and the singular values of their slopes at the guess, and their
+    slopes elsewhere (h, moved). `xp`: NumPy or JAX's.
 
     Where the slopes of the constraints depend on each other and the residuals contradict that, as for two rods in
     line, Newton's method knows no direction: then it starts beside the guess, in what these constraints read.
     """
-    q, system = jax.lax.stop_gradient((q0, system))
-    elsewhere = q + np.random.default_rng(0).uniform(0.3, 0.7, q.shape).astype(q.dtype)  # no special place
-    here, there = jax.lax.map(lambda q: _slopes(system, t, q, places), jnp.stack([q, elsewhere]))
-    h, reads = configuration_residual(system, t, q), ~_flat(there)  # (h,) (h,moved)
-    U, s, _ = jnp.linalg.svd(here, full_matrices=True)
-    unmoved = _flat(jnp.concatenate([s, jnp.zeros(len(h), s.dtype)])[: len(h)])
-    left = U @ jnp.where(unmoved, U.T @ h, 0.0)  # of the residuals, what no direction takes away
-    beside = jnp.any(reads & ~_met(left)[:, None], axis=0)
-    return q0.at[places].add(jnp.where(beside, 1.0, 0.0).astype(q0.dtype)), _met(h) & ~jnp.any(reads, axis=1)
+    reads = ~_flat(there)  # (h,moved)
+    U, s = directions
+    unmoved = _flat(xp.concatenate([s, xp.zeros(len(h), s.dtype)])[: len(h)])
+    left = U @ xp.where(unmoved, U.T @ h, 0.0)  # of the residuals, what no direction takes away
+    beside = xp.any(reads & ~_met(left)[:, None], axis=0)
+    return xp.where(beside, 1.0, 0.0), _met(h) & ~xp.any(reads, axis=1)
+
+
+_MOST_STEPS = 64
+
+
+def _newton_in_numbers(system: System, q0, t, where: tuple[int, ...], lenient: bool) -> _Found:
+    """`_newton` where all numbers are known: the same steps, by NumPy, before XLA would have begun to compile them."""
+    system, q0, t = jax.device_get((system, q0, t))
+    places, finite = np.array(where, int), all(np.all(np.isfinite(x)) for x in jax.tree.leaves((system, q0)))
+    if not finite:
+        system, q0 = jax.tree.map(np.ones_like, (system, q0))
+    along = np.zeros((len(q0), len(places)), q0.dtype)
+    along[places, np.arange(len(places))] = 1.0
+
+    def slopes(q):
+        return derivative_in_numbers(configuration_residual, (system, t, q), (None, None, along))
+
+    h = in_numbers(configuration_residual, system, t, q0)
+    beside, already_met = _of_slopes(np, h, _svd(slopes(q0)), slopes(_elsewhere(q0)))
+    start, already_met = q0 + along @ beside.astype(q0.dtype), already_met & lenient
+    n_h = len(already_met)
+    directions = np.eye(n_h, dtype=q0.dtype) if len(places) == n_h and not lenient else slopes(start)
+
+    def at(amount):
+        """The coordinates, the residuals, and how what Newton's method sees of them changes with the amount."""
+        q = start + along @ (amount @ directions)
+        h = in_numbers(configuration_residual, system, t, q)
+        derivatives = np.where(already_met[:, None], np.eye(n_h, dtype=q0.dtype), slopes(q) @ directions.T)
+        return q, h, derivatives
+
+    tolerance, amount, steps = 8 * float(np.finfo(q0.dtype).eps), np.zeros(n_h, q0.dtype), 0
+    q, h, derivatives = at(amount)
+    while steps < _MOST_STEPS:
+        seen = np.where(already_met, amount, h)
+        try:
+            step = np.linalg.solve(derivatives, seen)
+        except np.linalg.LinAlgError:
+            break
+        amount, steps = amount - step, steps + 1
+        q, h, derivatives = at(amount)
+        arrived = np.all(np.abs(step) < tolerance * (1 + np.abs(amount))) and np.all(np.abs(seen) < tolerance)
+        if arrived or not np.all(np.isfinite(derivatives)):
+            break
+    slope = _svd(derivatives)[1][-1]
+    follows = np.max(np.abs(implied_residual(system, t, q)), initial=0.0)
+    good = finite and bool(np.all(_met(h))) and bool(slope > float(np.finfo(q0.dtype).eps) ** 0.6)
+    good &= bool(follows <= configuration_tolerance(q0.dtype))
+    return _Found(jax.device_put(q), good, np.max(np.abs(h)), follows, slope, steps)
+
+
+def _svd(A):
+    """U and the singular values of an array of NumPy, NaN where it is not finite, as JAX has it."""
+    if np.all(np.isfinite(A)):
+        return np.linalg.svd(A, full_matrices=True)[:2]
+    return np.full((len(A), len(A)), np.nan, A.dtype), np.full(min(A.shape), np.nan, A.dtype)
 
 
 def _why_not(system: System, q0, plan: _Plan, found: _Found) -> str:

@@ -1,8 +1,8 @@
 """Whether a description contradicts itself, found at trial states. Knows the method; knows no mechanism.
 
-The description is read once, as one compiled function of the parameters, time, coordinates and speeds, and once more
-for its derivative along the motion. Both are then asked at states that meet the constraints, beside the one that was
-given: speeds of both signs and several sizes, and other numbers in the place of those that are traced.
+The description is read once, as one function of the parameters, time, coordinates and speeds, and once more for its
+derivative along the motion. Both are then evaluated by NumPy at states that meet the constraints, beside the one that
+was given: speeds of both signs and several sizes, and other numbers in the place of those that are traced.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from jax.core import Tracer
 from .._description.bodies import Force, Load, Motion
 from .._description.system import System
 from .._description.vectors import Frame, Point
-from .._scalars import native
 from .._scalars.components import is_exact
 from .._scalars.fuse import fused
-from .._scalars.linear import as_vector, is_written_out, stack
+from .._scalars.linear import as_vector, stack
+from .._scalars.numbers import derivative_in_numbers, in_numbers
 from .._scalars.reads import version_of
 from .._scalars.types import Component
 from .kane import Reading
@@ -92,8 +92,6 @@ class _Description:
         self.name = type(system).__name__
         self.speeds = (*system.speeds, *system.dependent_speeds)
         self.inputs = {name: np.asarray(0.7, q.dtype) for name in system.inputs}
-        # It is asked a dozen times: a long chain is done before XLA would have compiled its program.
-        self._reading = _compiled if is_written_out(len(system.speeds)) or native.is_on() else _reading
         self.tolerance = float(jnp.finfo(q.dtype).eps) ** 0.5
 
     def check(self, are_given: bool) -> bool:
@@ -107,15 +105,14 @@ class _Description:
         return self._check_state(beside.astype(self.q.dtype)) or judged
 
     def read(self, q: np.ndarray, u: np.ndarray) -> Found:
-        # As arrays of JAX: numbers of NumPy are floats, whose zeros would be exact where no program is traced.
-        at = jnp.asarray(q), jnp.asarray(u, q.dtype)
-        return jax.device_get(self._reading(self.system, self.t, *at, self.inputs))
+        return in_numbers(_reading, self.system, self.t, q, u.astype(q.dtype), self.inputs)
 
     def read_along(self, q: np.ndarray, u: np.ndarray, now: Found) -> Found:
         """How all that is read changes along the motion [1/s]."""
         q_dot = np.concatenate([x.ravel() for x in _of_kind(now, "rate").values()])
-        at = lambda t, q: self._reading(self.system, t, q, u.astype(q.dtype), self.inputs)  # noqa: E731
-        return jax.device_get(jax.jvp(at, (self.t, q), (np.ones_like(self.t), q_dot))[1])
+        at = self.system, self.t, q, u.astype(q.dtype), self.inputs
+        along = None, np.ones((1,), q.dtype), q_dot[:, None], None, None
+        return jax.tree.map(lambda x: x[..., 0], derivative_in_numbers(_reading, at, along))
 
     def _trial_speeds(self) -> np.ndarray:
         n = len(self.speeds)
@@ -177,7 +174,7 @@ class _Description:
 
     def _on_constraints(self, q: np.ndarray) -> np.ndarray:
         """The nearest coordinates that meet the configuration constraints; NaN where there are none to be found."""
-        residual = lambda q: np.asarray(configuration_residual(self.system, self.t, q), float)  # noqa: E731
+        residual = lambda q: in_numbers(configuration_residual, self.system, self.t, q).astype(float)  # noqa: E731
         h, step = residual(q), self.tolerance
         for _ in range(20):
             if not h.size or np.max(np.abs(h)) <= 0.1 * self.tolerance:
@@ -284,6 +281,7 @@ class _Description:
 # -- what is read
 
 
+@fused
 def _reading(system: System, t: Any, q: Any, u: Any, inputs: Any) -> Found:
     reading = Reading(system, inputs)
     q, u, like = tuple(q[i] for i in range(len(q))), tuple(u[i] for i in range(len(u))), q
@@ -297,9 +295,6 @@ def _reading(system: System, t: Any, q: Any, u: Any, inputs: Any) -> Found:
         )
     facts = [*_of_speeds(reading, t, q, u), *_of_bodies(motion), *_of_points(motion, loads), *_of_frames(motion, loads)]
     return {(i, *key): stack(rows).astype(like.dtype) for i, (key, rows) in enumerate(facts)}
-
-
-_compiled = fused(_reading)
 
 
 Fact = tuple[tuple[str, ...], list[tuple[Component, ...]]]

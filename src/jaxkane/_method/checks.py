@@ -7,7 +7,7 @@ numbers are checked where they are numbers. Under a trace, and in a batch, a bad
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -22,6 +22,7 @@ from .._scalars.fuse import fused
 from .._scalars.jax_internals import concretely
 from .._scalars.linear import as_vector, stack
 from .._scalars.nan import nan_where
+from .._scalars.numbers import in_numbers
 from .check_description import check_description
 from .check_description import configuration_residual as configuration_residual
 from .kane import Reading, Row
@@ -77,7 +78,7 @@ def check_bodies(system: System, t: Any, q: Any) -> None:
     rounding, by up to 5 % for measured and warned about, beyond that refused, unless the class has
     `check_inertia = False`. A moment about one axis alone, (0, 0, J), is a rotor's: the other two are elsewhere.
     """
-    for i, (mass, I) in enumerate(_masses_and_inertias(system, t, q)):
+    for i, (mass, I) in enumerate(in_numbers(_masses_and_inertias, system, t, q)):
         mass, I = float(mass), np.asarray(I, dtype=float)  # [kg], (3,3) [kg m^2]
         fault = _fault(mass, I) or (_excess_in_words(I) if system.check_inertia else "")
         if fault:
@@ -164,32 +165,38 @@ def _implied_residual(system: System, t: Any, q: Any):
 def implied_residual(system: System, t: Any, q: Any) -> Any:
     """Residuals (h,) that follow from the configuration constraints."""
     if type(system).implied_constraints is System.implied_constraints:
-        return jnp.zeros(0, q.dtype)
-    return _implied_residual(system, t, q)
+        return np.zeros(0, q.dtype)
+    return _residual_of(_implied_residual, system, t, q)
+
+
+def _residual_of(f: Callable[..., Any], system: System, t: Any, q: Any) -> Any:
+    """Of numbers by NumPy, so that nothing is compiled."""
+    return in_numbers(f, system, t, q) if is_concrete(system, t, q) else f(system, t, q)
 
 
 def configuration_is_met(system: System, t: Any, q: Any) -> Any:
     """Whether the configuration constraints are met, and what follows from them."""
-    residuals = jnp.concatenate([configuration_residual(system, t, q), implied_residual(system, t, q)])
-    return jnp.all(jnp.abs(residuals) <= configuration_tolerance(residuals.dtype))
+    residuals = [_residual_of(configuration_residual, system, t, q), implied_residual(system, t, q)]
+    xp = np if is_concrete(residuals) else jnp
+    return xp.all(xp.abs(xp.concatenate(residuals)) <= configuration_tolerance(residuals[0].dtype))
 
 
 def check_state(system: System, t: Any, q: Any) -> None:
     """Refuse coordinates that violate a configuration constraint, with the residual."""
     if not is_concrete(system, t, q):
         return
-    residual = configuration_residual(system, t, q)
+    residual = in_numbers(configuration_residual, system, t, q)
     if residual.size and not np.max(np.abs(residual)) <= configuration_tolerance(residual.dtype):
         adjust = ", ".join(system.dependent_coordinates) or "the coordinates"
         raise ValueError(
             f"{type(system).__name__}: the coordinates violate the configuration constraints by "
-            f"{np.array2string(np.asarray(residual), precision=3)}. Find {adjust} with jaxkane.assemble(system, q, u)."
+            f"{np.array2string(residual, precision=3)}. Find {adjust} with jaxkane.assemble(system, q, u)."
         )
     implied = implied_residual(system, t, q)
     if implied.size and not np.max(np.abs(implied)) <= configuration_tolerance(implied.dtype):
         raise ValueError(
             f"{type(system).__name__}: what follows from the configuration constraints is violated by "
-            f"{np.array2string(np.asarray(implied), precision=3)}: with these parameters the loop cannot be closed."
+            f"{np.array2string(implied, precision=3)}: with these parameters the loop cannot be closed."
         )
 
 
@@ -198,17 +205,20 @@ def met_or_refused(system: System, t: Any, q: Any, left_out: Sequence[str]) -> A
 
     **Raises:** `ValueError` that names them; under a trace the coordinates become NaN.
     """
-    residual = configuration_residual(system, t, q)
+    concrete = is_concrete(system, t, q)
+    residual = _residual_of(configuration_residual, system, t, q)
     if not residual.size:
         return q
     met = configuration_is_met(system, t, q)
-    if is_concrete(met) and not met:
-        raise ValueError(
-            f"{type(system).__name__}: with {', '.join(left_out)} left out of q, and taken as zero, the configuration "
-            f"constraints are violated by {np.array2string(np.asarray(residual), precision=3)}. Find the state with "
-            "jaxkane.assemble(system, q, u), and give its state.q; or name them."
-        )
-    return nan_where(~met, q, (system, t, q))
+    if not concrete:
+        return nan_where(~met, q, (system, t, q))
+    if met:
+        return q
+    raise ValueError(
+        f"{type(system).__name__}: with {', '.join(left_out)} left out of q, and taken as zero, the configuration "
+        f"constraints are violated by {np.array2string(residual, precision=3)}. Find the state with "
+        "jaxkane.assemble(system, q, u), and give its state.q; or name them."
+    )
 
 
 def configuration_tolerance(dtype: Any) -> float:

@@ -49,9 +49,9 @@ from .reads import on_forget, settling, version_of
 _PLAIN = frozenset(
     "abs acos acosh add add_any and asin asinh atan atan2 atanh broadcast_in_dim cbrt ceil clamp concatenate "
     "convert_element_type copy copy_p cos cosh div eq erf exp exp2 expm1 floor ge gt integer_pow is_finite jit le "
-    "log log1p logistic lt max min mul ne neg not or pad pjit pow reduce_and reduce_max reduce_min reduce_or "
-    "reduce_prod reduce_sum rem reshape rev round rsqrt select_n sign sin sinh slice split sqrt square squeeze "
-    "stack stop_gradient sub tan tanh transpose unstack xor".split()
+    "log log1p logistic lt max min mul ne neg not one_minus_square or pad pjit pow reduce_and reduce_max reduce_min "
+    "reduce_or reduce_prod reduce_sum rem reshape rev round rsqrt select_n sign sin sinh slice split sqrt square "
+    "squeeze stack stop_gradient sub tan tanh transpose unstack xor".split()
 )
 _LARGEST_SUM = 64  # XLA may hand larger ones to a library
 _MOST_LANES = 128  # in XLA's hands: with more, intermediates no longer stay in the cache
@@ -89,20 +89,24 @@ def fused(f: Callable[..., Any]) -> Callable[..., Any]:
 
     on_forget(program_for.cache_clear)
 
+    def find(leaves, treedef, args):
+        if FUSES is not None:
+            return None
+        try:
+            return program_for(treedef, tuple(map(jax.typeof, leaves)), version_of(args), _label(args[0]), settings())
+        except _CapturedError:
+            return None
+
     @functools.wraps(f)
     def call(*args):
-        if FUSES is not None:
-            return f(*args)
         leaves, treedef = jax.tree.flatten(args)
-        try:
-            found = program_for(treedef, tuple(map(jax.typeof, leaves)), version_of(args), _label(args[0]), settings())
-        except _CapturedError:
-            found = None
+        found = find(leaves, treedef, args)
         if found is None:
             return f(*args)
         program, structure = found
         return jax.tree.unflatten(structure, program(*leaves))
 
+    vars(call)["find"] = find  # for `numbers`
     return call
 
 

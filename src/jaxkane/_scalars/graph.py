@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jax.lax import RoundingMethod
 
-from .jax_internals import Jaxpr, Literal
+from .jax_internals import ClosedJaxpr, Jaxpr, Literal, types_of
 
 OPERATORS: dict[str, Callable[..., Any]] = {
     "add": operator.add,
@@ -120,6 +120,16 @@ class Graph:
         return None
 
 
+def graph_of(program: ClosedJaxpr) -> tuple[Graph, list[np.ndarray]]:
+    """A program as a graph, and its outputs as arrays of node numbers. Element e of argument i is an input (i, e, the
+    argument's size)."""
+    graph, inputs = Graph(), []
+    for i, aval in enumerate(types_of(program)[0]):
+        elements = [graph.add("input", (i, e, aval.size), str(aval.dtype)) for e in range(aval.size)]
+        inputs.append(np.array(elements, np.int64).reshape(aval.shape))
+    return graph, unrolled(program.jaxpr, program.consts, inputs, graph)
+
+
 def unrolled(program: Jaxpr, consts: Sequence[Any], inputs: Sequence[np.ndarray], graph: Graph) -> list[np.ndarray]:
     """The program's outputs as arrays of node numbers."""
 
@@ -195,6 +205,8 @@ def _operation(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.nda
             return [each("div", one, each("add", one, each("exp", each("neg", xs[0]))))]
         case "square":
             return [each("mul", xs[0], xs[0])]
+        case "one_minus_square":  # of JAX 0.12, in the derivative of tanh
+            return [each("mul", each("sub", one, xs[0]), each("add", one, xs[0]))]
         case "integer_pow":
             return [_power(xs[0], params["y"], each, one)]
         case "rsqrt":

@@ -13,20 +13,16 @@ import numpy as np
 
 from .._description.system import System
 from .._method.formulas import JACOBIANS, Formulas
-from .._scalars.graph import DTYPES, LIBRARY
+from .._scalars.graph import DTYPES
+from .._scalars.numbers import NUMPY_NAMES
 from .._scalars.written import ARITHMETIC, COMPARED, COMPARISONS, TIGHT, Form, Language, as_source, call
 from ._functions import chosen
 from ._names import identifiers, variable_units
 
-_WORDS = {name: name for name in LIBRARY} | {
-    "asin": "arcsin", "acos": "arccos", "atan": "arctan", "atan2": "arctan2", "asinh": "arcsinh", "acosh": "arccosh",
-    "atanh": "arctanh", "pow": "power", "abs": "abs", "sqrt": "sqrt", "floor": "floor", "rem": "fmod",
-    "max": "maximum", "min": "minimum",
-}  # fmt: skip
 _TWO = ("pow", "atan2", "rem", "max", "min")
 _FORMS = {
     **COMPARISONS,
-    **{name: call(f"np.{word}", 1 + (name in _TWO)) for name, word in _WORDS.items()},
+    **{name: call(f"np.{word}", 1 + (name in _TWO)) for name, word in NUMPY_NAMES.items()},
     **ARITHMETIC,
     "erf": call("_erf"),
     "and": Form("{0} & {1}", COMPARED, (TIGHT, TIGHT)),

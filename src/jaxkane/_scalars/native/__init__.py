@@ -13,7 +13,7 @@ import functools
 import jax
 import numpy as np
 
-from ..graph import LIBRARY, Graph, NotScalarError, symbol, unrolled
+from ..graph import LIBRARY, NotScalarError, graph_of, symbol
 from ..jax_internals import ClosedJaxpr, types_of
 from .available import is_on, is_wanted, machine, tell, use, why_not
 from .handler import handler_text
@@ -32,12 +32,8 @@ class Scalars:
     """
 
     def __init__(self, program: ClosedJaxpr):
-        self.graph, inputs = Graph(), []
+        self.graph, self.outputs = graph_of(program)
         taken, given = types_of(program)
-        for i, aval in enumerate(taken):
-            elements = [self.graph.add("input", (i, e, aval.size), str(aval.dtype)) for e in range(aval.size)]
-            inputs.append(np.array(elements, np.int64).reshape(aval.shape))
-        self.outputs = unrolled(program.jaxpr, program.consts, inputs, self.graph)
         self.bytes_of = [a.size * a.dtype.itemsize for a in (*taken, *given)]
         self.functions = {
             symbol(node._replace(operation=FMOD) if node.operation == "rem" else node)
