@@ -70,7 +70,7 @@ def test_the_audit_costs_what_the_accelerations_cost(held):
         system = TiltedChain(n=n, held=held)
         counts[n], is_plain = operations(audit._measured, system, jnp.ones(n - held))
         assert is_plain
-    assert counts[6] < operations(rates._state_rates, TiltedChain(n=6, held=held))[0]
+    assert counts[6] < operations(rates._motion_rates, TiltedChain(n=6, held=held))[0]
     # Linear but for the weights and the columns of the constraint, which pass all frames: less than quadratic
     assert counts[8] - counts[6] < 1.6 * (counts[6] - counts[4])
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._method.rates import _state_rates, state_rates
+from jaxkane._method.rates import _motion_rates, motion_rates
 from jaxkane._scalars import fuse
 from jaxkane._scalars import native as native_kernels
 from jaxkane._scalars.fuse import _Program, fused
@@ -188,17 +188,17 @@ def close(a, b):
 @pytest.mark.usefixtures("native")
 def test_the_bicycle_and_its_derivatives_as_by_xla(bicycle):
     def many(system, t, q, u, inputs):
-        return jax.vmap(lambda push: state_rates(system, t, q, u.at[0].set(push), inputs))(jnp.linspace(0.0, 0.5, 11))
+        return jax.vmap(lambda push: motion_rates(system, t, q, u.at[0].set(push), inputs))(jnp.linspace(0.0, 0.5, 11))
 
     moved = jax.tree.map(lambda x: 0.01 * jnp.ones_like(x), bicycle)
     jax.tree.map(close, *both(many, *bicycle))
-    jax.tree.map(close, *both(lambda *args: jax.jvp(state_rates, args, moved), *bicycle))
+    jax.tree.map(close, *both(lambda *args: jax.jvp(motion_rates, args, moved), *bicycle))
 
 
 def test_a_derivative_costs_a_few_values(bicycle):
     """Operations of the graphs; all directions of a derivative are lanes of one kernel, which share what they can."""
     leaves, treedef = jax.tree.flatten(bicycle)
-    plain = _state_rates.__wrapped__
+    plain = _motion_rates.__wrapped__
     program = _Program(jax.make_jaxpr(lambda *x: plain(*jax.tree.unflatten(treedef, x)))(*leaves))
     work = lambda scalars: sum(n.operation not in ("input", "constant") for n in scalars.graph.nodes)  # noqa: E731
     value = work(program.scalars())

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import pytest
 
 import jaxkane as jk
-from jaxkane._method.rates import _state_rates
+from jaxkane._method.rates import _motion_rates
 from jaxkane._scalars import fuse
 from jaxkane._scalars.fuse import _Program
 from jaxkane._scalars.native import Scalars
@@ -24,7 +24,7 @@ def test_the_programs_do_not_grow(name):
         dict.fromkeys(system.inputs, jnp.array(0.0)),
     )
     leaves, treedef = jax.tree.flatten(args)
-    plain = _state_rates.__wrapped__
+    plain = _motion_rates.__wrapped__
     program = _Program(jax.make_jaxpr(lambda *x: plain(*jax.tree.unflatten(treedef, x)))(*leaves))
     size = lambda program: len(program.program.jaxpr.eqns)  # noqa: E731
     tangent = program.tangent((True,) * len(leaves))

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from .system import System
 
 METHODS = ("motion", "q_dot", "loads", "configuration_constraints", "implied_constraints", "events")
-NAMES = ("coordinates", "speeds", "dependent_speeds", "auxiliary_speeds", "dependent_coordinates", "inputs")
+METHODS += ("state_rates", "outputs")
+NAMES = ("coordinates", "speeds", "dependent_speeds", "auxiliary_speeds", "dependent_coordinates", "inputs", "states")
 
 
 def _prepared(system: str, name: str, value: Any) -> Any:
@@ -87,6 +88,8 @@ def _named(method: Callable[..., Any]) -> Callable[..., Any]:
         if rest:
             names = (*self.speeds, *self.dependent_speeds, *self.auxiliary_speeds)
             rest = (_values(rest[0], names, f"{type(self).__name__}: u", len(self.auxiliary_speeds)), *rest[1:])
+        if method.__name__ == "state_rates" and len(rest) > 1:
+            rest = (rest[0], _values(rest[1], self.states, f"{type(self).__name__}: x"), *rest[2:])
         began = now()
         try:
             found = method(self, t, q, *rest, **more)

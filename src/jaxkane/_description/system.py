@@ -16,22 +16,27 @@ from .prepared import METHODS, NAMES, Kind, checked_names, checked_units
 
 
 class State(eqx.Module):
-    """What is integrated: coordinates and independent speeds.
+    """What is integrated: coordinates, independent speeds and, where a system has such, states of the first order.
 
-    Attributes: `q` (n_q,) [rad, m], `u` (n_u,) [rad/s, m/s]; a batch has leading axes. Or dicts by name, which are read
-    where the state meets its system: `jk.State({"angle": 0.3}, {"rate": 1.0})`. Names left out are zero.
+    Attributes: `q` (n_q,) [rad, m], `u` (n_u,) [rad/s, m/s], `x` (n_x,) or None; a batch has leading axes. Or dicts by
+    name, which are read where the state meets its system: `jk.State({"angle": 0.3}, {"rate": 1.0})`. Names left out are
+    zero.
     """
 
     q: Float[Array, "*batch n_q"] = eqx.field(converter=to_float)
     u: Float[Array, "*batch n_u"] = eqx.field(converter=to_float)
+    x: Float[Array, "*batch n_x"] | None = eqx.field(
+        converter=lambda x: x if x is None else to_float(x), default=None
+    )
 
 
 class System(eqx.Module, metaclass=Kind):
     """A mechanism: its array leaves are its parameters, its methods describe it.
 
     A subclass names its coordinates and speeds, and writes `motion`; and, where it needs them, `loads`, `q_dot`,
-    `configuration_constraints` and `events`. The `u` that these receive holds all speeds: first the independent, then
-    the dependent, then the auxiliary ones. `q` and `u` are read by place or by name: `q[0]`, `q["roll"]`.
+    `configuration_constraints` and `events`; `state_rates` of what has states of the first order, and `outputs` of what
+    carries sensors. The `u` that these receive holds all speeds: first the independent, then the dependent, then the
+    auxiliary ones. `q`, `u` and `x` are read by place or by name: `q[0]`, `q["roll"]`.
     """
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -56,9 +61,10 @@ class System(eqx.Module, metaclass=Kind):
     """Names of the coordinates that `assemble` finds from the configuration constraints; the others are held."""
     inputs: ClassVar[tuple[str, ...]] = ()
     """Names of the inputs that `loads` reads."""
+    states: ClassVar[tuple[str, ...]] = ()
+    """Names of states of the first order, which `state_rates` drives: motors that lag, bristles, filters."""
     units: ClassVar[Mapping[Any, str]] = {}
-    """Units of coordinates, speeds and inputs by name, for pictures: `{"q0": "rad", "push": "N"}`. Those of usual
-    names, as "roll", "x" or "steer_torque", are known without."""
+    """Units of coordinates, speeds, inputs, states and outputs by name, for pictures: `{"q0": "rad", "push": "N"}`."""
     check_inertia: ClassVar[bool] = True
     """Whether bodies are refused whose principal moments of inertia break the triangle inequality by more than 5 %."""
 
@@ -83,8 +89,37 @@ class System(eqx.Module, metaclass=Kind):
         return u[:n_q]
 
     def loads(self, t: Component, q: Any, u: Any, motion: Motion, inputs: Mapping[str, Component]) -> Any:
-        """Active forces and torques: `Force`s and `Torque`s, nested in tuples as is convenient."""
+        """Active forces and torques: `Force`s and `Torque`s, nested in tuples as is convenient.
+
+        `inputs` holds the values of the inputs, and of the states of the first order, by name.
+        """
         return ()
+
+    def state_rates(self, t: Component, q: Any, u: Any, x: Any, motion: Motion, now: Any) -> Sequence[Component]:
+        """Rates of the states of the first order, in the order of `states`; or by name, in a dict.
+
+            states = ("motor_torque",)
+
+            def state_rates(self, t, q, u, x, motion, now):
+                return ((now["command"] - x["motor_torque"]) / self.lag,)
+
+        `now` is a `Now`: inputs and states by name, and accelerations, for the filter of an accelerometer.
+        """
+        raise NotImplementedError(
+            f"{type(self).__name__} has states ({', '.join(self.states)}): define state_rates(self, t, q, u, x, motion, "
+            "now), one rate for each."
+        )
+
+    def outputs(self, t: Component, q: Any, u: Any, motion: Motion, now: Any) -> Mapping[str, Any]:
+        """What the sensors say, by name: numbers, or dicts of such, whose names are joined by a dot.
+
+            def outputs(self, t, q, u, motion, now):
+                box = motion.frames["box"]
+                return {"gyro": jk.sensors.gyroscope(box), "strain": self.stiffness * q["bend"]}
+
+        `now` is a `Now`: inputs and states by name, accelerations, and the forces of constraints.
+        """
+        return {}
 
     def configuration_constraints(self, t: Component, q: Any) -> Sequence[Component]:
         """Residuals that are zero in every possible configuration."""

@@ -33,6 +33,7 @@ def assemble(
     system: System,
     q: Any,
     u: Any = None,
+    x: Any = None,
     *,
     t: Component = 0.0,
     free: Sequence[str] | None = None,
@@ -47,6 +48,7 @@ def assemble(
         start at zero; of four Euler parameters the last starts at one, so that those left out are no rotation.
     - `u` (n_u,), or a dict by name in which speeds left out are zero: the independent speeds. Dependent speeds may be
         given too, and are then compared with what the residuals say.
+    - `x` (n_x,), or a dict by name: states of the first order. Those left out are zero.
     - `t`: time [s], one finite number.
     - `free`: names of the coordinates that are moved. By default `system.dependent_coordinates`; of a system that
         names none, those left out of the dict `q`, or all of an array. Where more are moved than there are constraints,
@@ -66,9 +68,13 @@ def assemble(
         given = {speed: u[speed] for speed in system.dependent_speeds if speed in u}
         u = {speed: value for speed, value in u.items() if speed not in given}
     u0 = as_array({} if u is None else u, system.speeds, f"{name}: u").astype(q0.dtype)
-    if is_concrete(q0, u0) and not np.all(np.isfinite(np.concatenate([q0, u0]))):
-        names = (*system.coordinates, *system.speeds)
-        bad = [n for n, x in zip(names, np.concatenate([q0, u0]), strict=True) if not np.isfinite(x)]
+    if not system.states and x is not None and np.size(x):
+        raise ValueError(f"{name} has no states of the first order: leave out x, got {x!r}.")
+    x0 = as_array({} if x is None else x, system.states, f"{name}: x").astype(q0.dtype) if system.states else None
+    given_numbers = [y for y in (q0, u0, x0) if y is not None]
+    if is_concrete(given_numbers) and not np.all(np.isfinite(np.concatenate(given_numbers))):
+        names = (*system.coordinates, *system.speeds, *system.states)
+        bad = [n for n, y in zip(names, np.concatenate(given_numbers), strict=True) if not np.isfinite(y)]
         raise ValueError(f"{name}: {', '.join(bad)} is not finite.")
     q0 = _solve_configuration(system, q0, t, plan)
     if is_concrete(system, q0, u0, t):
@@ -76,7 +82,7 @@ def assemble(
         if given:
             u_dep = dict(zip(system.dependent_speeds, dependent_speeds(system, t, q0, u0), strict=True))
             _check_dependent_speeds(name, given, u_dep)
-    return State(q0, u0)
+    return State(q0, u0, x0)
 
 
 def _check_time(name: str, t: Any) -> None:

@@ -20,8 +20,8 @@ from .._scalars.linear import as_vector, stack
 from .._scalars.types import Component
 from .checks import check_system, is_concrete, met_or_refused
 from .diagnose import diagnosis
-from .kane import Instant, as_array, as_row, checked_inputs, jvp, refuse_incomplete
-from .rates import rates_and_equations, state_rates
+from .kane import Instant, as_array, as_row, checked_values, jvp, refuse_incomplete
+from .rates import rates_and_equations, motion_rates
 
 InputValues = Mapping[str, Component] | None
 
@@ -37,7 +37,7 @@ def _arrays(system: System, t: Component, q: Any, u: Any, inputs: InputValues = 
     q = as_array(q, system.coordinates, f"{name}: q")
     u = as_array(u, system.speeds, f"{name}: u")
     t = jnp.asarray(t, dtype=q.dtype)
-    checked_inputs(system, inputs)
+    checked_values(system, inputs)
     if left_out:
         q = met_or_refused(system, t, q, left_out)
     check_system(system, t, q)
@@ -72,7 +72,7 @@ def accelerations(system: System, t: Component, q: Any, u: Any, inputs: InputVal
     cannot be solved for the dependent speeds; under a trace these are NaN or infinite.
     """
     arrays = _arrays(system, t, q, u, inputs)
-    _, u_dot = state_rates(*arrays)
+    _, u_dot = motion_rates(*arrays)
     if is_concrete(u_dot) and not np.all(np.isfinite(u_dot)):
         wrong = diagnosis(*arrays)
         if wrong:
@@ -176,7 +176,7 @@ def dependent_accelerations(
 ) -> Float[Array, " k"]:
     """u_dep_dot (k,) = J u_dot - C_dep^-1 (dc/dt at frozen speeds). Arguments as `equations_of_motion`."""
     arrays = _arrays(system, t, q, u, inputs)
-    return _dependent_accelerations(*arrays, state_rates(*arrays)[1])
+    return _dependent_accelerations(*arrays, motion_rates(*arrays)[1])
 
 
 @fused

@@ -32,7 +32,7 @@ from .equations import (
     partial_velocities,
 )
 from .kane import Reading, as_row
-from .rates import state_rates
+from .rates import motion_rates
 
 
 class Function(NamedTuple):
@@ -58,7 +58,7 @@ def _configuration_residuals(system, t, q, u, w, u_dep):
 
 
 FUNCTIONS: dict[str, Function] = {
-    "rates": Function(("q_dot", "u_dot"), lambda s, t, q, u, w, _: state_rates(s, t, q, u, w)),
+    "rates": Function(("q_dot", "u_dot"), lambda s, t, q, u, w, _: motion_rates(s, t, q, u, w)),
     "equations": Function(("M", "f"), lambda s, t, q, u, w, _: equations_of_motion(s, t, q, u, w)),
     "dependent_speeds": Function(("u_dep",), lambda s, t, q, u, w, _: (dependent_speeds(s, t, q, u),), True),
     "dependent_accelerations": Function(

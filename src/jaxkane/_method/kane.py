@@ -108,7 +108,7 @@ class Reading:
                 "use jax.vmap, or jaxkane.sweep.sweep for their motions."
             )
         self.n, self.k = len(system.speeds), len(system.dependent_speeds)
-        self.inputs = Inputs(checked_inputs(system, inputs), f"the inputs of {self.name}")
+        self.inputs = Inputs(checked_values(system, inputs), f"the inputs and states of {self.name}")
         self._memory: dict[Any, Any] = {}
 
     def read(self, part: str, t: Component, q: Row, u: Row) -> Any:
@@ -237,8 +237,12 @@ class Instant(Reading):
         """The derivative of `f(u)` along a direction of speeds, at u = 0: all of it, since f is affine in them."""
         return jvp(lambda s: f(tuple(mul(s, x) for x in direction)), (self._zero(),), (jnp.ones_like(self._zero()),))[1]
 
+    @property
+    def dtype(self) -> Any:
+        return jnp.result_type(*([x for x in (*self.q, *self.u) if not is_exact(x)] or [float]))
+
     def _zero(self) -> Array:
-        return jnp.zeros((), jnp.result_type(*([x for x in (*self.q, *self.u) if not is_exact(x)] or [float])))
+        return jnp.zeros((), self.dtype)
 
     def _constraint_rows(self) -> tuple[Rows, Rows, Row]:
         # c = C_ind u + C_dep u_dep + c0
@@ -454,7 +458,7 @@ def refuse_incomplete(system: System, q: Any, u: Any) -> None:
 
 
 class Inputs(dict[str, Component]):
-    """Inputs by name, as `loads` reads them. One that is not there is refused with the names that are."""
+    """Inputs and states by name, as `loads` reads them. One that is not there is refused with the names that are."""
 
     def __init__(self, values: Mapping[str, Component], of: str):
         super().__init__(values)
@@ -466,12 +470,23 @@ class Inputs(dict[str, Component]):
 
 def checked_inputs(system: System, inputs: Mapping[str, Component] | None) -> dict[str, Component]:
     """All inputs of a system by name; those left out are exactly zero."""
+    return _checked(system, inputs, system.inputs, "input")
+
+
+def checked_values(system: System, values: Mapping[str, Component] | None) -> dict[str, Component]:
+    """All inputs and states of a system by name, as `loads` reads them; those left out are exactly zero."""
+    if not system.states:
+        return checked_inputs(system, values)
+    return _checked(system, values, (*system.inputs, *system.states), "input or state")
+
+
+def _checked(system: System, values: Any, names: Sequence[str], what: str) -> dict[str, Component]:
     own = type(system).__name__
-    if not isinstance(inputs, (Mapping, type(None))):
-        raise TypeError(f"{own}: the inputs are numbers by name, {{name: number}}, got {inputs!r}.")
-    inputs = dict(inputs or {})
-    refuse_unknown(inputs, system.inputs, f"{own} has no input named", "it has")
-    for name, value in inputs.items():
+    if not isinstance(values, (Mapping, type(None))):
+        raise TypeError(f"{own}: the inputs are numbers by name, {{name: number}}, got {values!r}.")
+    values = dict(values or {})
+    refuse_unknown(values, names, f"{own} has no {what} named", "it has")
+    for name, value in values.items():
         if isinstance(value, str) or np.shape(value) != ():
-            raise TypeError(f"{own}: the input {name!r} must be one number, got {value!r}.")
-    return {name: component(inputs.get(name, 0.0)) for name in system.inputs}
+            raise TypeError(f"{own}: the {what} {name!r} must be one number, got {value!r}.")
+    return {name: component(values.get(name, 0.0)) for name in names}

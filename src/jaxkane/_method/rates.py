@@ -16,12 +16,12 @@ from .._scalars.linear import as_vector, is_written_out, solve_positive, solve_p
 from .kane import Instant, as_row
 
 
-def state_rates(
+def motion_rates(
     system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]
 ) -> tuple[Float[Array, " n_q"], Float[Array, " n"]]:
     """q_dot and u_dot: the right-hand side, from arrays that are known to fit."""
     if is_written_out(len(system.speeds)):
-        return _state_rates(system, t, q, u, inputs)
+        return _motion_rates(system, t, q, u, inputs)
     q_dot, M, f = rates_and_equations(system, t, q, u, inputs)
     return q_dot, solve_positive_array(M, f)
 
@@ -49,7 +49,7 @@ def accelerations_and_mass_matrix(
 
 
 @fused
-def _state_rates(system, t, q, u, inputs):
+def _motion_rates(system, t, q, u, inputs):
     now = Instant(system, t, q, u, inputs)
     return as_vector(now.q_dot, q), as_vector(now.accelerations(), q)
 

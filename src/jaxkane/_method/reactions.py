@@ -26,19 +26,19 @@ from .._scalars.reads import compiled
 from .._scalars.types import Component, Triple
 from .equations import InputValues
 from .kane import Instant, Row, Said, as_row, unit
-from .rates import state_rates
+from .rates import motion_rates
 
 
 @compiled
 def multipliers_now(system, t, q, u, inputs):
     """Of the residuals (k,), at the accelerations of the motion."""
-    return _multipliers(system, t, q, u, inputs, state_rates(system, t, q, u, inputs)[1])
+    return _multipliers(system, t, q, u, inputs, motion_rates(system, t, q, u, inputs)[1])
 
 
 @compiled
 def forces_now(system, t, q, u, inputs):
     """By name, numbers and components in N (3,), at the accelerations of the motion."""
-    return _forces(system, t, q, u, inputs, state_rates(system, t, q, u, inputs)[1])
+    return _forces(system, t, q, u, inputs, motion_rates(system, t, q, u, inputs)[1])
 
 
 @fused

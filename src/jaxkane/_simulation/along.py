@@ -16,7 +16,7 @@ from .._description.system import System
 from .._description.vectors import Frame, Point
 from .._method.equations import InputValues, _arrays, _dependent_accelerations
 from .._method.kane import Instant
-from .._method.rates import state_rates
+from .._method.rates import motion_rates
 from .._method.reactions import forces_now, multipliers_now
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector
@@ -45,7 +45,7 @@ def along(f: Callable[..., Any], system: System, t: Any, q: Any, u: Any, inputs:
     for _ in range(t.t.ndim - 1):
         over_times = jax.vmap(over_times, in_axes=(None, 0, 0))
     n_axes = t.t.ndim
-    motion = (t.t, t.q, t.u, t.inputs)
+    motion = (t.t, t.q, t.u, t.values)
     return over_times(system, motion, jax.tree.map(lambda x: x[(slice(None),) * (n_axes - 1) + (0,)], motion))
 
 
@@ -172,6 +172,6 @@ _compiled_orientations = compiled(_orientations)
 
 @compiled
 def _compiled_speed_rates(system, t, q, u, inputs):
-    u_dot = state_rates(system, t, q, u, inputs)[1]
+    u_dot = motion_rates(system, t, q, u, inputs)[1]
     u_dep_dot = _dependent_accelerations(system, t, q, u, inputs, u_dot)
     return dict(zip((*system.speeds, *system.dependent_speeds), (*u_dot, *u_dep_dot), strict=True))

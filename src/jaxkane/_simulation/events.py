@@ -98,29 +98,27 @@ def at_zero(system: System, t: Array, state: State, which: Array, happened: Arra
     To first order that is the implicit function theorem. Here `t` is a number, near enough (within `reach`) that two
     steps of Newton's method are exact, and `state` is the motion at that time.
 
-    **Arguments:** `rates`: (t, q, u) -> (q_dot, u_dot); `happened`: False where no event did: then it is `t` itself.
+    **Arguments:** `rates`: (t, state) -> its rates, a State; `happened`: False where no event did: then it is `t`
+    itself.
     """
     t = jax.lax.stop_gradient(t)
 
-    def measured(t: Array, q: Array, u: Array):
-        q_dot, u_dot = rates(t, q, u)
-        g, g_dot, _ = watched(system, t, q, u, u_dot)
-        return q_dot, u_dot, g[which], g_dot[which]
-
     def stage(carry: Any, k: Array):
-        (t, q, u), step, smooth = carry
-        q_dot, u_dot, g, g_dot = measured(t, q, u)
+        (t, y), step, smooth = carry
+        y_dot = rates(t, y)
+        watching = watched(system, t, y.q, y.u, y_dot.u)
+        g, g_dot = watching.values[which], watching.rates[which]
         # Beside the first point, where to go; there halfway, by the rates in the middle; and there again.
         is_small = jnp.abs(g) <= jnp.abs(g_dot) * reach
         newton = -g / jnp.where(happened & is_small & (g_dot != 0), g_dot, jnp.ones_like(g_dot))
         newton = jnp.where(happened & is_small, newton, jnp.zeros_like(newton))
         step = jnp.where(k == 1, step, newton)
         ahead = jnp.where(k == 0, 0.5 * step, step)
-        base = jax.tree.map(lambda x, x0: jnp.where(k == 1, x0, x), (t, q, u), (t0, q0, u0))
-        moved = jax.tree.map(lambda x, x_dot: x + ahead * x_dot, base, (jnp.ones_like(t), q_dot, u_dot))
+        base = jax.tree.map(lambda x, x0: jnp.where(k == 1, x0, x), (t, y), first)
+        moved = jax.tree.map(lambda x, x_dot: x + ahead * x_dot, base, (jnp.ones_like(t), y_dot))
         return (moved, step, smooth & (is_small | (k == 1))), None
 
-    t0, q0, u0 = t, state.q, state.u
-    first = ((t0, q0, u0), jnp.zeros_like(t), jnp.array(True))
-    ((t, q, u), _, smooth), _ = jax.lax.scan(stage, first, jnp.arange(3))
-    return End(t, State(q, u), smooth)
+    first = (t, state)
+    start = (first, jnp.zeros_like(t), jnp.array(True))
+    ((t, state), _, smooth), _ = jax.lax.scan(stage, start, jnp.arange(3))
+    return End(t, state, smooth)

@@ -18,7 +18,7 @@ from .._method.checks import configuration_is_met
 from .._method.drift import correction, has_configuration_constraints, projected
 from .._method.equations import _dependent_speeds
 from .._method.kane import Instant, checked_inputs
-from .._method.rates import state_rates
+from .._method.now import outputs_at, rates, values_of
 from .._scalars.nan import all_finite, derivative_free_where_not_finite, nan_derivative_where, nan_where
 from .._scalars.reads import compiled
 from .._scalars.types import Component
@@ -31,22 +31,24 @@ from .trajectory import Status, Trajectory
 
 
 class Now(eqx.Module):
-    """What an input function receives: `state.q`, `state.u`, and any coordinate or speed by name."""
+    """What an input function receives: `state.q`, `state.u`, `state.x`, and any coordinate, speed or state by name."""
 
     q: Array
     u: Array
+    x: Array | None
     t: Any
     system: System
 
     def __getitem__(self, name: str) -> Component:
         system = self.system
-        for names, values in ((system.coordinates, self.q), (system.speeds, self.u)):
-            if name in names:
+        for names, values in ((system.coordinates, self.q), (system.speeds, self.u), (system.states, self.x)):
+            if values is not None and name in names:
                 return values[names.index(name)]
         if name in system.dependent_speeds:
             now = Instant(system, self.t, self.q, self.u)
             return jnp.asarray(now.u_dep[system.dependent_speeds.index(name)])
-        raise not_there(name, (*system.coordinates, *system.speeds, *system.dependent_speeds), "the state")
+        known = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.states)
+        raise not_there(name, known, "the state")
 
 
 @compiled
@@ -65,11 +67,10 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
 
     def vector_field(t, y, args):
         system, signals = args
-        q, u = y
-        q_dot, u_dot = state_rates(system, t, q, u, inputs_at(system, signals, t, q, u))
+        y_dot = rates(system, t, y, inputs_at(system, signals, t, y))
         if constrained and settings.stabilize:
-            q_dot = q_dot + settings.stabilize * correction(system, t, q)
-        return tuple(jnp.where(valid, rate, jnp.zeros_like(rate)) for rate in (q_dot, u_dot))
+            y_dot = State(y_dot.q + settings.stabilize * correction(system, t, y.q), y_dot.u, y_dot.x)
+        return jax.tree.map(lambda rate: jnp.where(valid, rate, jnp.zeros_like(rate)), y_dot)
 
     def trial_rates(t, y, args):
         # A step that is rejected since its rates are not finite must not spoil a derivative in reverse mode.
@@ -87,7 +88,7 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
         ts[0],
         ts[-1],
         step,
-        (state.q, state.u),
+        state,
         (system, signals),
         saveat=diffrax.SaveAt(subs=(diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)), controller_state=stops),
         stepsize_controller=controller,
@@ -97,8 +98,8 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
         throw=False,
     )
     times, states = cast(Any, (solution.ts, solution.ys))
-    (t_reached, t_last), ((q, u), (q_last, u_last)) = jax.lax.stop_gradient(times), states
-    reached, t_end, end = jnp.isfinite(t_reached) & valid, t_last[0], State(q_last[0], u_last[0])
+    (t_reached, t_last), (motion, last) = jax.lax.stop_gradient(times), states
+    reached, t_end, end = jnp.isfinite(t_reached) & valid, t_last[0], jax.tree.map(lambda y: y[0], last)
 
     which = cast(Any, solution.controller_state).which.astype(int) if stops else jnp.array(-1)
     status = jnp.where(valid, _status(solution, which, events), Status.INVALID).astype(jnp.int32)
@@ -107,33 +108,36 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
     if events.names:
         happened = status >= Status.EVENT
         beside = jax.tree.map(lambda x, first: jnp.where(happened, x, first), (t_end, end), (ts[0], state))
-        rates = lambda t, q, u: vector_field(t, (q, u), (system, signals))  # noqa: E731
-        found = at_zero(system, beside[0], beside[1], jnp.maximum(which, 0), happened, rates, 4 * reach)
+        moving = lambda t, y: vector_field(t, y, (system, signals))  # noqa: E731
+        found = at_zero(system, beside[0], beside[1], jnp.maximum(which, 0), happened, moving, 4 * reach)
         t_end, end = jax.tree.map(lambda x, y: jnp.where(happened, x, y), (found.t, found.state), (t_end, end))
         smooth |= happened & found.smooth
         # The last step ends a little beside the event: samples from there to here are those of the event itself.
         here = 64 * jnp.finfo(ts.dtype).eps * jnp.max(jnp.abs(ts))
         late = happened & ~reached & (ts <= t_end + here)
         reached = jnp.where(happened, ts <= t_end + here, reached)
-        q, u = (jnp.where(late[:, None], x[None], y) for x, y in zip((end.q, end.u), (q, u), strict=True))
+        motion = jax.tree.map(lambda x, y: jnp.where(late[:, None], x[None], y), end, motion)
 
     # What follows from the motion is found where there is one, and from the first state elsewhere: a value that is
     # not finite has derivatives that a mask behind it cannot take away.
-    q, u = (jnp.where(reached[:, None], y, first[None]) for y, first in ((q, state.q), (u, state.u)))
+    motion = jax.tree.map(lambda y, first: jnp.where(reached[:, None], y, first[None]), motion, state)
     end = jax.tree.map(lambda y, first: jnp.where(valid, y, first), end, state)
     if constrained and settings.project:
-        q = jax.vmap(lambda t, q: projected(system, t, q))(ts, q)
-        end = State(projected(system, t_end, end.q), end.u)
-    u_dep = jax.vmap(lambda t, q, u: _dependent_speeds(system, t, q, u, {}))(ts, q, u)
-    inputs = jax.vmap(lambda t, q, u: inputs_at(system, signals, t, q, u, all_of_them=True))(ts, q, u)
-    q, u, u_dep, inputs = nan_where(~reached, (q, u, u_dep, inputs), origin)
+        motion = State(jax.vmap(lambda t, q: projected(system, t, q))(ts, motion.q), motion.u, motion.x)
+        end = State(projected(system, t_end, end.q), end.u, end.x)
+    u_dep = jax.vmap(lambda t, y: _dependent_speeds(system, t, y.q, y.u, {}))(ts, motion)
+    inputs = jax.vmap(lambda t, y: inputs_at(system, signals, t, y, all_of_them=True))(ts, motion)
+    outputs = jax.vmap(lambda t, y, w: outputs_at(system, t, y.q, y.u, values_of(system, y.x, w)))(ts, motion, inputs)
+    motion, u_dep, inputs, outputs = nan_where(~reached, (motion, u_dep, inputs, outputs), origin)
     t_end, end = nan_derivative_where(~smooth, (t_end, end), origin)
     return Trajectory(
         t=ts,
-        q=q,
-        u=u,
+        q=motion.q,
+        u=motion.u,
         u_dep=u_dep,
+        x=motion.u[:, :0] if motion.x is None else motion.x,
         inputs=inputs,
+        outputs=outputs,
         status=status,
         t_end=t_end,
         stats={
@@ -141,7 +145,12 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
             "accepted": solution.stats["num_accepted_steps"],
             "rejected": solution.stats["num_rejected_steps"],
         },
-        names=(tuple(system.coordinates), tuple(system.speeds), tuple(system.dependent_speeds)),
+        names=(
+            tuple(system.coordinates),
+            tuple(system.speeds),
+            tuple(system.dependent_speeds),
+            tuple(system.states),
+        ),
         events=events.names,
         adjoint=type(settings.adjoint).__name__,
         units=tuple(units_of(system).items()),
@@ -171,9 +180,8 @@ def _to_stops(controller: Any, vector_field: Any, events: Events, system: System
     """A controller that also ends the motion: at the events, and before the dependent speeds are singular."""
 
     def watch(t, y, args):
-        q, u = y
-        u_dot = vector_field(t, y, args)[1] if events.read_speeds else jnp.zeros_like(u)
-        return Quantities(*watched(args[0], t, q, u, u_dot))
+        u_dot = vector_field(t, y, args).u if events.read_speeds else jnp.zeros_like(y.u)
+        return Quantities(*watched(args[0], t, y.q, y.u, u_dot))
 
     whole = jax.lax.stop_gradient(ts[-1] - ts[0])
     adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
@@ -183,10 +191,11 @@ def _to_stops(controller: Any, vector_field: Any, events: Events, system: System
     return kind(controller=controller, watch=watch, limits=limits)
 
 
-def inputs_at(system: System, signals: Any, t: Component, q: Array, u: Array, all_of_them: bool = False):
-    values = evaluate(signals, t, Now(q, u, t, system))
+def inputs_at(system: System, signals: Any, t: Component, state: State, all_of_them: bool = False):
+    """The inputs by name, at one time: all, or those that are given."""
+    values = evaluate(signals, t, Now(state.q, state.u, state.x, t, system))
     names = checked_inputs(system, values) if all_of_them else values
-    return {name: jnp.asarray(values.get(name, 0.0), dtype=q.dtype) for name in names}
+    return {name: jnp.asarray(values.get(name, 0.0), dtype=state.q.dtype) for name in names}
 
 
 def _is_valid(system: System, state: State, ts: Array, signals: Any) -> Array:

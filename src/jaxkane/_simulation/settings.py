@@ -112,8 +112,9 @@ def checked_state(system: System, state: Any) -> State:
             f"{name}: the state must be a jaxkane.State(q, u), as assemble gives it; got {type(state).__name__}."
         )
     state = as_state(system, state)
-    for label, value, names in (("q", state.q, system.coordinates), ("u", state.u, system.speeds)):
-        if value.shape != (len(names),):
+    parts = [("q", state.q, system.coordinates), ("u", state.u, system.speeds), ("x", state.x, system.states)]
+    for label, value, names in parts:
+        if value is not None and value.shape != (len(names),):
             raise ValueError(
                 f"{name}: state.{label} must have the shape ({len(names)},) for {', '.join(names)}; got {value.shape}."
                 + (" For a batch use jaxkane.sweep or jax.vmap." if value.ndim > 1 else "")
@@ -122,17 +123,23 @@ def checked_state(system: System, state: Any) -> State:
 
 
 def as_state(system: System, state: State) -> State:
-    """A state in arrays, of one in dicts by name. Coordinates and speeds that are left out are zero.
+    """A state in arrays, of one in dicts by name. What is left out is zero.
 
     **Raises:** `ValueError` for an unknown name, a dependent coordinate left out, a dependent speed that is named.
     """
     refuse_incomplete(system, state.q, state.u)
     title = type(system).__name__
-    q, u = (
-        by_names(values, names, f"{title}: state.{label}") if isinstance(values, Mapping) else values
-        for label, values, names in (("q", state.q, system.coordinates), ("u", state.u, system.speeds))
-    )
-    for label, values in (("q", q), ("u", u)):
+    x: Any = {} if state.x is None and system.states else state.x
+    if not system.states and x is not None and np.size(x):
+        raise ValueError(f"{title} has no states of the first order, but state.x is {x!r}.")
+    parts: list[Any] = [("q", state.q, system.coordinates), ("u", state.u, system.speeds)]
+    parts += [("x", x, system.states)] if system.states else []
+    found: list[Any] = []
+    for label, values, names in parts:
+        if isinstance(values, Mapping):
+            values = by_names(values, names, f"{title}: state.{label}")
+            values = values.astype(found[0].dtype) if found else values
         if not hasattr(values, "shape"):
             raise TypeError(f"{title}: state.{label} is an array of numbers, or a dict by name; got {values!r}.")
-    return State(q, u.astype(q.dtype) if isinstance(state.u, Mapping) else u)
+        found.append(values)
+    return State(*found)

@@ -37,14 +37,15 @@ class Status(enum.IntEnum):
 
 
 class Trajectory(eqx.Module):
-    """Motion over time, by name: `ride["roll"]`, `ride["yaw_rate"]`, `ride["steer_torque"]`.
+    """Motion over time, by name: `ride["roll"]`, `ride["yaw_rate"]`, `ride["steer_torque"]`, `ride["imu.ay"]`.
 
     Values after the end of a simulation that stopped early are NaN. A batch has leading axes.
 
     Attributes:
 
-    - `t` (n_t,) [s]; `q` (n_t, n_q); `u` (n_t, n_u) independent speeds; `u_dep` (n_t, k) dependent speeds.
-    - `inputs`: values (n_t,) of every input by name.
+    - `t` (n_t,) [s]; `q` (n_t, n_q); `u` (n_t, n_u) independent speeds; `u_dep` (n_t, k) dependent speeds;
+        `x` (n_t, n_x) states of the first order.
+    - `inputs`, `outputs`: values (n_t,) of every input, and of every output of the system, by name.
     - `status`: a `Status` code; `reason` says it in words.
     - `t_end` [s] and `end`, the state there: where the simulation ended. They have derivatives where it ended at the
         last time or by an event, whose time moves with what it follows from; otherwise their derivatives are NaN.
@@ -56,19 +57,26 @@ class Trajectory(eqx.Module):
     q: Float[Array, "*batch n_t n_q"]
     u: Float[Array, "*batch n_t n_u"]
     u_dep: Float[Array, "*batch n_t k"]
+    x: Float[Array, "*batch n_t n_x"]
     inputs: dict[str, Float[Array, "*batch n_t"]]
+    outputs: dict[str, Float[Array, "*batch n_t"]]
     status: Int[Array, "*batch"]
     t_end: Float[Array, "*batch"]
     stats: dict[str, Int[Array, "*batch"]]
-    names: tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]] = eqx.field(static=True)
+    names: tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...], tuple[str, ...]] = eqx.field(static=True)
     events: tuple[str, ...] = eqx.field(static=True)
     adjoint: str = eqx.field(static=True)
     units: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
     end: State | None = None
 
     def __getitem__(self, name: str) -> Float[Array, "*batch n_t"]:
-        groups = zip(self.names, (self.q, self.u, self.u_dep), strict=True)
-        return by_name(name, groups, self.inputs, "this trajectory")
+        groups = zip(self.names, (self.q, self.u, self.u_dep, self.x), strict=True)
+        return by_name(name, groups, {**self.inputs, **self.outputs}, "this trajectory")
+
+    @property
+    def values(self) -> dict[str, Float[Array, "*batch n_t"]]:
+        """Inputs and states of the first order by name, as `loads` reads them."""
+        return {**self.inputs, **{name: self.x[..., i] for i, name in enumerate(self.names[3])}}
 
     @property
     def ok(self) -> Any:
@@ -84,7 +92,7 @@ class Trajectory(eqx.Module):
 
     def state(self, i: int = -1) -> State:
         """The state at the i-th time, to go on from."""
-        return State(self.q[..., i, :], self.u[..., i, :])
+        return State(self.q[..., i, :], self.u[..., i, :], self.x[..., i, :] if self.names[3] else None)
 
     def __repr__(self) -> str:
         if isinstance(self.status, Tracer) or np.ndim(self.status) > 0:

@@ -8,7 +8,7 @@ import numpy as np
 
 from .._description.system import System
 from .._method.checks import configuration_residual, is_concrete
-from .._method.rates import state_rates
+from .._method.rates import motion_rates
 from .._scalars.jax_internals import concretely
 from .._scalars.reads import on_forget, version_of
 
@@ -50,7 +50,7 @@ def _search(system: System, leaves: list, treedef) -> tuple[str, ...]:
 
     @jax.jit
     def rates(trial, t, q, u, w):
-        q_dot, u_dot = state_rates(trial, t, q, u, w)
+        q_dot, u_dot = motion_rates(trial, t, q, u, w)
         return q_dot, jnp.concatenate([u_dot, configuration_residual(trial, t, q)])
 
     notices = np.zeros((n_q + 1, n_q), bool)  # row: a rate, the last those of the speeds and the constraints

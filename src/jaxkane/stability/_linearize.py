@@ -17,7 +17,7 @@ from .._description.values import Values
 from .._method.checks import check_system, configuration_residual, is_concrete
 from .._method.equations import dependent_speeds
 from .._method.kane import as_array, checked_inputs, refuse_incomplete
-from .._method.rates import state_rates
+from .._method.rates import motion_rates
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, solve, stack
 from .._scalars.nan import nan_where
@@ -184,7 +184,7 @@ def _at_deviation(x, w, at, T, choice: _Choice, functions: _Functions):
     moved = dict(zip(choice.states, x, strict=True))
     q = q + sum((moved[k] * T[:, i] for i, k in enumerate(names) if k in moved), jnp.zeros_like(q))
     u = jnp.stack([u[i] + moved[k] if k in moved else u[i] for i, k in enumerate(system.speeds)])
-    q_dot, u_dot = state_rates(system, t, q, u, {k: w[i] for i, k in enumerate(system.inputs)})
+    q_dot, u_dot = motion_rates(system, t, q, u, {k: w[i] for i, k in enumerate(system.inputs)})
     x_dot = dict(zip((*names, *system.speeds), (*q_dot, *u_dot), strict=True))
     known = dict(zip((*names, *system.speeds), (*q, *u), strict=True))
     if functions or not known.keys() >= {*choice.outputs}:
@@ -218,7 +218,7 @@ def _tangents(system: System, t, q, choice: _Choice):
 
 @compiled
 def _rates(system, t, q, u, w):
-    q_dot, u_dot = state_rates(system, t, q, u, {k: w[i] for i, k in enumerate(system.inputs)})
+    q_dot, u_dot = motion_rates(system, t, q, u, {k: w[i] for i, k in enumerate(system.inputs)})
     return q_dot, u_dot, configuration_residual(system, t, q)
 
 

@@ -15,7 +15,7 @@ from .._description.system import State, System
 from .._method.checks import check_system, configuration_residual, is_concrete
 from .._method.equations import dependent_speeds
 from .._method.kane import as_array, checked_inputs
-from .._method.rates import state_rates
+from .._method.rates import motion_rates
 from .._scalars.nan import nan_where
 from .._scalars.reads import compiled
 from .._scalars.types import Component
@@ -162,7 +162,7 @@ class Problem(eqx.Module):
         """F (m,): accelerations, rates of the non-cyclic coordinates, constraints, what is held."""
         system, t, q, inputs, held = args
         q, u, inputs = self.parts(z, q, inputs)
-        q_dot, u_dot = state_rates(system, t, q, u, inputs)
+        q_dot, u_dot = motion_rates(system, t, q, u, inputs)
         free = [self.quantity(system, t, q, u, k) for k in self.held]
         fixed = jnp.stack(free) - held if free else jnp.zeros(0, q.dtype)
         return jnp.concatenate([u_dot, q_dot[np.array(self.places, int)], configuration_residual(system, t, q), fixed])

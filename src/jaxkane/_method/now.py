@@ -1,0 +1,229 @@
+"""What a description is told of one instant beyond its speeds: accelerations and the forces of constraints.
+
+`System.state_rates` and `System.outputs` are read here. Knows the method; knows no mechanism and no time.
+
+An acceleration is asked for while a description is read, and is a derivative of what is being read. So the description
+is read twice: first it says of which points and frames it wants to know; their velocities are differentiated along the
+motion; then it is read with the answers. What asks for none is read once.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from .._common.lookup import not_there, refuse_unknown
+from .._description.bodies import Motion
+from .._description.system import State, System
+from .._description.values import Values
+from .._description.vectors import Frame, Point, Vector
+from .._scalars.components import add3, component, cross, is_exact
+from .._scalars.fuse import fused
+from .._scalars.linear import as_vector, is_written_out
+from .._scalars.types import Component
+from .kane import Inputs, Instant, Row, as_row, jvp
+from .rates import motion_rates
+from .reactions import Reactions
+
+
+class Now(Inputs):
+    """One instant, as `state_rates` and `outputs` receive it: `now["command"]` is an input or a state by name.
+
+    Attributes: `u_dot`, the time derivatives of all speeds, dependent ones too, by place and by name.
+    """
+
+    def __init__(self, instant: Instant, N: Frame, u_dot: Values, answers: Iterator[Row] | None):
+        super().__init__(instant.inputs, f"the inputs and states of {instant.name}")
+        self.u_dot = u_dot
+        self._instant, self._N, self._answers = instant, N, answers
+        self._asked: list[Vector] = []
+
+    def acceleration(self, point: Point) -> Vector:
+        """Of a Point in the inertial frame [m/s^2]."""
+        if not isinstance(point, Point):
+            raise TypeError(f"now.acceleration(point): a Point is asked for, got {point!r}. Of a body, its `center`.")
+        return self._rate(point.velocity)
+
+    def angular_acceleration(self, frame: Frame) -> Vector:
+        """Of a Frame in the inertial frame [rad/s^2]."""
+        if not isinstance(frame, Frame):
+            raise TypeError(f"now.angular_acceleration(frame): a Frame is asked for, got {frame!r}.")
+        return self._rate(frame.angular_velocity)
+
+    def force(self, name: str) -> Any:
+        """What constraints carry at a named point [N] or frame [N m], a Vector, or along an auxiliary speed, a number:
+        as `jaxkane.constraint_forces` gives it by that name."""
+        forces = self._forces
+        if name not in forces:
+            raise not_there(name, forces, "the named points, frames and auxiliary speeds")
+        found = forces[name]
+        return self._N.vector(*found) if isinstance(found, tuple) else found
+
+    @functools.cached_property
+    def _forces(self) -> dict[str, Any]:
+        now = self._instant
+        reactions = Reactions(now.system, now.t, now.q, now.u, dict(now.inputs), self.u_dot[: now.n])
+        return dict([*reactions.forces_of_parts(), *reactions.forces_of_auxiliary_speeds()])
+
+    def _rate(self, vector: Vector) -> Vector:
+        self._asked.append(vector)
+        if self._answers is None:
+            return Vector(vector.frame, (jnp.ones((), self._instant.dtype),) * 3)
+        return Vector(vector.frame, next(self._answers))  # type: ignore[arg-type]
+
+
+Read = Callable[[System, Component, Row, Row, Motion, Now], Any]
+
+
+def read_at(now: Instant, u_dot: Row, read: Read) -> Any:
+    """What `read` finds in the description at an instant, whose independent speeds change with `u_dot` (n,)."""
+    u_dot_all = (*u_dot, *now.dependent_accelerations(u_dot))
+    names = (*now.system.speeds, *now.system.dependent_speeds)
+
+    def reading(t: Component, q: Row, u: Row, answers: Iterator[Row] | None = None) -> tuple[Any, Now]:
+        motion = now.motion(t, q, u)
+        told = Now(now, motion.N, Values(u_dot_all, names), answers)
+        return read(now.system, t, q, u, motion, told), told
+
+    # Points that are made while it is read divide by speeds, perhaps: by no exact zero.
+    q, u = (tuple(jnp.asarray(x, now.dtype) if is_exact(x) else x for x in row) for row in (now.q, now.u_all))
+    found, told = reading(now.t, q, u)
+    if not told._asked:
+        return found
+    n_q = len(q)
+
+    def asked(t: Component, *z: Component) -> list[Row]:
+        return [vector.components for vector in reading(t, z[:n_q], z[n_q:])[1]._asked]
+
+    values, rates = jvp(asked, (now.t, *q, *u), (1.0, *now.q_dot, *u_dot_all))
+    turning = [vector.frame.angular_velocity.components for vector in told._asked]
+    # dv/dt in N = derivative of the components + omega x v
+    answers = [add3(rate, cross(w, v)) for rate, w, v in zip(rates, turning, values, strict=True)]
+    return reading(now.t, q, u, iter(answers))[0]
+
+
+def _state_rates(system: System, t: Component, q: Row, u: Row, motion: Motion, now: Now) -> Row:
+    names, label = system.states, f"{type(system).__name__}.state_rates"
+    rates: Any = system.state_rates(t, q, u, [now[name] for name in names], motion, now)
+    if isinstance(rates, Mapping):
+        refuse_unknown(rates, names, f"{label} names what is no state:")
+        missing = [name for name in names if name not in rates]
+        if missing:
+            raise ValueError(f"{label} gives no rate of {', '.join(missing)}.")
+        rates = [rates[name] for name in names]
+    if isinstance(rates, (float, int)) or (hasattr(rates, "shape") and not rates.shape):
+        rates = (rates,)  # the rate of a single state needs no tuple
+    return as_row(rates, names, label)
+
+
+def _outputs(system: System, t: Component, q: Row, u: Row, motion: Motion, now: Now) -> dict[str, Component]:
+    return flatten_outputs(system, system.outputs(t, q, u, motion, now))
+
+
+def flatten_outputs(system: System, given: Any) -> dict[str, Component]:
+    """Outputs by name, those of nested dicts joined by dots.
+
+    **Raises:** `TypeError` for what is no number; `ValueError` for a name that stands for something else already.
+    """
+    label = f"{type(system).__name__}.outputs"
+    if not isinstance(given, Mapping):
+        hint = " Does it end without a `return`?" if given is None else ""
+        raise TypeError(f"{label} returns numbers by name, in a dict; got {given!r}.{hint}")
+    found: dict[str, Component] = {}
+    for name, value in given.items():
+        if not isinstance(name, str) or not name:
+            raise TypeError(f"{label}: the name of an output is a string, got {name!r}.")
+        each = {f"{name}.{k}": x for k, x in flatten_outputs(system, value).items()} if _is_dict(value) else {name: value}
+        for key, x in each.items():
+            if isinstance(x, Vector):
+                raise TypeError(f"{label}: {key!r} is a Vector; give its components, as in `a, b, c = v.to(frame)`.")
+            if key in found:
+                raise ValueError(f"{label}: the name {key!r} stands for two outputs.")
+            try:
+                found[key] = component(x)
+            except TypeError as error:
+                raise TypeError(f"{label}: {key!r} is one number: {error}") from None
+    taken = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.inputs, *system.states)
+    twice = [name for name in found if name in taken]
+    if twice:
+        raise ValueError(
+            f"{label}: {', '.join(twice)} is the name of a coordinate, a speed, an input or a state already: "
+            f"trajectories are read by name. Call what a sensor says of it otherwise, such as {twice[0] + '_measured'!r}."
+        )
+    return found
+
+
+def _is_dict(value: Any) -> bool:
+    return isinstance(value, Mapping)
+
+
+def rates(system: System, t: Array, state: State, inputs: Mapping[str, Array]) -> State:
+    """The right-hand side: the time derivatives of coordinates, independent speeds and states of the first order, from
+    arrays that are known to fit."""
+    values = values_of(system, state.x, inputs)
+    if not system.states:
+        return State(*motion_rates(system, t, state.q, state.u, values))
+    if is_written_out(len(system.speeds)):
+        return State(*_all_rates(system, t, state.q, state.u, values))
+    q_dot, u_dot = motion_rates(system, t, state.q, state.u, values)
+    return State(q_dot, u_dot, first_order_rates(system, t, state.q, state.u, values, u_dot))
+
+
+def values_of(system: System, x: Array | None, inputs: Mapping[str, Any]) -> dict[str, Any]:
+    """Inputs and states by name, as `loads` reads them; `x` (..., n_x)."""
+    return {**inputs, **{name: x[..., i] for i, name in enumerate(system.states)}} if x is not None else dict(inputs)
+
+
+@fused
+def _all_rates(system, t, q, u, inputs):
+    now = Instant(system, t, q, u, inputs)
+    u_dot = now.accelerations()
+    x_dot = read_at(now, u_dot, _state_rates)
+    return as_vector(now.q_dot, q), as_vector(u_dot, q), as_vector(x_dot, q)
+
+
+@fused
+def first_order_rates(system, t, q, u, inputs, u_dot):
+    """x_dot (n_x,) at the accelerations u_dot (n,)."""
+    now = Instant(system, t, q, u, inputs)
+    return as_vector(read_at(now, as_row(u_dot, system.speeds, "u_dot"), _state_rates), q)
+
+
+def has_outputs(system: System) -> bool:
+    """Whether a system says anything beside its coordinates, speeds, inputs and states."""
+    return type(system).outputs is not System.outputs
+
+
+def outputs_at(system: System, t: Array, q: Array, u: Array, inputs: Mapping[str, Array]) -> dict[str, Array]:
+    """Outputs by name, from arrays that are known to fit; `inputs` holds the states too."""
+    if not has_outputs(system):
+        return {}
+    if is_written_out(len(system.speeds)):
+        return _outputs_written_out(system, t, q, u, inputs)
+    return _outputs_with_accelerations(system, t, q, u, inputs, motion_rates(system, t, q, u, dict(inputs))[1])
+
+
+@fused
+def _outputs_written_out(system, t, q, u, inputs):
+    now = Instant(system, t, q, u, inputs)
+    return {name: as_vector([x], q)[0] for name, x in read_at(now, now.accelerations(), _outputs).items()}
+
+
+@fused
+def _outputs_with_accelerations(system, t, q, u, inputs, u_dot):
+    now = Instant(system, t, q, u, inputs)
+    found = read_at(now, as_row(u_dot, system.speeds, "u_dot"), _outputs)
+    return {name: as_vector([x], q)[0] for name, x in found.items()}
+
+
+def output_names(system: System) -> tuple[str, ...]:
+    """The names of a system's outputs, in the order of the alphabet."""
+    if not has_outputs(system):
+        return ()
+    q, u = (jnp.zeros(len(names)) for names in (system.coordinates, system.speeds))
+    return tuple(jax.eval_shape(lambda t, q, u: outputs_at(system, t, q, u, {}), jnp.zeros(()), q, u))
