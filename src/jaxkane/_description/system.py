@@ -25,9 +25,7 @@ class State(eqx.Module):
 
     q: Float[Array, "*batch n_q"] = eqx.field(converter=to_float)
     u: Float[Array, "*batch n_u"] = eqx.field(converter=to_float)
-    x: Float[Array, "*batch n_x"] | None = eqx.field(
-        converter=lambda x: x if x is None else to_float(x), default=None
-    )
+    x: Float[Array, "*batch n_x"] | None = eqx.field(converter=lambda x: x if x is None else to_float(x), default=None)
 
 
 class System(eqx.Module, metaclass=Kind):
@@ -106,8 +104,8 @@ class System(eqx.Module, metaclass=Kind):
         `now` is a `Now`: inputs and states by name, and accelerations, for the filter of an accelerometer.
         """
         raise NotImplementedError(
-            f"{type(self).__name__} has states ({', '.join(self.states)}): define state_rates(self, t, q, u, x, motion, "
-            "now), one rate for each."
+            f"{type(self).__name__} has states ({', '.join(self.states)}): define state_rates(self, t, q, u, x, "
+            "motion, now), one rate for each."
         )
 
     def outputs(self, t: Component, q: Any, u: Any, motion: Motion, now: Any) -> Mapping[str, Any]:

@@ -20,8 +20,9 @@ def unit_of(name: str, declared: Mapping[str, str]) -> str:
 def units_of(system: System) -> dict[str, str]:
     """Units by name that a system declares; and of speeds that are the rates of such coordinates."""
     speeds = (*system.speeds, *system.dependent_speeds)
-    names = (*system.coordinates, *speeds, *system.auxiliary_speeds, *system.inputs)
-    units = {name: unit for name, unit in system.units.items() if name in names}
+    has_outputs = type(system).outputs is not System.outputs  # whose names are known when they are read
+    names = (*system.coordinates, *speeds, *system.auxiliary_speeds, *system.inputs, *system.states)
+    units = {name: unit for name, unit in system.units.items() if name in names or has_outputs}
     if type(system).q_dot is System.q_dot:
         for coordinate, speed in zip(system.coordinates, speeds, strict=False):
             if coordinate in units:

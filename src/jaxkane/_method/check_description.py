@@ -91,7 +91,7 @@ class _Description:
         self.system, self.t, self.q, self.rng = system, np.asarray(t, q.dtype), q, rng
         self.name = type(system).__name__
         self.speeds = (*system.speeds, *system.dependent_speeds)
-        self.inputs = {name: np.asarray(0.7, q.dtype) for name in system.inputs}
+        self.inputs = {name: np.asarray(0.7, q.dtype) for name in (*system.inputs, *system.states)}
         self.tolerance = float(jnp.finfo(q.dtype).eps) ** 0.5
 
     def check(self, are_given: bool) -> bool:

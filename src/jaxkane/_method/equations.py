@@ -21,7 +21,7 @@ from .._scalars.types import Component
 from .checks import check_system, is_concrete, met_or_refused
 from .diagnose import diagnosis
 from .kane import Instant, as_array, as_row, checked_values, jvp, refuse_incomplete
-from .rates import rates_and_equations, motion_rates
+from .rates import motion_rates, rates_and_equations
 
 InputValues = Mapping[str, Component] | None
 

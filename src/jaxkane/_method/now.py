@@ -131,6 +131,18 @@ def flatten_outputs(system: System, given: Any) -> dict[str, Component]:
     **Raises:** `TypeError` for what is no number; `ValueError` for a name that stands for something else already.
     """
     label = f"{type(system).__name__}.outputs"
+    found = _flat(label, given)
+    taken = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.inputs, *system.states)
+    twice = [name for name in found if name in taken]
+    if twice:
+        raise ValueError(
+            f"{label}: {', '.join(twice)} is the name of a coordinate, a speed, an input or a state already, and "
+            f"trajectories are read by name. Call what a sensor says of it otherwise: {'measured_' + twice[0]!r}."
+        )
+    return found
+
+
+def _flat(label: str, given: Any) -> dict[str, Component]:
     if not isinstance(given, Mapping):
         hint = " Does it end without a `return`?" if given is None else ""
         raise TypeError(f"{label} returns numbers by name, in a dict; got {given!r}.{hint}")
@@ -138,40 +150,32 @@ def flatten_outputs(system: System, given: Any) -> dict[str, Component]:
     for name, value in given.items():
         if not isinstance(name, str) or not name:
             raise TypeError(f"{label}: the name of an output is a string, got {name!r}.")
-        each = {f"{name}.{k}": x for k, x in flatten_outputs(system, value).items()} if _is_dict(value) else {name: value}
-        for key, x in each.items():
-            if isinstance(x, Vector):
-                raise TypeError(f"{label}: {key!r} is a Vector; give its components, as in `a, b, c = v.to(frame)`.")
+        inner = {f"{name}.{k}": x for k, x in _flat(label, value).items()} if isinstance(value, Mapping) else None
+        for key, x in ({name: value} if inner is None else inner).items():
             if key in found:
                 raise ValueError(f"{label}: the name {key!r} stands for two outputs.")
-            try:
-                found[key] = component(x)
-            except TypeError as error:
-                raise TypeError(f"{label}: {key!r} is one number: {error}") from None
-    taken = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.inputs, *system.states)
-    twice = [name for name in found if name in taken]
-    if twice:
-        raise ValueError(
-            f"{label}: {', '.join(twice)} is the name of a coordinate, a speed, an input or a state already: "
-            f"trajectories are read by name. Call what a sensor says of it otherwise, such as {twice[0] + '_measured'!r}."
-        )
+            found[key] = x if inner is not None else _number(label, key, x)
     return found
 
 
-def _is_dict(value: Any) -> bool:
-    return isinstance(value, Mapping)
+def _number(label: str, name: str, value: Any) -> Component:
+    if isinstance(value, Vector):
+        raise TypeError(f"{label}: {name!r} is a Vector; give its components, as in `a, b, c = v.to(frame)`.")
+    try:
+        return component(value)
+    except TypeError as error:
+        raise TypeError(f"{label}: {name!r} is one number: {error}") from None
 
 
-def rates(system: System, t: Array, state: State, inputs: Mapping[str, Array]) -> State:
+def rates(system: System, t: Array, q: Array, u: Array, values: dict[str, Array]) -> State:
     """The right-hand side: the time derivatives of coordinates, independent speeds and states of the first order, from
-    arrays that are known to fit."""
-    values = values_of(system, state.x, inputs)
+    arrays that are known to fit; `values` of inputs and states by name."""
     if not system.states:
-        return State(*motion_rates(system, t, state.q, state.u, values))
+        return State(*motion_rates(system, t, q, u, values))
     if is_written_out(len(system.speeds)):
-        return State(*_all_rates(system, t, state.q, state.u, values))
-    q_dot, u_dot = motion_rates(system, t, state.q, state.u, values)
-    return State(q_dot, u_dot, first_order_rates(system, t, state.q, state.u, values, u_dot))
+        return State(*_all_rates(system, t, q, u, values))
+    q_dot, u_dot = motion_rates(system, t, q, u, values)
+    return State(q_dot, u_dot, first_order_rates(system, t, q, u, values, u_dot))
 
 
 def values_of(system: System, x: Array | None, inputs: Mapping[str, Any]) -> dict[str, Any]:

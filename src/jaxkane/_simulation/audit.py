@@ -167,7 +167,7 @@ def audit(system: System, trajectory: Trajectory) -> Audit:
             f"audit({name}): the simulation reached only {reached.sum()} of its times: {trajectory.reason}."
         )
     t, q, u = (x[reached] for x in (trajectory.t, trajectory.q, trajectory.u))
-    inputs = {key: x[reached] for key, x in trajectory.inputs.items()}
+    inputs = {key: x[reached] for key, x in trajectory.values.items()}
     now = jax.tree.map(lambda x: np.asarray(x, dtype=float), _measured_along(system, t, q, u, inputs))
     ts = np.asarray(t, dtype=float)
     work, work_error = _work(ts, now)

@@ -67,7 +67,7 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
 
     def vector_field(t, y, args):
         system, signals = args
-        y_dot = rates(system, t, y, inputs_at(system, signals, t, y))
+        y_dot = rates(system, t, y.q, y.u, values_of(system, y.x, inputs_at(system, signals, t, y)))
         if constrained and settings.stabilize:
             y_dot = State(y_dot.q + settings.stabilize * correction(system, t, y.q), y_dot.u, y_dot.x)
         return jax.tree.map(lambda rate: jnp.where(valid, rate, jnp.zeros_like(rate)), y_dot)

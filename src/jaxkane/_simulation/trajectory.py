@@ -63,7 +63,7 @@ class Trajectory(eqx.Module):
     status: Int[Array, "*batch"]
     t_end: Float[Array, "*batch"]
     stats: dict[str, Int[Array, "*batch"]]
-    names: tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...], tuple[str, ...]] = eqx.field(static=True)
+    names: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     events: tuple[str, ...] = eqx.field(static=True)
     adjoint: str = eqx.field(static=True)
     units: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())

@@ -8,10 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Array
 
 from .._description.system import System
-from .._simulation.trajectory import Trajectory
 from ._data.trial import Trial
 from ._optimize.gradient_descent import GradientDescent
 from ._optimize.minimize import minimize
@@ -39,7 +37,6 @@ def fit(
     hold: Sequence[str] = (),
     window: float | None = None,
     continuity: Mapping[str, float] | None = None,
-    outputs: Mapping[str, Callable[[Trajectory], Array]] | None = None,
     processes: bool = False,
     simulation: Simulation | None = None,
     optimizer: Optimizer | None = None,
@@ -57,8 +54,8 @@ def fit(
 
     - `system`: with initial guesses of its parameters. `trials`: one `Trial` or several.
     - `free`: what to find: names, paths, functions to leaves, `Free`, `Gain`, `Delay` and `Inertia`.
-    - `unknown`: coordinates and independent speeds whose value at the start of every window is to be found too;
-        dependent ones follow from them (`assemble`).
+    - `unknown`: coordinates, independent speeds and states of the first order whose value at the start of every window
+        is to be found too; dependent ones follow from them (`assemble`).
     - `sensor_bias`, `sensor_gain`: channels with an unknown constant offset and factor in every trial. `input_bias`,
         `input_gain`, `input_delay` [s]: inputs with an offset, a factor and a delay of every trial's own.
     - These are names, or a dict from names to the standard deviation of a Gaussian prior around the initial guess
@@ -72,7 +69,6 @@ def fit(
     - `continuity`: by name, the standard deviation of the jump from a window's end to the next one's start, for what is
         `unknown`; names left out jump freely. Small ones ask for one motion through all windows; with windows as short
         as the samples they are a process noise, and the sum of squares is that of a Kalman filter's prediction errors.
-    - `outputs`: channels that are functions of the `Trajectory`, by name: values (n_t,).
     - `processes`: let all processes of `jax.distributed` simulate together. Each is started with the same script,
         calls `jax.distributed.initialize(...)` before anything else, and this with all trials; each simulates a share
         of the windows, all take the same steps and return the same `Fit`, that of one process alone.
@@ -99,7 +95,6 @@ def fit(
         hold=hold,
         window=window,
         continuity=continuity,
-        outputs=outputs,
         simulation=simulation,
         processes=processes,
     )

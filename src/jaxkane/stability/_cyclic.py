@@ -8,7 +8,7 @@ import numpy as np
 
 from .._description.system import System
 from .._method.checks import configuration_residual, is_concrete
-from .._method.rates import motion_rates
+from .._method.now import rates as rates_of
 from .._scalars.jax_internals import concretely
 from .._scalars.reads import on_forget, version_of
 
@@ -50,8 +50,9 @@ def _search(system: System, leaves: list, treedef) -> tuple[str, ...]:
 
     @jax.jit
     def rates(trial, t, q, u, w):
-        q_dot, u_dot = motion_rates(trial, t, q, u, w)
-        return q_dot, jnp.concatenate([u_dot, configuration_residual(trial, t, q)])
+        moves = rates_of(trial, t, q, u, w)
+        others = [moves.u, configuration_residual(trial, t, q)]
+        return moves.q, jnp.concatenate(others if moves.x is None else [*others, moves.x])
 
     notices = np.zeros((n_q + 1, n_q), bool)  # row: a rate, the last those of the speeds and the constraints
     compared = 0
@@ -62,7 +63,10 @@ def _search(system: System, leaves: list, treedef) -> tuple[str, ...]:
             trial = system
         q, u = rng.uniform(-0.4, 0.4, n_q), rng.uniform(-1.0, 1.0, len(system.speeds))
         size = _INPUTS[compared % len(_INPUTS)]
-        w = {name: as_floats(size * rng.choice([-1, 1]) * rng.uniform(0.5, 1.5)) for name in system.inputs}
+        w = {
+            name: as_floats(size * rng.choice([-1, 1]) * rng.uniform(0.5, 1.5))
+            for name in (*system.inputs, *system.states)
+        }
         t, u = as_floats(rng.uniform(0.0, 2.0)), as_floats(u)
         at = lambda q, trial=trial, t=t, u=u, w=w: tuple(map(np.asarray, rates(trial, t, as_floats(q), u, w)))  # noqa: E731
         here = at(q)

@@ -15,19 +15,20 @@ from .._common.lookup import by_name, hint
 from .._description.system import System
 from .._scalars.reads import compiled
 from ._solve import jacobian
-from ._steady import Problem, SteadyMotion, as_motion
+from ._steady import Problem, SteadyMotion, as_motion, names_of
 
 
 class Family(eqx.Module):
     """Steady motions along a curve, by name: `turns["steer"]` (m,).
 
-    Attributes: `q` (m, n_q), `u` (m, n_u), `u_dep` (m, k); `arclength` (m,), in the scaled unknowns; `residual` (m,);
-    `inputs` by name; `reason`: why the family ends here. `turns.motion(i)` is the i-th `SteadyMotion`.
+    Attributes: `q` (m, n_q), `u` (m, n_u), `u_dep` (m, k), `x` (m, n_x); `arclength` (m,), in the scaled
+    unknowns; `residual` (m,); `inputs` by name; `reason`: why the family ends here. `turns.motion(i)` is the i-th `SteadyMotion`.
     """
 
     q: Float[Array, "m n_q"]
     u: Float[Array, "m n_u"]
     u_dep: Float[Array, "m k"]
+    x: Float[Array, "m n_x"]
     arclength: Float[Array, " m"]
     residual: Float[Array, " m"]
     inputs: dict[str, Any]
@@ -37,10 +38,12 @@ class Family(eqx.Module):
 
     def motion(self, i: Any) -> SteadyMotion:
         inputs = {k: x[i] if jnp.ndim(x) else x for k, x in self.inputs.items()}
-        return SteadyMotion(self.q[i], self.u[i], self.u_dep[i], inputs, self.t, self.residual[i], self.names)
+        parts = (self.q[i], self.u[i], self.u_dep[i], self.x[i])
+        return SteadyMotion(*parts, inputs, self.t, self.residual[i], self.names)
 
     def __getitem__(self, name: str) -> Float[Array, " m"]:
-        return by_name(name, zip(self.names, (self.q, self.u, self.u_dep), strict=True), self.inputs, "this family")
+        groups = zip(self.names, (self.q, self.u, self.u_dep, self.x), strict=True)
+        return by_name(name, groups, self.inputs, "this family")
 
     def __len__(self) -> int:
         return len(self.arclength)
@@ -81,9 +84,11 @@ def family(
 
     **Raises:** `ValueError` where the start is not isolated on one curve: it names what moves.
     """
-    q, t, inputs = start.q, jnp.asarray(start.t, start.q.dtype), dict(start.inputs)
-    problem = Problem(system, tuple(find), tuple(hold))
-    stops = Problem(system, tuple(find), (*hold, *(until or {})))
+    q, t = start.q, jnp.asarray(start.t, start.q.dtype)
+    inputs = {**start.inputs, **{name: start.x[i] for i, name in enumerate(system.states)}}
+    find = (*find, *system.states)
+    problem = Problem(system, find, tuple(hold))
+    stops = Problem(system, find, (*hold, *(until or {})))
     values = [float(problem.quantity(system, t, q, start.u, k)) for k in hold]
     n_s, n = len(problem.places), len(system.speeds)
     scale = np.ones(len(problem.names))
@@ -230,8 +235,9 @@ def _as_family(problem: Problem, system: System, t, q, inputs, values, zs, arc, 
         args = (system, t, q, inputs, held)
         r = jnp.max(jnp.abs(problem.residual(z, args)))
         here = as_motion(system, t, *problem.parts(z, q, inputs), r)
-        return here.q, here.u, here.u_dep, here.residual, {k: here.inputs[k] for k in problem.found}
+        found = {k: here.inputs[k] for k in problem.found if k in here.inputs}
+        return (here.q, here.u, here.u_dep, here.x), here.residual, found
 
-    q_all, u_all, u_dep, residual, found = members(jnp.asarray(zs, q.dtype))
-    names = (tuple(system.coordinates), tuple(system.speeds), tuple(system.dependent_speeds))
-    return Family(q_all, u_all, u_dep, jnp.asarray(arc), residual, {**inputs, **found}, t, names, reason)
+    parts, residual, found = members(jnp.asarray(zs, q.dtype))
+    inputs = {k: x for k, x in {**inputs, **found}.items() if k not in system.states}
+    return Family(*parts, jnp.asarray(arc), residual, inputs, t, names_of(system), reason)

@@ -17,7 +17,7 @@ from .._description.values import Values
 from .._method.checks import check_system, configuration_residual, is_concrete
 from .._method.equations import dependent_speeds
 from .._method.kane import as_array, checked_inputs, refuse_incomplete
-from .._method.rates import motion_rates
+from .._method.now import output_names, outputs_at, rates, values_of
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, solve, stack
 from .._scalars.nan import nan_where
@@ -78,7 +78,8 @@ def linearize(
 ) -> LinearModel:
     """The linear model of a system about an equilibrium or a steady motion, exact to rounding.
 
-        x = (independent coordinates, independent speeds),   h(q) = 0:  dq_dep = -(dh/dq_dep)^-1 dh/dq_ind dq_ind
+        x = (independent coordinates, independent speeds, states of the first order)
+        h(q) = 0:  dq_dep = -(dh/dq_dep)^-1 dh/dq_ind dq_ind
 
     Dependent coordinates follow the constraints to first order, dependent speeds follow by the method; derivatives are
     those of the equations of motion by `jax.jvp`. Differentiable itself, and usable under jit and vmap.
@@ -87,10 +88,11 @@ def linearize(
 
     - `motion`: a `SteadyMotion`, or a `State` as from `assemble`.
     - `inputs`: values about which to linearize; by default those of the `SteadyMotion`, or zero. `t`: time [s].
-    - `states`: names of coordinates and speeds to keep; by default all independent ones without the cyclic
-        coordinates. The deviations of those left out are taken as zero.
-    - `outputs`: names of coordinates and speeds, dependent ones too, by default the states; or functions by name,
-        `{"lean_rate": lambda t, q, u: ...}`, that read all of them by name.
+    - `states`: names of coordinates, speeds and states of the first order to keep; by default all independent ones
+        without the cyclic coordinates. The deviations of those left out are taken as zero.
+    - `outputs`: names of coordinates, speeds, dependent ones too, states of the first order and outputs of the system;
+        by default the states. Or functions by name, `{"lean_rate": lambda t, q, u: ...}`, that read coordinates and
+        speeds by name.
     - `dependent`: names of the coordinates that the constraints determine, by default `system.dependent_coordinates`.
     - `steady`: refuse a state that is not steady. With False the model is that of an instant of any motion.
 
@@ -108,10 +110,11 @@ def linearize(
     q = as_array(motion.q, system.coordinates, f"{name}: q")
     u = as_array(motion.u, system.speeds, f"{name}: u")
     t = jnp.asarray(0.0 if t is None else t, q.dtype)
+    x = as_array({} if motion.x is None else motion.x, system.states, f"{name}: x").astype(q.dtype)
     w = checked_inputs(system, inputs)
     w = jnp.stack([jnp.asarray(w[k], q.dtype) for k in system.inputs]) if w else jnp.zeros(0, q.dtype)
     check_system(system, t, q)
-    origin = (system, t, q, u, w)
+    origin = (system, t, q, u, x, w)
     n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q).shape[0]
     dependent = tuple(system.dependent_coordinates if dependent is None else dependent)
     if len(dependent) != n_h:
@@ -123,16 +126,17 @@ def linearize(
     kept = _states(system, states, dependent)
     rows = tuple(kept) if outputs is None else tuple(outputs)
     functions = dict(outputs) if isinstance(outputs, Mapping) else {}
-    known = (*system.coordinates, *system.speeds, *system.dependent_speeds)
+    own = output_names(system) if outputs is not None else ()
+    known = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.states, *own)
     refuse_unknown(rows, (*known, *functions), f"{name}: outputs are functions, or by name; it has no output", "it has")
-    if is_concrete(system, t, q, u, w):
-        _check_state(system, t, q, u, w, steady)
+    if is_concrete(*origin):
+        _check_state(*origin, steady)
         wrong = jnp.array(False)
     else:
-        wrong = _is_wrong(system, t, q, u, w, steady)
+        wrong = _is_wrong(*origin, steady)
     # Numbers in the place of what is none, so that its NaN does not meet the zeros of who does not read it.
-    t, q, u, w = (jnp.where(jnp.all(jnp.isfinite(x)), x, 0.1) for x in (t, q, u, w))
-    model = _derivatives((system, t, q, u, w), _Choice(dependent, kept, rows), _Functions(functions))
+    at = tuple(jnp.where(jnp.all(jnp.isfinite(y)), y, 0.1) for y in (t, q, u, x, w))
+    model = _derivatives((system, *at), _Choice(dependent, kept, rows), _Functions(functions))
     A, B, C, D = nan_where(wrong, model, origin)
     return LinearModel(A, B, C, D, kept, tuple(system.inputs), rows)
 
@@ -141,12 +145,13 @@ def _states(system: System, states: Sequence[str] | None, dependent: tuple[str, 
     free = tuple(c for c in system.coordinates if c not in dependent)
     if states is None:
         cyclic = cyclic_coordinates(system)
-        return (*(c for c in free if c not in cyclic), *system.speeds)
-    unknown = [k for k in states if k not in (*free, *system.speeds)]
+        return (*(c for c in free if c not in cyclic), *system.speeds, *system.states)
+    known = (*free, *system.speeds, *system.states)
+    unknown = [k for k in states if k not in known]
     if unknown:
         raise ValueError(
             f"{type(system).__name__}: {', '.join(unknown)} cannot be a state; "
-            f"{hint(unknown, (*free, *system.speeds), 'independent coordinates and speeds are')}"
+            f"{hint(unknown, known, 'independent coordinates, speeds and states of the first order are')}"
         )
     return tuple(states)
 
@@ -168,7 +173,7 @@ class _Choice(eqx.Module):
 
 @compiled
 def _derivatives(at, choice: _Choice, functions: _Functions):
-    q, w = at[2], at[4]
+    q, w = at[2], at[5]
     T = _tangents(*at[:3], choice)
     x = jnp.zeros(len(choice.states), q.dtype)
     # Two loops, so that who wants A alone does not pay for B.
@@ -179,14 +184,20 @@ def _derivatives(at, choice: _Choice, functions: _Functions):
 
 def _at_deviation(x, w, at, T, choice: _Choice, functions: _Functions):
     """Rates of the states (n,) and the outputs (p,), where the states deviate by x (n,), at inputs w (m,)."""
-    system, t, q, u, _ = at
+    system, t, q, u, x1, _ = at
     names, speeds = system.coordinates, (*system.speeds, *system.dependent_speeds)
     moved = dict(zip(choice.states, x, strict=True))
     q = q + sum((moved[k] * T[:, i] for i, k in enumerate(names) if k in moved), jnp.zeros_like(q))
     u = jnp.stack([u[i] + moved[k] if k in moved else u[i] for i, k in enumerate(system.speeds)])
-    q_dot, u_dot = motion_rates(system, t, q, u, {k: w[i] for i, k in enumerate(system.inputs)})
-    x_dot = dict(zip((*names, *system.speeds), (*q_dot, *u_dot), strict=True))
-    known = dict(zip((*names, *system.speeds), (*q, *u), strict=True))
+    x1 = [x1[i] + moved[k] if k in moved else x1[i] for i, k in enumerate(system.states)]
+    values = _values(system, w) | dict(zip(system.states, x1, strict=True))
+    rate = rates(system, t, q, u, values)
+    of_states = () if rate.x is None else rate.x
+    all_names = (*names, *system.speeds, *system.states)
+    x_dot = dict(zip(all_names, (*rate.q, *rate.u, *of_states), strict=True))
+    known = dict(zip(all_names, (*q, *u, *x1), strict=True))
+    if not {*functions, *known, *system.dependent_speeds} >= {*choice.outputs}:
+        known |= outputs_at(system, t, q, u, values)
     if functions or not known.keys() >= {*choice.outputs}:
         known |= zip(system.dependent_speeds, dependent_speeds(system, t, q, u), strict=True)
     y = []
@@ -216,10 +227,14 @@ def _tangents(system: System, t, q, choice: _Choice):
     return stack(T).astype(q.dtype)
 
 
+def _values(system: System, w) -> dict[str, Any]:
+    return {k: w[i] for i, k in enumerate(system.inputs)}
+
+
 @compiled
-def _rates(system, t, q, u, w):
-    q_dot, u_dot = motion_rates(system, t, q, u, {k: w[i] for i, k in enumerate(system.inputs)})
-    return q_dot, u_dot, configuration_residual(system, t, q)
+def _rates(system, t, q, u, x, w):
+    rate = rates(system, t, q, u, values_of(system, x, _values(system, w)))
+    return rate.q, rate.u, x if rate.x is None else rate.x, configuration_residual(system, t, q)
 
 
 def _tolerances(system: System, u) -> tuple[float, Any]:
@@ -234,30 +249,37 @@ def _still(system: System) -> np.ndarray:
     return np.array([i for i, k in enumerate(system.coordinates) if k not in cyclic], int)
 
 
-def _is_wrong(system: System, t, q, u, w, steady: bool):
+def _is_wrong(system: System, t, q, u, x, w, steady: bool):
     """Whether a state is off the constraints, not finite or, where that is asked, not steady."""
-    q_dot, u_dot, h = _rates(system, t, q, u, w)
+    q_dot, u_dot, x_dot, h = _rates(system, t, q, u, x, w)
     tol, slack = _tolerances(system, u)
-    rates = jnp.concatenate([u_dot, q_dot[_still(system)]]) if steady else jnp.zeros(0, q.dtype)
-    fine = jnp.all(jnp.abs(h) <= tol) & jnp.all(jnp.abs(rates) <= slack)
-    return jax.lax.stop_gradient(~(fine & jnp.all(jnp.isfinite(jnp.concatenate([q, u, w, t[None]])))))
+    moving = jnp.concatenate([u_dot, q_dot[_still(system)], x_dot]) if steady else jnp.zeros(0, q.dtype)
+    fine = jnp.all(jnp.abs(h) <= tol) & jnp.all(jnp.abs(moving) <= slack)
+    return jax.lax.stop_gradient(~(fine & jnp.all(jnp.isfinite(jnp.concatenate([q, u, x, w, t[None]])))))
 
 
-def _check_state(system: System, t, q, u, w, steady: bool) -> None:
+def _check_state(system: System, t, q, u, x, w, steady: bool) -> None:
     name = type(system).__name__
-    q_dot, u_dot, h = map(np.asarray, _rates(system, t, q, u, w))
+    q_dot, u_dot, x_dot, h = map(np.asarray, _rates(system, t, q, u, x, w))
     tol, slack = _tolerances(system, u)
-    named = ((system.coordinates, q), (system.speeds, u), (system.inputs, w), (("t",), t[None]))
-    bad = [k for names, x in named for k, value in zip(names, np.asarray(x), strict=True) if not np.isfinite(value)]
+    named = (
+        (system.coordinates, q),
+        (system.speeds, u),
+        (system.states, x),
+        (system.inputs, w),
+        (("t",), t[None]),
+    )
+    bad = [k for names, y in named for k, value in zip(names, np.asarray(y), strict=True) if not np.isfinite(value)]
     if bad:
         raise ValueError(f"{name}: {', '.join(bad)} is not finite: there is no linear model there.")
     if h.size and not np.abs(h).max() <= tol:
         raise ValueError(f"{name}: the coordinates violate the configuration constraints by {h}. Use assemble.")
     if not steady:
         return
-    rates = {f"{k} is accelerated by": x for k, x in zip(system.speeds, u_dot, strict=True)}
-    rates |= {f"{system.coordinates[i]} changes with": q_dot[i] for i in _still(system)}
-    moving = [f"{k} {float(x):.3g}" for k, x in rates.items() if not abs(x) <= float(slack)]
+    found = {f"{k} is accelerated by": y for k, y in zip(system.speeds, u_dot, strict=True)}
+    found |= {f"{system.coordinates[i]} changes with": q_dot[i] for i in _still(system)}
+    found |= {f"{k} changes with": y for k, y in zip(system.states, x_dot, strict=True)}
+    moving = [f"{k} {float(x):.3g}" for k, x in found.items() if not abs(x) <= float(slack)]
     if moving:
         raise ValueError(
             f"{name}: this motion is not steady: {', '.join(moving)}. Find one with equilibrium or steady_turn; or ask "

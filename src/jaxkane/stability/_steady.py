@@ -14,8 +14,8 @@ from .._common.lookup import by_name, hint
 from .._description.system import State, System
 from .._method.checks import check_system, configuration_residual, is_concrete
 from .._method.equations import dependent_speeds
-from .._method.kane import as_array, checked_inputs
-from .._method.rates import motion_rates
+from .._method.kane import as_array, checked_values
+from .._method.now import rates
 from .._scalars.nan import nan_where
 from .._scalars.reads import compiled
 from .._scalars.types import Component
@@ -28,14 +28,15 @@ Held = Sequence[str] | Mapping[str, Any]
 class SteadyMotion(eqx.Module):
     """A motion in which every speed and every coordinate that is not cyclic stays as it is.
 
-    Attributes: `q` (n_q,), `u` (n_u,), `u_dep` (k,); `inputs` by name; `t` [s]; `residual`: the largest acceleration,
-    rate or constraint that should be zero. NaN where none was found under a trace. `motion["steer"]` gives any of
-    them by its name; `motion.state` is the `State` to simulate from.
+    Attributes: `q` (n_q,), `u` (n_u,), `u_dep` (k,); `x` (n_x,) states of the first order; `inputs` by name; `t` [s];
+    `residual`: the largest acceleration, rate or constraint that should be zero. NaN where none was found under a
+    trace. `motion["steer"]` gives any of them by its name; `motion.state` is the `State` to simulate from.
     """
 
     q: Float[Array, "*batch n_q"]
     u: Float[Array, "*batch n_u"]
     u_dep: Float[Array, "*batch k"]
+    x: Float[Array, "*batch n_x"]
     inputs: dict[str, Any]
     t: Any
     residual: Any
@@ -43,10 +44,11 @@ class SteadyMotion(eqx.Module):
 
     @property
     def state(self) -> State:
-        return State(self.q, self.u)
+        return State(self.q, self.u, self.x if self.names[3] else None)
 
     def __getitem__(self, name: str) -> Any:
-        return by_name(name, zip(self.names, (self.q, self.u, self.u_dep), strict=True), self.inputs, "this motion")
+        groups = zip(self.names, (self.q, self.u, self.u_dep, self.x), strict=True)
+        return by_name(name, groups, self.inputs, "this motion")
 
 
 def equilibrium(
@@ -85,10 +87,13 @@ def steady_turn(
 
         u_dot(q, u) = 0,   q_dot = 0 for coordinates that are not cyclic,   h(q) = 0,   what is held as it is
 
+    States of the first order are found too, so that they stand still: x_dot = 0.
+
     **Arguments:**
 
     - `q` (n_q,), `u` (n_u,): an initial guess, or dicts by name in which what is left out is zero.
-    - `inputs`: numbers by name; those left out are zero.
+    - `inputs`: numbers by name; those left out are zero. States of the first order may be given here: an
+        initial guess.
     - `hold`: what is to have a given value: names of coordinates and speeds (dependent ones too), kept at the guess;
         or a dict of names and values. Steady motions come in families; hold as many quantities as the family has
         dimensions. Cyclic coordinates stay at the guess.
@@ -105,11 +110,11 @@ def steady_turn(
     values = dict(hold) if isinstance(hold, Mapping) else dict.fromkeys(hold)
     q = as_array({} if q is None else q, system.coordinates, f"{name}: q")
     u = as_array({} if u is None else u, system.speeds, f"{name}: u").astype(q.dtype)
-    known = {k: jnp.asarray(x, q.dtype) for k, x in checked_inputs(system, inputs).items()}
+    known = {k: jnp.asarray(x, q.dtype) for k, x in checked_values(system, inputs).items()}
     unknown = sorted(set(find) - set(system.inputs))
     if unknown:
         raise ValueError(f"{name} has no input {', '.join(unknown)} to find; {hint(unknown, system.inputs, 'it has')}")
-    problem = Problem(system, tuple(find), tuple(values))
+    problem = Problem(system, (*find, *system.states), tuple(values))
     for k, x in values.items():
         if x is not None and k in system.coordinates:
             q = q.at[system.coordinates.index(k)].set(jnp.asarray(x, q.dtype))
@@ -127,7 +132,10 @@ def steady_turn(
 
 
 class Problem(eqx.Module):
-    """Which unknowns z = (non-cyclic q, u, inputs to find) a steady motion has, and its equations F(z) = 0."""
+    """Which unknowns z = (non-cyclic q, u, inputs to find, states) a steady motion has, and its equations F(z) = 0.
+
+    `inputs` are those and the states by name, as `loads` reads them.
+    """
 
     names: tuple[str, ...] = eqx.field(static=True)
     places: tuple[int, ...] = eqx.field(static=True)  # of the coordinates that are not cyclic
@@ -159,13 +167,15 @@ class Problem(eqx.Module):
         return q.at[np.array(self.places, int)].set(z[:n_s]), z[n_s : len(z) - n_f], {**inputs, **found}
 
     def residual(self, z, args) -> Array:
-        """F (m,): accelerations, rates of the non-cyclic coordinates, constraints, what is held."""
+        """F (m,): accelerations, rates of the non-cyclic coordinates and of the states, constraints, what is held."""
         system, t, q, inputs, held = args
         q, u, inputs = self.parts(z, q, inputs)
-        q_dot, u_dot = motion_rates(system, t, q, u, inputs)
+        rate = rates(system, t, q, u, inputs)
         free = [self.quantity(system, t, q, u, k) for k in self.held]
         fixed = jnp.stack(free) - held if free else jnp.zeros(0, q.dtype)
-        return jnp.concatenate([u_dot, q_dot[np.array(self.places, int)], configuration_residual(system, t, q), fixed])
+        of_states = [] if rate.x is None else [rate.x]
+        still = [rate.u, rate.q[np.array(self.places, int)], *of_states]
+        return jnp.concatenate([*still, configuration_residual(system, t, q), fixed])
 
     @staticmethod
     def quantity(system, t, q, u, name):
@@ -195,8 +205,14 @@ def as_motion(system, t, q, u, inputs, residual, missing=None, origin=()) -> Ste
     u_dep = dependent_speeds(system, t, q, u) if system.dependent_speeds else jnp.zeros(0, q.dtype)
     if missing is not None:
         q, u, u_dep, inputs = nan_where(missing, (q, u, u_dep, inputs), origin)
-    names = (tuple(system.coordinates), tuple(system.speeds), tuple(system.dependent_speeds))
-    return SteadyMotion(q, u, u_dep, dict(inputs), t, residual, names)
+    x = jnp.stack([inputs[k] for k in system.states]) if system.states else jnp.zeros(0, q.dtype)
+    given = {k: value for k, value in inputs.items() if k not in system.states}
+    return SteadyMotion(q, u, u_dep, x, given, t, residual, names_of(system))
+
+
+def names_of(system: System) -> tuple[tuple[str, ...], ...]:
+    """Of coordinates, independent and dependent speeds, and states."""
+    return tuple(map(tuple, (system.coordinates, system.speeds, system.dependent_speeds, system.states)))
 
 
 def _why_not(name: str, problem: Problem, motion: SteadyMotion, slopes: np.ndarray, J: np.ndarray) -> str:

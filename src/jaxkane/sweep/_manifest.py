@@ -35,7 +35,10 @@ def manifest_of(
         parameters = {field.name: _shown(getattr(system, field.name)) for field in dataclasses.fields(system)}
     else:
         kind, parameters = {"function": _shown(system)}, {}
-    places = {"q": _shown(state.q), "u": _shown(state.u)} if isinstance(state, State) else {"function": _shown(state)}
+    if isinstance(state, State):
+        places = {part: _shown(x) for part, x in vars(state).items() if x is not None}
+    else:
+        places = {"function": _shown(state)}
     signals = {name: _shown(x) for name, x in (inputs or {}).items()} if not callable(inputs) else _shown(inputs)
     return {
         "system": kind,

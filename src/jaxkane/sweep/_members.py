@@ -97,10 +97,12 @@ def _system(system: Any, row: Row) -> tuple[System, dict[str, Any]]:
 def _start(system: Any, state: Any, row: Row, t: Any) -> State:
     system, parameters = _system(system, row)
     state = as_state(system, state if isinstance(state, State) else state(system, row))
-    q, u = ({n: dict.__getitem__(row, n) for n in names if n in row} for names in (system.coordinates, system.speeds))
-    state = State(_set(state.q, q, system.coordinates), _set(state.u, u, system.speeds))
+    groups = (system.coordinates, system.speeds, system.states)
+    q, u, x = ({n: dict.__getitem__(row, n) for n in names if n in row} for names in groups)
+    parts = zip((state.q, state.u, state.x), (q, u, x), groups, strict=True)
+    state = State(*(_set(values, given, names) for values, given, names in parts))
     if system.dependent_coordinates and (q or parameters):  # they follow from the others
-        state = assemble(system, state.q, state.u, t=t)
+        state = assemble(system, state.q, state.u, state.x, t=t)
     return state
 
 
@@ -125,6 +127,7 @@ def _check(members: Tree, shared: Tree, t: Any) -> None:
     jax.eval_shape(trial, jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), members))
     system, signals, row = seen[0]
     applied = set(row) & {*parameter_info(system), *system.coordinates, *system.speeds, *system.inputs}
+    applied |= set(row) & {*system.states}
     applied -= set(system.dependent_coordinates)
     name = type(system).__name__
     if callable(signals) and applied & set(system.inputs):
@@ -137,8 +140,8 @@ def _check(members: Tree, shared: Tree, t: Any) -> None:
     if unused:
         raise ValueError(
             f"sweep: the table's {', '.join(unused)} changes nothing: {name} has no parameter, independent coordinate, "
-            "independent speed or input of that name. Give `state` as a function of (system, row), or `system` as a "
-            f"function of (row), which reads row[{unused[0]!r}]."
+            "independent speed, state or input of that name. Give `state` as a function of (system, row), or `system` "
+            f"as a function of (row), which reads row[{unused[0]!r}]."
         )
 
 
@@ -199,7 +202,7 @@ def _batches(tree: Tree) -> dict[int, str]:
             if np.ndim(value) == len(info.shape) + 1:
                 found[id(value)] = name
     if isinstance(state, State):
-        for name, value in (("q", state.q), ("u", state.u)):
+        for name, value in (("q", state.q), ("u", state.u), ("x", state.x)):
             if np.ndim(value) == 2:
                 found[id(value)] = f"state.{name}"
     if isinstance(signals, dict):

@@ -25,7 +25,7 @@ class Sweep(eqx.Module):
     Attributes:
 
     - `trajectory`: all motions as one `Trajectory` with leading axes, for whatever wants such (`constraint_forces`);
-        `t`, `q`, `u`, `u_dep`, `inputs`, `names` are its own. None where `reduce` was given.
+        `t`, `q`, `u`, `u_dep`, `x`, `inputs`, `outputs`, `names` are its own. None where `reduce` was given.
     - `values`: what `reduce` made of every motion, with leading axes; else None.
     - `status`, `t_end` [s], `stats`: how, when and in how many steps each ended; `ok`, `reason`: as of a `Trajectory`.
     - `table`: what was swept; `dims`, `shape`: names and lengths of the leading axes.
@@ -45,10 +45,10 @@ class Sweep(eqx.Module):
         shaped = jax.tree.map(lambda x: x.reshape(*table.shape, *x.shape[1:]), part)
         ride = None
         if not reduced:
-            q, u, u_dep, inputs, end = shaped.values
+            q, u, u_dep, x, inputs, outputs, end = shaped.values
             spread: Any = np.broadcast_to if isinstance(q, np.ndarray) else jax.numpy.broadcast_to
             t = spread(ts if isinstance(ts, Tracer) else np.asarray(ts), (*table.shape, ts.shape[0]))
-            arrays: list[Any] = [t, q, u, u_dep, inputs, shaped.status, shaped.t_end, shaped.stats]
+            arrays: list[Any] = [t, q, u, u_dep, x, inputs, outputs, shaped.status, shaped.t_end, shaped.stats]
             static = {"names": part.names, "events": part.events, "adjoint": part.adjoint, "units": part.units}
             ride = Trajectory(*arrays, **static, end=end)
         values = shaped.values if reduced else None
@@ -88,12 +88,20 @@ class Sweep(eqx.Module):
         return self._ride.u_dep
 
     @property
+    def x(self) -> Any:
+        return self._ride.x
+
+    @property
     def inputs(self) -> dict[str, Any]:
         return self._ride.inputs
 
     @property
-    def names(self) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
-        """Of coordinates, independent and dependent speeds."""
+    def outputs(self) -> dict[str, Any]:
+        return self._ride.outputs
+
+    @property
+    def names(self) -> tuple[tuple[str, ...], ...]:
+        """Of coordinates, independent and dependent speeds, and states."""
         return self._ride.names
 
     @property
@@ -107,7 +115,8 @@ class Sweep(eqx.Module):
         return [reason(int(code), self.events) for code in np.ravel(self.status)]
 
     def __getitem__(self, name: str) -> Any:
-        """A coordinate, speed or input (*shape, n_t), what `reduce` called so, or a column of the table (*shape)."""
+        """A coordinate, speed, state, input or output (*shape, n_t), what `reduce` called so, or a column of the table
+        (*shape)."""
         if self.trajectory is not None and name in _names(self.trajectory):
             return self.trajectory[name]
         if isinstance(self.values, Mapping) and name in self.values:
@@ -175,4 +184,4 @@ class Sweep(eqx.Module):
 
 
 def _names(ride: Trajectory) -> list[str]:
-    return [*(name for names in ride.names for name in names), *ride.inputs]
+    return [*(name for names in ride.names for name in names), *ride.inputs, *ride.outputs]

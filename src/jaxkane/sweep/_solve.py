@@ -29,13 +29,14 @@ GROUP = 32
 
 
 class Part(eqx.Module):
-    """What comes back of some members: `values` are what `reduce` made of a ride, or its (q, u, u_dep, inputs, end)."""
+    """What comes back of some members: `values` are what `reduce` made of a ride, or its (q, u, u_dep,
+    x, inputs, outputs, end)."""
 
     values: Any
     status: Any
     t_end: Any
     stats: dict[str, Any]
-    names: tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]] = eqx.field(static=True)
+    names: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     events: tuple[str, ...] = eqx.field(static=True)
     adjoint: str = eqx.field(static=True)
     units: tuple[tuple[str, str], ...] = eqx.field(static=True)
@@ -60,7 +61,7 @@ class Job(eqx.Module):
         start = with_possible_bodies(system, self.ts[0], start)
         ride = solve(system, start, self.ts, signals, self.settings)
         if self.reduce is None:
-            values = (ride.q, ride.u, ride.u_dep, ride.inputs, ride.end)
+            values = (ride.q, ride.u, ride.u_dep, ride.x, ride.inputs, ride.outputs, ride.end)
         else:
             values = jax.tree.map(jnp.asarray, self.reduce(ride))
         return Part(values, ride.status, ride.t_end, ride.stats, ride.names, ride.events, ride.adjoint, ride.units)

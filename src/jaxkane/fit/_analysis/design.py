@@ -18,7 +18,7 @@ from tqdm import tqdm
 from ..._common.lookup import refuse_unknown
 from ..._description.system import System
 from .._data.trial import Trial
-from .._data.windows import Windows
+from .._data.windows import Windows, state_names
 from .._problem.parameters import parameters_of
 from .._problem.problem import Problem
 from .information import Goal, covariance_of, goal_of
@@ -165,8 +165,8 @@ class _Plan:
             return trial
         # Every window is known to begin where the motion is.
         rides = dataclasses.replace(problem, windows=found.windows).trajectories(problem.start)
-        moves = _joined(problem, [np.concatenate([ride.q, ride.u], axis=1).T for ride in rides])
-        known = dict(zip((*problem.system.coordinates, *problem.system.speeds), moves, strict=True))
+        moves = _joined(problem, [np.concatenate([ride.q, ride.u, ride.x], axis=1).T for ride in rides])
+        known = dict(zip(state_names(problem.system), moves, strict=True))
         return trial.begun(known)
 
 

@@ -22,15 +22,15 @@ class Trial:
 
     - `t` (n_t,) [s]: increasing times.
     - `measured`: by channel, samples (n_t,) in the channel's unit; NaN, or masked, where there is a gap. A channel is
-        the name of a coordinate, speed or dependent speed, or of one of the `outputs` that are given to the fit.
+        the name of a coordinate, speed, dependent speed or state of the system, or of one of its `outputs`.
     - `inputs`: by name, a number or samples (n_t,) without gaps, taken as linear between the times. Those left out are
         zero. An input is what was measured: feedback (a controller, a rider) belongs into the system's `loads`, where
         it follows the simulated motion and its gains are parameters that can be found.
     - `sigma`: by channel, the standard deviation of the measurement, a positive number or (n_t,): residuals are divided
         by it. One number serves all channels.
-    - `initial`: by name, what is known of coordinates and speeds: a number, or samples (n_t,) from which every window
-        takes its start. What is neither known nor measured starts at zero, of four Euler parameters
-        the last at one, and what the constraints ask of it is found from there as by `assemble`.
+    - `initial`: by name, what is known of coordinates, speeds and states: a number, or samples (n_t,) from which every
+        window takes its start. What is neither known nor measured starts at zero, of four Euler parameters the last at
+        one, and what the constraints ask of it is found from there as by `assemble`.
     - `name`: for messages, tables and pictures.
 
     **Raises:** `ValueError` that names the trial and the channel, for wrong shapes, text, times that do not increase,

@@ -25,8 +25,8 @@ class Windows(eqx.Module):
     - `t` (W, n_t) [s]; where windows are chained, the last is the next window's first.
     - `measured`, `weight` (W, n_c, n_t): samples, and 1/sigma or zero.
     - `t_input` (W, n_in) [s], `inputs` (W, inputs, n_in): samples of the inputs, from before and after too.
-    - `step` (W,) [s]: of the integration. `start`, `next_start` (W, n_q + n_u): the start as far as it is known or
-        measured, and that of the next window.
+    - `step` (W,) [s]: of the integration. `start`, `next_start` (W, n_q + n_u + n_x): the start as far as it is known
+        or measured, and that of the next window.
     - `linked` (W,): one where the next window goes on from this one, else zero.
     - `trial` (W,): whose window it is; `first` (W,): whether it is its trial's first, `very_first` of all.
     """
@@ -90,7 +90,7 @@ def cut(
         found["t_input"].append(trial.t[there] + found["step"][-1] * (wanted - there))
         rows = [trial.inputs.get(name, np.zeros_like(trial.t))[there] for name in system.inputs]
         found["inputs"].append(np.array(rows).reshape(len(system.inputs), len(wanted)))
-    names = (*system.coordinates, *system.speeds)
+    names = state_names(system)
     guesses = [(guess or {}).get(name, 0.0) for name in names]
     pairs = tuple(zip(names, guesses, strict=True))
     start = np.array([[_start(trials[k], i, n, *pair) for pair in pairs] for k, i, n in places])
@@ -106,6 +106,11 @@ def cut(
         very_first=jnp.asarray(np.arange(len(owner)) == 0),
     )
     return windows, tuple(places)
+
+
+def state_names(system: System) -> tuple[str, ...]:
+    """Of what a motion starts with: coordinates, independent speeds and states of the first order."""
+    return (*system.coordinates, *system.speeds, *system.states)
 
 
 def _pieces(t: np.ndarray, window: float | None, chained: bool) -> list[tuple[int, int]]:

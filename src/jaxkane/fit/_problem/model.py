@@ -23,7 +23,7 @@ from ..._simulation.ride import solve
 from ..._simulation.settings import Settings
 from ..._simulation.signals import Samples, with_one_times
 from ..._simulation.trajectory import Trajectory
-from .._data.windows import Windows
+from .._data.windows import Windows, state_names
 from .blocks import Blocks
 from .parameters import Parameters
 
@@ -83,21 +83,19 @@ class Model(eqx.Module):
     driven: tuple[str, ...] = eqx.field(static=True)  # inputs of which there are samples
     held: tuple[str, ...] = eqx.field(static=True)
     assembled: tuple[str, ...] | None = eqx.field(static=True)  # coordinates that `assemble` moves, if not its own
-    outputs: tuple[tuple[str, Callable[[Trajectory], Array]], ...] = eqx.field(static=True)
 
     @property
     def unknown_places(self) -> np.ndarray:
-        """Where the unknown part of a start stands in [q, u]."""
-        names = (*self.system.coordinates, *self.system.speeds)
+        """Where the unknown part of a start stands in [q, u, x]."""
+        names = state_names(self.system)
         return np.array([names.index(name) for name in self.nuisance.start], dtype=int)
 
     def consistent(self, window: Windows, z: Array, x: Array) -> Array:
-        """The start (n_q + n_u,) of one window, its dependent coordinates found by `assemble`."""
+        """The start (n_q + n_u + n_x,) of one window, its dependent coordinates found by `assemble`."""
         system, _ = self.parameters.apply(self.system, x)
         start = window.start.at[self.unknown_places].add(z)
-        n_q = len(system.coordinates)
-        state = assemble(system, start[:n_q], start[n_q:], t=window.t[0], free=self.assembled)
-        return jnp.concatenate([state.q, state.u])
+        state = assemble(system, *_parts(system, start), t=window.t[0], free=self.assembled)
+        return joined(state.q, state.u, state.x)
 
     def simulate(self, window: Windows, start: Array, b: Array, x: Array) -> Trajectory:
         """One window's motion."""
@@ -111,9 +109,8 @@ class Model(eqx.Module):
                 signals[name] = kind(self._times_of(name, window, b, roles), gain * window.inputs[i] + bias)
             elif ("bias of input", name) in self.nuisance.trial:
                 signals[name] = bias
-        n_q = len(system.coordinates)
         settings = self.settings if self.settings.step is None else dataclasses.replace(self.settings, step=window.step)
-        return solve(system, State(start[:n_q], start[n_q:]), window.t, with_one_times(signals), settings)
+        return solve(system, State(*_parts(system, start)), window.t, with_one_times(signals), settings)
 
     def _times_of(self, name: str, window: Windows, b: Array, roles: dict[tuple[str, str], Array]) -> Array:
         """When an input's samples act (n_in,) [s]: the same array for all that have no delay, since kinks that are
@@ -125,16 +122,10 @@ class Model(eqx.Module):
 
     def simulated(self, ride: Trajectory, b: Array) -> Array:
         """What the sensors would have said (n_c, n_t)."""
-        outputs, rows = dict(self.outputs), []
+        rows = []
         for c in self.channels:
-            value = outputs[c](ride) if c in outputs else ride[c]
-            if jnp.shape(value) != ride.t.shape:
-                raise ValueError(
-                    f"`outputs`: {c} is a number for each time, of the shape (n_t,), here {ride.t.shape}; "
-                    f"got the shape {jnp.shape(value)}."
-                )
             gain = self.nuisance.of_trial(b, "gain of sensor", c, 1.0)
-            rows.append(gain * value + self.nuisance.of_trial(b, "bias of sensor", c, 0.0))
+            rows.append(gain * ride[c] + self.nuisance.of_trial(b, "bias of sensor", c, 0.0))
         return jnp.stack(rows)
 
     def residuals(self, window: Windows, start: Array, z: Array, b: Array, x: Array) -> tuple[Array, Any]:
@@ -143,7 +134,7 @@ class Model(eqx.Module):
         ride = self.simulate(window, start, b, x)
         simulated, n = self.simulated(ride, b), self.nuisance
         difference = jnp.where(window.weight > 0, (simulated - window.measured) * window.weight, 0.0)
-        end = jnp.concatenate([ride.q[-1], ride.u[-1]])
+        end = joined(ride.q[-1], ride.u[-1], ride.x[-1])
         jump = jnp.where(window.linked > 0, (end - window.next_start)[self.unknown_places] / n.jump, 0.0)
         # A prior of infinite width is a row of zeros. A trial's prior is counted in its first window, and so is that of
         # a start from which all else follows.
@@ -152,6 +143,16 @@ class Model(eqx.Module):
         of_all = jnp.where(window.very_first, self.parameters.prior_residuals(x), 0.0)
         rows = [difference.ravel(), *([jump] if n.chained else []), of_start, of_trial, of_all]
         return jnp.concatenate(rows), (simulated, ride.status)
+
+
+def _parts(system: System, start: Array) -> list[Array]:
+    """q, u and, where there are states of the first order, x of a start (n,)."""
+    n_q, n = len(system.coordinates), len(system.coordinates) + len(system.speeds)
+    return [start[:n_q], start[n_q:n], *([start[n:]] if system.states else [])]
+
+
+def joined(q: Array, u: Array, x: Array | None) -> Array:
+    return jnp.concatenate([q, u] if x is None else [q, u, x])
 
 
 @compiled

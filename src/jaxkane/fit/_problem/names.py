@@ -12,7 +12,9 @@ from ..._common.lookup import hint, refuse_unknown
 from ..._description.system import System
 from ..._method.assembly import found_of
 from ..._method.drift import has_configuration_constraints
+from ..._method.now import output_names
 from .._data.trial import Trial
+from .._data.windows import state_names
 from .model import Nuisance
 from .parameters import Delay
 
@@ -20,22 +22,19 @@ Names = Sequence[str] | Mapping[str, float | None]
 """Names, or names with the standard deviation of a Gaussian prior around the initial guess (None: no prior)."""
 
 
-def checked_trials(system: System, trials: Sequence[Trial], outputs: Mapping[str, Any]) -> tuple[str, ...]:
+def checked_trials(system: System, trials: Sequence[Trial]) -> tuple[str, ...]:
     """The channels of all trials."""
     title = type(system).__name__
     if not trials:
         raise ValueError("There is no trial to fit.")
-    named = (*system.coordinates, *system.speeds, *system.dependent_speeds)
-    twice = [name for name in outputs if name in named]
-    if twice:
-        raise ValueError(f"`outputs`: {twice[0]} is a coordinate or a speed of {title}; give the output another name.")
+    named = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.states, *output_names(system))
     for trial in trials:
         if not isinstance(trial, Trial):
             raise TypeError(f"`trials` holds jaxkane.fit.Trial, got {type(trial).__name__}.")
         for what, given, known in (
-            ("channel", trial.measured, (*named, *outputs)),
+            ("channel", trial.measured, named),
             ("input", trial.inputs, system.inputs),
-            ("coordinate or independent speed", trial.initial, (*system.coordinates, *system.speeds)),
+            ("coordinate, independent speed or state", trial.initial, state_names(system)),
         ):
             refuse_unknown(given, known, f"{trial.name}: {title} has no {what}")
     return tuple(dict.fromkeys(channel for trial in trials for channel in trial.measured))
@@ -97,7 +96,7 @@ def nuisance_of(system: System, channels: Sequence[str], driven: Sequence[str], 
         for name, deviation in checked_names(system, argument, posed[argument], names).items():
             trial[f"{kind} of {where}", name] = deviation
     independent = tuple(c for c in system.coordinates if c not in system.dependent_coordinates)
-    start = checked_names(system, "unknown", posed["unknown"], (*independent, *system.speeds))
+    start = checked_names(system, "unknown", posed["unknown"], (*independent, *system.speeds, *system.states))
     jump = checked_names(system, "continuity", posed["continuity"] or {}, tuple(start))
     array = lambda numbers: jnp.asarray(np.array(list(numbers), float), jnp.result_type(float))  # noqa: E731
     return Nuisance(

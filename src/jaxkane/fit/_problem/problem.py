@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -66,7 +66,6 @@ class Problem:
         hold: Sequence[str] = (),
         window: float | None = None,
         continuity: Mapping[str, float] | None = None,
-        outputs: Mapping[str, Callable[[Trajectory], Array]] | None = None,
         simulation: Simulation | None = None,
         processes: bool = False,
     ) -> Problem:
@@ -75,8 +74,7 @@ class Problem:
         refuse_other(simulation, Simulation, "`simulation=`", "Simulation(step=0.01)")
         posed = {key: value for key, value in locals().items() if key not in ("cls", "trials")}
         trials = (trials,) if isinstance(trials, Trial) else tuple(trials)
-        outputs = dict(outputs or {})
-        channels = checked_trials(system, trials, outputs)
+        channels = checked_trials(system, trials)
         _check_windows(window, continuity)
         driven = tuple(name for name in system.inputs if any(name in trial.inputs for trial in trials))
         nuisance = nuisance_of(system, channels, driven, posed)
@@ -96,7 +94,6 @@ class Problem:
             driven=driven,
             held=held,
             assembled=assembled,
-            outputs=tuple(outputs.items()),
         )
         if simulation.step is not None:  # one step in all windows; none is longer than they, so that it can be halved
             step = jnp.minimum(simulation.step, windows.t[:, -1] - windows.t[:, 0])
