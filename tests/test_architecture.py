@@ -22,7 +22,7 @@ SOURCE = Path(jk.__file__).parent
 
 # Rooms: each may import from those above it, and within itself. What the rooms do not say, is read in their own files:
 # no file imports another that imports it, directly or by way of others.
-FLOORS = ["_common", "_scalars", "rotations", "_description", "loads", "catalog"]
+FLOORS = ["_common", "_scalars", "rotations", "_description", "loads", "sensors", "catalog"]
 FLOORS += ["joints", "convert", "_method", "_simulation", "sweep", "plot", "fit", "data", "stability"]
 FLOORS += ["symbolic", "export", "_animate"]
 FLOORS_OF_FIT = ["_data", "_problem", "_result", "_optimize", "_analysis", "_report", "_fit", "bicycle"]
@@ -86,7 +86,7 @@ def test_no_files_import_each_other_in_a_circle():
 
 def test_what_stands_in_the_house_itself():
     """The public names, the public modules that are one file, and rooms that say what they are."""
-    assert {path.name for path in SOURCE.glob("*.py")} == {"__init__.py", "rotations.py"}
+    assert {path.name for path in SOURCE.glob("*.py")} == {"__init__.py", "rotations.py", "sensors.py"}
     rooms = [path for path in SOURCE.rglob("*") if path.is_dir() and any(path.glob("*.py"))]
     for path in rooms:
         assert ast.get_docstring(ast.parse((path / "__init__.py").read_text(encoding="utf-8"))), path

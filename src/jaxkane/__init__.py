@@ -5,6 +5,7 @@ import typing as _typing
 
 from . import loads as loads
 from . import rotations as rotations
+from . import sensors as sensors
 from ._description.bodies import Body as Body
 from ._description.bodies import Force as Force
 from ._description.bodies import Motion as Motion
@@ -39,8 +40,10 @@ from ._scalars.types import Scalar as Scalar
 from ._simulation.along import constraint_forces as constraint_forces
 from ._simulation.along import constraint_multipliers as constraint_multipliers
 from ._simulation.along import orientations as orientations
+from ._simulation.along import outputs as outputs
 from ._simulation.along import positions as positions
 from ._simulation.along import speed_rates as speed_rates
+from ._simulation.along import state_rates as state_rates
 from ._simulation.along import velocities as velocities
 from ._simulation.audit import Audit as Audit
 from ._simulation.audit import audit as audit

@@ -149,6 +149,24 @@ def euler_parameter_norm(parameters: Sequence[Component]) -> Component:
     return sub(dot(parameters, parameters), 1.0)
 
 
+def of_rotation_vector(vector: Sequence[Component]) -> tuple[Component, Component, Component, Component]:
+    """Euler parameters (scalar last) of a rotation vector [rad]: (r sin(a / 2) / a, cos(a / 2)), a = |r|; smooth at
+    zero."""
+    square = dot(vector, vector)
+    if is_exact(square):
+        angle = math.sqrt(square)
+        ratio, scalar = (math.sin(0.5 * angle) / angle if angle else 0.5), math.cos(0.5 * angle)
+    else:
+        # Where the series is exact to rounding, and the square root of zero, which has no derivative, is not taken.
+        small = square < 1e-4
+        angle = jnp.sqrt(jnp.where(small, 1.0, square))
+        series = 0.5 - square / 48 + square**2 / 3840 - square**3 / 645120
+        ratio = jnp.where(small, series, jnp.sin(0.5 * angle) / angle)
+        series = 1.0 - square / 8 + square**2 / 384 - square**3 / 46080
+        scalar = jnp.where(small, series, jnp.cos(0.5 * angle))
+    return (*(mul(ratio, x) for x in vector), scalar)  # type: ignore[return-value]
+
+
 def rodrigues_matrix(axis: Triple, c: Component, s: Component) -> Matrix:
     """[R] of a rotation about the unit vector `axis`, from the cosine and sine of its angle (Rodrigues' formula)."""
     is_along = all(is_exact(a) and abs(a) in (0.0, 1.0) for a in axis)  # one of the coordinate axes

@@ -184,6 +184,17 @@ class Frame:
             rotations.euler_parameters_matrix(e), ZERO3 if angular_velocity is None else angular_velocity, name
         )
 
+    def rotate_fixed(self, rotation_vector: Sequence[Component], name: str | None = None) -> Frame:
+        """A frame fixed in this one, turned by a rotation vector: how an instrument is mounted on its body.
+
+        **Arguments:** `rotation_vector`: three components in this frame [rad], its length the angle, right-hand about
+        its direction; smooth at zero, so that a fit can start there.
+        """
+        if len(rotation_vector) != 3:
+            raise ValueError(f"A rotation vector has three components, got {len(rotation_vector)}.")
+        e = rotations.of_rotation_vector([component(x) for x in rotation_vector])
+        return self._oriented(rotations.euler_parameters_matrix(e), ZERO3, name)
+
     def rotate_by(
         self, orientation: Callable[..., Any], t: Component, q: Any, q_dot: Any, name: str | None = None
     ) -> Frame:

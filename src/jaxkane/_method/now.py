@@ -73,7 +73,8 @@ class Now(Inputs):
     def _rate(self, vector: Vector) -> Vector:
         self._asked.append(vector)
         if self._answers is None:
-            return Vector(vector.frame, (jnp.ones((), self._instant.dtype),) * 3)
+            one = jnp.ones((), self._instant.dtype)
+            return Vector(vector.frame, (one, one, one))
         return Vector(vector.frame, next(self._answers))  # type: ignore[arg-type]
 
 

@@ -16,6 +16,7 @@ from .._description.system import System
 from .._description.vectors import Frame, Point
 from .._method.equations import InputValues, _arrays, _dependent_accelerations
 from .._method.kane import Instant
+from .._method.now import outputs_at, rates
 from .._method.rates import motion_rates
 from .._method.reactions import forces_now, multipliers_now
 from .._scalars.fuse import fused
@@ -93,6 +94,27 @@ def speed_rates(
     return along(_compiled_speed_rates, system, t, q, u, inputs)
 
 
+def outputs(
+    system: System, t: Any, q: Any = None, u: Any = None, inputs: InputValues = None
+) -> dict[str, Float[Array, "*n_t"]]:
+    """What the sensors of a system say, by name: `System.outputs`, those of nested dicts joined by a dot.
+
+    A trajectory holds them already: `ride["imu.ay"]`. Arguments as `positions`; `inputs` as `accelerations`, in which
+    states of the first order are given too.
+    """
+    return along(_compiled_outputs, system, t, q, u, inputs)
+
+
+def state_rates(
+    system: System, t: Any, q: Any = None, u: Any = None, inputs: InputValues = None
+) -> dict[str, Float[Array, "*n_t"]]:
+    """The time derivatives of the states of the first order by name: `System.state_rates`.
+
+    Arguments as `outputs`.
+    """
+    return along(_compiled_state_rates, system, t, q, u, inputs)
+
+
 def constraint_forces(
     system: System, t: Any, q: Any = None, u: Any = None, inputs: InputValues = None
 ) -> dict[str, Float[Array, "*n_t 3"]]:
@@ -168,6 +190,15 @@ def _orientations(system, t, q, u, inputs):
 _compiled_positions = compiled(_positions)
 _compiled_velocities = compiled(_velocities)
 _compiled_orientations = compiled(_orientations)
+
+
+_compiled_outputs = compiled(outputs_at)
+
+
+@compiled
+def _compiled_state_rates(system, t, q, u, inputs):
+    x_dot = rates(system, t, q, u, inputs).x
+    return {} if x_dot is None else dict(zip(system.states, x_dot, strict=True))
 
 
 @compiled

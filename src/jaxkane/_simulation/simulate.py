@@ -12,6 +12,7 @@ from jax.core import Tracer
 from .._description.system import State, System
 from .._method.checks import check_state, check_system, is_concrete, with_possible_bodies
 from .._method.diagnose import diagnosis
+from .._method.now import values_of
 from .._scalars.types import Inputs
 from .modes import for_reverse_mode, goes_forward
 from .ride import inputs_at, solve
@@ -91,7 +92,7 @@ def simulate(
         given = for_reverse_mode(given)
     ride = solve(*given, settings)
     if is_concrete(ride.status) and int(ride.status) == Status.NO_SOLUTION:
-        inputs_now = inputs_at(system, signals, ts[0], state.q, state.u)
+        inputs_now = values_of(system, state.x, inputs_at(system, signals, ts[0], state))
         raise ValueError(
             diagnosis(system, ts[0], state.q, state.u, inputs_now) or _UNSOLVED.format(type(system).__name__)
         )

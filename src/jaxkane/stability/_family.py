@@ -21,8 +21,9 @@ from ._steady import Problem, SteadyMotion, as_motion, names_of
 class Family(eqx.Module):
     """Steady motions along a curve, by name: `turns["steer"]` (m,).
 
-    Attributes: `q` (m, n_q), `u` (m, n_u), `u_dep` (m, k), `x` (m, n_x); `arclength` (m,), in the scaled
-    unknowns; `residual` (m,); `inputs` by name; `reason`: why the family ends here. `turns.motion(i)` is the i-th `SteadyMotion`.
+    Attributes: `q` (m, n_q), `u` (m, n_u), `u_dep` (m, k), `x` (m, n_x); `arclength` (m,), in the scaled unknowns;
+    `residual` (m,); `inputs` by name; `reason`: why the family ends here. `turns.motion(i)` is the i-th
+    `SteadyMotion`.
     """
 
     q: Float[Array, "m n_q"]
@@ -240,4 +241,5 @@ def _as_family(problem: Problem, system: System, t, q, inputs, values, zs, arc, 
 
     parts, residual, found = members(jnp.asarray(zs, q.dtype))
     inputs = {k: x for k, x in {**inputs, **found}.items() if k not in system.states}
-    return Family(*parts, jnp.asarray(arc), residual, inputs, t, names_of(system), reason)
+    q_all, u_all, u_dep, x = parts
+    return Family(q_all, u_all, u_dep, x, jnp.asarray(arc), residual, inputs, t, names_of(system), reason)

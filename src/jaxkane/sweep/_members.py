@@ -203,7 +203,7 @@ def _batches(tree: Tree) -> dict[int, str]:
                 found[id(value)] = name
     if isinstance(state, State):
         for name, value in (("q", state.q), ("u", state.u), ("x", state.x)):
-            if np.ndim(value) == 2:
+            if value is not None and np.ndim(value) == 2:
                 found[id(value)] = f"state.{name}"
     if isinstance(signals, dict):
         for name, signal in signals.items():

@@ -1,0 +1,263 @@
+"""States of the first order and outputs: beside exact solutions, through every part of the library, and refused."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.linalg import expm
+
+import jaxkane as jk
+from jaxkane.fit import LeastSquares, Simulation, Trial, fit
+from jaxkane.stability import equilibrium, linearize
+from jaxkane.sweep import sweep
+
+ts = np.linspace(0.0, 1.0, 21)
+GRAVITY = 9.81
+
+
+class Cart(jk.System):
+    """A cart on a spring, pushed by a motor that lags; an accelerometer behind a filter."""
+
+    mass: jk.Scalar = jk.parameter(2.0)
+    stiffness: jk.Scalar = jk.parameter(30.0)
+    lag: jk.Scalar = jk.parameter(0.1)
+    filter_time: jk.Scalar = jk.parameter(0.05)
+    gain: jk.Scalar = jk.parameter(1.0)
+    coordinates = ("place",)
+    speeds = ("speed",)
+    inputs = ("command",)
+    states = ("force", "filtered")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(q["place"] * N.x, u["speed"] * N.x, frame=N)
+        return jk.Motion([jk.Body(self.mass, 0.0, P, name="cart")], points={"P": P})
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force((inputs["force"] - self.stiffness * q["place"]) * motion.N.x, motion["P"])
+
+    def state_rates(self, t, q, u, x, motion, now):
+        (motor,), _ = jk.sensors.low_pass(now["command"], x["force"], self.lag)
+        (read,), _ = jk.sensors.low_pass(now.u_dot["speed"], x["filtered"], self.filter_time)
+        return motor, read
+
+    def outputs(self, t, q, u, motion, now):
+        a = now.acceleration(motion["P"]).to(motion.N)
+        return {"motor": {"force": now["force"]}, "acceleration": self.gain * a[0], "read": now["filtered"]}
+
+
+@pytest.fixture(scope="module")
+def cart():
+    return Cart()
+
+
+START = jk.State({"place": 0.2}, {"speed": -0.1}, {"force": 3.0})
+NAMES = ("place", "speed", "force", "filtered")
+
+
+def matrices(cart):
+    m, k, lag, tau = (float(x) for x in (cart.mass, cart.stiffness, cart.lag, cart.filter_time))
+    A = [[0, 1, 0, 0], [-k / m, 0, 1 / m, 0], [0, 0, -1 / lag, 0], [-k / m / tau, 0, 1 / m / tau, -1 / tau]]
+    return np.array(A), np.array([0, 0, 1 / lag, 0])[:, None]
+
+
+@pytest.fixture(scope="module")
+def ride(cart):
+    return jk.simulate(cart, START, ts, {"command": 5.0})
+
+
+def test_the_exact_motion_of_a_linear_system(cart, ride):
+    A, B = matrices(cart)
+    augmented = np.block([[A, 5.0 * B], [np.zeros((1, 5))]])
+    exact = np.array([(expm(augmented * t) @ [0.2, -0.1, 3.0, 0.0, 1.0])[:4] for t in ts])
+    found = np.stack([ride[name] for name in NAMES], axis=1)
+    assert np.abs(found - exact).max() < 1e-7
+    assert ride.x.shape == (21, 2)
+    assert ride.names[3] == ("force", "filtered")
+    a = (np.asarray(ride["force"]) - 30.0 * np.asarray(ride["place"])) / 2.0
+    np.testing.assert_allclose(ride["acceleration"], a, rtol=0, atol=1e-13)
+    np.testing.assert_array_equal(ride["motor.force"], ride["force"])
+    assert ride.end.x.shape == (2,)
+    again = jk.simulate(cart, ride.state(10), ts[10:] - ts[10], {"command": 5.0})
+    np.testing.assert_allclose(again["force"][-1], ride["force"][-1], rtol=1e-7)
+
+
+def test_what_is_asked_at_one_time(cart, ride):
+    at = (0.3, [0.1], [0.5], {"force": 2.0, "command": 1.0, "filtered": 0.4})
+    assert float(jk.accelerations(cart, *at)[0]) == pytest.approx((2.0 - 3.0) / 2.0)
+    rates = jk.state_rates(cart, *at)
+    assert float(rates["force"]) == pytest.approx(-10.0)
+    assert float(rates["filtered"]) == pytest.approx((-0.5 - 0.4) / 0.05)
+    assert float(jk.outputs(cart, *at)["acceleration"]) == pytest.approx(-0.5)
+    along = jk.outputs(cart, ride)
+    np.testing.assert_allclose(along["acceleration"], ride["acceleration"], atol=1e-13)
+    np.testing.assert_allclose(jk.state_rates(cart, ride)["force"], (5.0 - ride["force"]) / 0.1, atol=1e-12)
+    with pytest.raises(ValueError, match="no input or state named froce"):
+        jk.accelerations(cart, 0.0, [0.0], [0.0], {"froce": 1.0})
+
+
+def test_derivatives_in_both_modes_and_in_batches(cart):
+    def last(cart, force):
+        ride = jk.simulate(cart, jk.State({"place": 0.2}, {}, {"force": force}), ts, {"command": 5.0})
+        return ride["acceleration"][-1] + ride["filtered"][-3]
+
+    value_and_grad = jax.jit(jax.value_and_grad(last, (0, 1)))
+    slope, by_force = value_and_grad(cart, 3.0)[1]
+    h = 1e-5
+    for name in ("lag", "filter_time", "gain"):
+        up, down = (value_and_grad(Cart(**{name: getattr(cart, name) + d}), 3.0)[0] for d in (h, -h))
+        assert float(getattr(slope, name)) == pytest.approx(float(up - down) / (2 * h), rel=1e-5)
+    up, down = (value_and_grad(cart, 3.0 + d)[0] for d in (h, -h))
+    assert float(by_force) == pytest.approx(float(up - down) / (2 * h), rel=1e-5)
+    forward = jax.jacfwd(last, 1)(cart, 3.0)
+    assert float(forward) == pytest.approx(float(by_force), rel=1e-9)
+    batch = jk.State(jnp.full((3, 1), 0.2), jnp.zeros((3, 1)), jnp.array([[3.0, 0.0], [1.0, 0.0], [0.0, 0.5]]))
+    rides = jax.vmap(lambda state: jk.simulate(cart, state, ts, {"command": 5.0}))(batch)
+    assert rides["force"].shape == (3, 21)
+    assert float(rides["acceleration"][0, -1]) != float(rides["acceleration"][1, -1])
+
+
+def test_a_batch_by_sweep(cart):
+    rides = sweep(cart, START, ts, {"command": 5.0}, table={"lag": [0.1, 0.2], "force": [3.0, 1.0]})
+    assert rides["acceleration"].shape == (2, 21)
+    assert rides.x.shape == (2, 21, 2)
+    one = jk.simulate(Cart(lag=0.2), jk.State({"place": 0.2}, {"speed": -0.1}, {"force": 1.0}), ts, {"command": 5.0})
+    np.testing.assert_allclose(rides.member(1)["acceleration"], one["acceleration"], atol=1e-6)
+    assert rides.to_xarray()["motor.force"].shape == (2, 21)
+
+
+def test_linear_models_and_steady_motions(cart):
+    still = equilibrium(cart, inputs={"command": 5.0})
+    assert float(still["place"]) == pytest.approx(5.0 / 30.0)
+    assert float(still["force"]) == pytest.approx(5.0)
+    assert "force" not in still.inputs
+    model = linearize(cart, still, outputs=("acceleration", "read", "force"))
+    A, B = matrices(cart)
+    assert model.states == NAMES
+    np.testing.assert_allclose(model.A, A, atol=1e-12)
+    np.testing.assert_allclose(model.B, B, atol=1e-12)
+    np.testing.assert_allclose(model.C, [[-15, 0, 0.5, 0], [0, 0, 0, 1], [0, 0, 1, 0]], atol=1e-13)
+    np.testing.assert_allclose(linearize(cart, still, states=("place", "speed")).A, A[:2, :2], atol=1e-13)
+    ride = jk.simulate(cart, still.state, ts, {"command": 5.0})
+    np.testing.assert_allclose(ride["place"], 5.0 / 30.0, atol=1e-12)
+    with pytest.raises(ValueError, match="force changes with 20"):
+        linearize(cart, jk.State([0.1], [0.0], [3.0, 0.0]), {"command": 5.0})
+
+
+def test_a_controller_reads_a_state(cart):
+    ride = jk.simulate(cart, START, ts, lambda t, state: {"command": -2.0 * state["force"] + state.x[1]})
+    np.testing.assert_allclose(ride["command"], -2.0 * ride["force"] + ride["filtered"], atol=1e-12)
+
+
+def test_the_audit_knows_their_power(cart):
+    ride = jk.simulate(cart, START, np.linspace(0.0, 1.0, 201), {"command": 5.0})
+    kept = jk.audit(cart, ride)
+    assert np.abs(kept.energy_error).max() < 1e-6 * np.abs(kept.work).max()
+
+
+def test_a_lag_and_the_start_of_a_state_are_identified(cart):
+    rng = np.random.default_rng(0)
+    true = jk.simulate(Cart(lag=0.13, gain=1.2), START, ts, {"command": 5.0})
+    names = ("place", "acceleration")
+    noise = {"place": 1e-3, "acceleration": 1e-2}
+    measured = {name: true[name] + noise[name] * rng.standard_normal(21) for name in names}
+    trial = Trial(ts, measured, {"command": 5.0}, sigma=noise, initial={"force": 1.0})
+    found = fit(
+        cart,
+        trial,
+        ["lag", "gain"],
+        unknown=("place", "speed", "force"),
+        simulation=Simulation(step=0.05),
+        optimizer=LeastSquares(),
+    )
+    for name, truth in (("lag", 0.13), ("gain", 1.2)):
+        assert abs(found.estimates[name] - truth) < 3.5 * found.standard_errors[name] < 0.2 * truth
+    with pytest.raises(ValueError, match="has no coordinate, independent speed or state froce"):
+        fit(cart, Trial(ts, measured, sigma=noise, initial={"froce": 1.0}), "lag")
+    with pytest.raises(ValueError, match="has no channel acceleratoin"):
+        fit(cart, Trial(ts, {"acceleratoin": measured["place"]}, sigma=1.0), "lag")
+
+
+class Falling(jk.System):
+    """Dropped, with a state whose mean is that of the height: an event while states run."""
+
+    coordinates = ("height",)
+    speeds = ("climb",)
+    states = ("mean",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(q["height"] * N.z, u["climb"] * N.z, frame=N)
+        return jk.Motion([jk.Body(1.0, 0.0, P)])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -GRAVITY * motion.N.z)
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return q["height"]
+
+    def events(self, t, q, u):
+        return {"ground": q["height"]}
+
+
+def test_an_event_ends_the_states_too():
+    def end(height):
+        ride = jk.simulate(Falling(), jk.State([height], [0.0], [0.0]), ts)
+        return ride.t_end, ride.end.x[0], ride.x[-1, 0]
+
+    (t_end, mean, after), (_, slope, _) = jax.jvp(end, (2.0,), (1.0,))
+    exact = np.sqrt(2 * 2.0 / GRAVITY)
+    assert float(t_end) == pytest.approx(exact, abs=1e-9)
+    assert float(mean) == pytest.approx(2.0 * exact * 2 / 3, abs=1e-8)  # of h - g t^2 / 2 up to h = g t^2 / 2
+    assert float(slope) == pytest.approx(exact, rel=1e-5)  # d/dh (2/3 h sqrt(2 h / g)) = sqrt(2 h / g)
+    assert np.isnan(after)
+
+
+def test_starts_of_all_kinds(cart):
+    assert jk.assemble(cart, {"place": 0.1}, x={"force": 2.0}).x.tolist() == [2.0, 0.0]
+    assert jk.assemble(cart, {"place": 0.1}).x.tolist() == [0.0, 0.0]
+    plain = jk.simulate(cart, jk.State([0.1], [0.0]), ts[:2])
+    np.testing.assert_allclose(plain.x[0], [0.0, 0.0])
+    for wrong, message in (
+        (jk.State([0.1], [0.0], [1.0]), r"state.x must have the shape \(2,\) for force, filtered"),
+        (jk.State([0.1], [0.0], {"froce": 1.0}), "state.x has no froce"),
+        (jk.State([0.1], [0.0], "many"), "state.x"),
+    ):
+        with pytest.raises((ValueError, TypeError), match=message):
+            jk.simulate(cart, wrong, ts)
+    stateless = jk.catalog.DoublePendulum(mass=1.0, length=1.0)
+    for make in (
+        lambda: jk.simulate(stateless, jk.State([0.1, 0.2], [0.0, 0.0], [1.0]), ts),
+        lambda: jk.assemble(stateless, {}, {}, [1.0]),
+    ):
+        with pytest.raises(ValueError, match="has no states of the first order"):
+            make()
+    assert jk.simulate(cart, jk.State([np.nan], [0.0], [0.0, 0.0]), ts).status == jk.Status.INVALID
+    assert jk.simulate(cart, jk.State([0.0], [0.0], [np.nan, 0.0]), ts).status == jk.Status.INVALID
+
+
+def variant(**members):
+    return type("Variant", (Cart,), members)()
+
+
+@pytest.mark.parametrize(
+    ("members", "message"),
+    [
+        ({"state_rates": lambda self, t, q, u, x, motion, now: (0.0,)}, "must have 2 entries .force, filtered., got 1"),
+        ({"state_rates": lambda self, t, q, u, x, motion, now: {"force": 0.0}}, "gives no rate of filtered"),
+        ({"state_rates": lambda self, t, q, u, x, motion, now: {"froce": 0.0}}, "names what is no state: froce"),
+        ({"state_rates": jk.System.state_rates}, "define state_rates"),
+        ({"outputs": lambda self, t, q, u, motion, now: None}, "end without a `return`"),
+        ({"outputs": lambda self, t, q, u, motion, now: {"place": 1.0}}, "place is the name of a coordinate"),
+        ({"outputs": lambda self, t, q, u, motion, now: {"v": motion.N.x}}, "'v' is a Vector"),
+        ({"outputs": lambda self, t, q, u, motion, now: {"q": jnp.zeros(3)}}, "'q' is one number"),
+        ({"outputs": lambda self, t, q, u, motion, now: {"a.b": 1.0, "a": {"b": 2.0}}}, "'a.b' stands for two"),
+        ({"outputs": lambda self, t, q, u, motion, now: {"x": now["motor"]}}, "no 'motor' in the inputs and states"),
+        ({"outputs": lambda self, t, q, u, motion, now: {"x": now.acceleration(motion)}}, "a Point is asked for"),
+        ({"outputs": lambda self, t, q, u, motion, now: {"x": now.force("Q")}}, "no 'Q' in the named points"),
+        ({"states": ("force", "place")}, "'place' stands in `coordinates` and in `states`"),
+    ],
+)
+def test_what_is_wrong_is_named(members, message):
+    with pytest.raises((ValueError, TypeError, KeyError, NotImplementedError), match=message):
+        jk.simulate(variant(**members), jk.State([0.0], [0.0]), ts)
