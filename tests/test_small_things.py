@@ -150,7 +150,7 @@ def test_degrees_go_by_the_units_that_were_declared():
         jk.plot.trajectories(ride, ["q1"], degrees=True)
     several = jk.sweep.sweep(Cart(), jk.State({"q0": np.array([0.1, 0.2])}, {}), [0.0, 0.5, 1.0])
     assert dict(several.trajectory.units) == {"q0": "rad", "push": "N", "u0": "rad/s"}
-    with pytest.raises(ValueError, match=r"Wrong\.units names what is no coordinate, speed or input: q9"):
+    with pytest.raises(ValueError, match=r"Wrong\.units names what is no coordinate, speed, input or state: q9"):
         jk.simulate(type("Wrong", (Cart,), {"units": {"q9": "m"}})(), jk.State([0.0, 0.0], [0.0, 0.0]), [0.0, 1.0])
     assert units_of(type("Renamed", (Cart,), {"coordinates": ("angle", "q1")})()) == {"push": "N"}
     plt.close("all")

@@ -82,7 +82,7 @@ pendulum = DoublePendulum(mass=1.0, length=0.5)
     [
         ([trial(measured={"roll": good})], "mass", {}, "swing 3: DoublePendulum has no channel roll"),
         ([trial(inputs={"wind": 1.0})], "mass", {}, "swing 3: DoublePendulum has no input wind"),
-        ([trial(initial={"wind": 1.0})], "mass", {}, "has no coordinate or independent speed wind"),
+        ([trial(initial={"wind": 1.0})], "mass", {}, "has no coordinate, independent speed or state wind"),
         ([], "mass", {}, "There is no trial"),
         ([trial()], "weight", {}, "DoublePendulum has no parameter 'weight'; it has mass"),
         ([trial()], (), {}, "`free` names no parameter"),
@@ -94,7 +94,6 @@ pendulum = DoublePendulum(mass=1.0, length=0.5)
         ([trial()], "mass", {"sensor_bias": ("theta2",)}, "`sensor_bias` names theta2"),
         ([trial()], "mass", {"unknown": {"theta1": 0.0}}, "the standard deviation of theta1 must be positive"),
         ([trial()], "mass", {"window": 0.0}, "`window` is a length of time"),
-        ([trial()], "mass", {"outputs": {"theta1": lambda ride: ride["theta2"]}}, "`outputs`: theta1 is a coordinate"),
     ],
 )
 def test_a_bad_problem_is_named(trials, free, options, message):

@@ -145,11 +145,12 @@ def _check_names(system: System) -> None:
     name = type(system).__name__
     names = {kind: checked_names(name, kind, getattr(system, kind)) for kind in NAMES}
     units = checked_units(name, system.units)
-    if "units" in vars(type(system)):  # those that are inherited may name what this class has not
+    has_outputs = type(system).outputs is not System.outputs  # whose names are known when they are read
+    if "units" in vars(type(system)) and not has_outputs:  # those that are inherited may name what this class has not
         refuse_unknown(
             units,
             [each for named in names.values() for each in named],
-            f"{name}.units names what is no coordinate, speed or input:",
+            f"{name}.units names what is no coordinate, speed, input or state:",
         )
     owners: dict[str, str] = {}
     for kind in _FOUND_BY_NAME:

@@ -108,7 +108,7 @@ class Reading:
                 "use jax.vmap, or jaxkane.sweep.sweep for their motions."
             )
         self.n, self.k = len(system.speeds), len(system.dependent_speeds)
-        self.inputs = Inputs(checked_values(system, inputs), f"the inputs and states of {self.name}")
+        self.inputs = Inputs(checked_values(system, inputs), inputs_of(system))
         self._memory: dict[Any, Any] = {}
 
     def read(self, part: str, t: Component, q: Row, u: Row) -> Any:
@@ -455,6 +455,11 @@ def refuse_incomplete(system: System, q: Any, u: Any) -> None:
             f"{name}: {', '.join(given)} is a dependent speed, which follows from the others: leave it out of u. "
             "(jaxkane.assemble compares it with what the velocity residuals say.)"
         )
+
+
+def inputs_of(system: System) -> str:
+    """What `loads` reads by name, in words."""
+    return f"the inputs{' and states' if system.states else ''} of {type(system).__name__}"
 
 
 class Inputs(dict[str, Component]):

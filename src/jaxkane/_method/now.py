@@ -26,7 +26,7 @@ from .._scalars.components import add3, component, cross, is_exact
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, is_written_out
 from .._scalars.types import Component
-from .kane import Inputs, Instant, Row, as_row, jvp
+from .kane import Inputs, Instant, Row, as_row, inputs_of, jvp
 from .rates import motion_rates
 from .reactions import Reactions
 
@@ -38,7 +38,7 @@ class Now(Inputs):
     """
 
     def __init__(self, instant: Instant, N: Frame, u_dot: Values, answers: Iterator[Row] | None):
-        super().__init__(instant.inputs, f"the inputs and states of {instant.name}")
+        super().__init__(instant.inputs, inputs_of(instant.system))
         self.u_dot = u_dot
         self._instant, self._N, self._answers = instant, N, answers
         self._asked: list[Vector] = []
