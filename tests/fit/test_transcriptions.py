@@ -222,9 +222,17 @@ def test_process_noise_is_taken_for_what_it_is():
     assert 0.5 < chained.variance < 2.0
 
 
-def test_what_is_held_has_no_delay():
-    with pytest.raises(ValueError, match="push is held from sample to sample"):
-        Problem.of(GUESS, record(np.arange(0.0, 1.0, 0.1), 1), Delay("push"), hold=("push",))
+def test_the_delay_of_what_is_held():
+    t = np.arange(0.0, 4.0, 0.1)
+    push = {"push": np.round(np.sin(2.0 * t))}
+    held = {"push": jk.Samples(t + 0.033, push["push"], hold=True)}
+    ride = jk.simulate(TRUTH, jk.assemble(TRUTH, {"x": 0.2}), t, held)
+    noise = np.random.default_rng(3).normal(0.0, 1e-3, t.size)
+    trial = Trial(t, {"x": ride["x"] + noise}, push, sigma=1e-3, initial={"x": 0.2})
+    problem = Problem.of(TRUTH, trial, Delay("push"), hold=("push",))
+    found = minimize(problem, LeastSquares())
+    error = found.standard_errors["delay of push"]
+    assert abs(found.estimates["delay of push"] - 0.033) < 3 * error < 0.01
 
 
 def test_tied_parameters_and_gains():

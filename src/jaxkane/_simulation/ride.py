@@ -24,8 +24,8 @@ from .._scalars.reads import compiled
 from .._scalars.types import Component
 from .events import Events, at_zero, events_of, watched
 from .kinks import ToKinks
-from .settings import Settings
-from .signals import evaluate, sample_times, signals_are_sound, with_own_times, without_nonsense
+from .settings import Settings, refuse_held
+from .signals import evaluate, for_fixed_steps, sample_times, signals_are_sound, with_own_times, without_nonsense
 from .stops import AdaptiveToStops, Limits, Quantities, ToStops
 from .trajectory import Status, Trajectory
 
@@ -55,6 +55,9 @@ class Now(eqx.Module):
 def solve(system: System, state: State, ts: Array, signals: Any, settings: Settings) -> Trajectory:
     """`simulate` without its checks: one compiled program."""
     signals = with_own_times(signals)
+    if settings.step is not None:
+        refuse_held(settings.solver, signals)
+        signals = for_fixed_steps(signals)
     origin = (system, state, ts, signals)
     valid = _is_valid(*origin)
     # What is not finite must not enter the solver, where it would spoil the gradient of what is shared.

@@ -15,7 +15,7 @@ from jaxtyping import Array
 
 from .._description.system import State, System
 from .._method.kane import by_names, refuse_incomplete
-from .signals import real_array
+from .signals import real_array, samples_of
 
 ADJOINTS = {
     "auto": diffrax.RecursiveCheckpointAdjoint,
@@ -78,6 +78,19 @@ def settings_for(
         project=project,
         stabilize=float(stabilize),
     )
+
+
+def refuse_held(solver: Any, signals: Any) -> None:
+    """Refuse steps of one length over the jumps of held inputs, for a solver that asks for the right-hand side at the
+    end of a step: what is held has the next value there."""
+    tableau = getattr(solver, "tableau", None)
+    asks = True if tableau is None else np.any((np.asarray(tableau.c) == 1) & (np.asarray(tableau.b_sol)[1:] != 0))
+    if asks and any(x.hold for x in samples_of(signals)):
+        raise ValueError(
+            f"Steps of one length and an input under a zero-order hold: {type(solver).__name__} reads the end of a "
+            "step, where the next sample begins. Use solver=diffrax.Bosh3(); or leave out `step`, and the steps end "
+            "where the input jumps."
+        )
 
 
 def _check_number(label: str, value: Any, fits: Callable[[float], bool], what: str) -> None:

@@ -29,15 +29,24 @@ def real_array(value: Any, label: str, dtype: Any = None) -> Array:
 
 
 class Samples(eqx.Module):
-    """A signal given at times: linear between them, constant outside.
+    """A signal given at times: linear between them, constant outside; or held from each sample to the next.
 
-    Attributes: `ts` (n_t,) [s], `values` (n_t,).
+        Samples(ts + delay, values, hold=True)
+
+    Steps of error control end at the times, so that a motion is as exact as without kinks and jumps, and has its
+    derivative by the times too: by a delay.
+
+    Attributes: `ts` (n_t,) [s], `values` (n_t,); `hold`: whether each value lasts until the next.
     """
 
     ts: Float[Array, " n_t"]
     values: Float[Array, " n_t"]
+    hold: bool = eqx.field(static=True)
 
-    def __init__(self, ts: Any, values: Any):
+    def __init__(self, ts: Any, values: Any, hold: bool = False):
+        if not isinstance(hold, bool):
+            raise TypeError(f"Samples: `hold` is True or False, got {hold!r}.")
+        self.hold = hold
         self.ts, self.values = (real_array(x, f"Samples: {label}") for x, label in ((ts, "ts"), (values, "values")))
         n, m = (x.shape[-1] if x.ndim else 0 for x in (self.ts, self.values))
         if n != m or n < 2:
@@ -50,11 +59,24 @@ class Samples(eqx.Module):
 
     def __call__(self, t: Component, state: Any = None) -> Component:
         # Comparing with every sample is one short vector operation; a bisection is a loop of many small kernels.
+        if self.hold:
+            return self._held(t)
         i = jnp.clip(jnp.sum(self.ts <= t) - 1, 0, self.ts.shape[0] - 2)
         t0, t1, x0, x1 = self.ts[i], self.ts[i + 1], self.values[i], self.values[i + 1]
         # On a kink the derivative by a time is that of the right side; that of `jnp.clip` is the mean of both.
         w = (t - t0) / (t1 - t0)
         return x0 + (x1 - x0) * jnp.where(w >= 1.0, jnp.ones_like(w), jnp.where(w < 0.0, jnp.zeros_like(w), w))
+
+    def _held(self, t: Component) -> Component:
+        return self.values[jnp.clip(jnp.sum(self.ts <= t) - 1, 0, self.ts.shape[0] - 1)]
+
+
+class _OnGrid(Samples):
+    """Held samples for steps that end at them but for a rounding error: the end of a step is the beginning of the next
+    sample, whichever way it was rounded."""
+
+    def _held(self, t: Component) -> Component:
+        return super()._held(t + 1e-4 * (self.ts[1] - self.ts[0]))
 
 
 def as_signals(inputs: Inputs, names: Sequence[str], ts: Array, system_name: str) -> Any:
@@ -91,7 +113,8 @@ def _as_signal(name: str, value: Any, ts: Array) -> Any:
     return Samples(ts, array)
 
 
-def _samples(signals: Any) -> list[Samples]:
+def samples_of(signals: Any) -> list[Samples]:
+    """All signals that are samples."""
     return [x for x in jax.tree.leaves(signals, is_leaf=_is_samples) if _is_samples(x)]
 
 
@@ -130,17 +153,25 @@ def with_own_times(given: Any) -> Any:
 
 
 def sample_times(signals: Any, dtype: Any) -> tuple[Array, bool] | None:
-    """All times at which some signal has a kink, in their order, and whether two signals may have theirs at one time
-    and not together; None where there is none."""
-    distinct = {id(x.ts): x.ts.astype(dtype) for x in _samples(signals)}
-    return (jnp.sort(jnp.concatenate(list(distinct.values()))), len(distinct) > 1) if distinct else None
+    """All times at which some signal has a kink or a jump, in their order, and whether a step that begins at one of
+    them needs a right-hand side of its own: behind a jump, and where two signals may have their kinks at one time and
+    not together. None where there is none."""
+    distinct = {id(x.ts): x.ts.astype(dtype) for x in samples_of(signals)}
+    anew = len(distinct) > 1 or any(x.hold for x in samples_of(signals))
+    return (jnp.sort(jnp.concatenate(list(distinct.values()))), anew) if distinct else None
+
+
+def for_fixed_steps(signals: Any) -> Any:
+    """Signals for steps of one length, which end where samples stand but for a rounding error."""
+    on_grid = lambda x: _OnGrid(x.ts, x.values, True) if _is_samples(x) and x.hold else x  # noqa: E731
+    return jax.tree.map(on_grid, signals, is_leaf=_is_samples)
 
 
 def signals_are_sound(signals: Any) -> Array:
     """Whether all samples and numbers are finite, and the samples' times increase: what tracing kept from a check."""
     numbers = [x for x in jax.tree.leaves(_plain(signals)) if eqx.is_inexact_array(x)]
     finite = [jnp.all(jnp.isfinite(x)) for x in numbers]
-    return jnp.all(jnp.stack([jnp.array(True), *finite, *(jnp.all(x.ts[1:] > x.ts[:-1]) for x in _samples(signals))]))
+    return jnp.all(jnp.stack([jnp.array(True), *finite, *(jnp.all(x.ts[1:] > x.ts[:-1]) for x in samples_of(signals))]))
 
 
 def without_nonsense(signals: Any, valid: Array) -> Any:

@@ -57,16 +57,20 @@ class Nuisance(eqx.Module):
         return jnp.asarray(otherwise, b.dtype)
 
 
-class ZeroOrderHold(eqx.Module):
-    """A signal that keeps each sample until the next: `ts`, `values` (n_t,)."""
+class Ramps(eqx.Module):
+    """Held samples that jump at times of their own, for steps of one length, which cannot end there: each jump is a
+    ramp about its time, of a `width` [s] that goes with the step. So it has a derivative by that time.
+
+    Attributes: `ts`, `values` (n_t,); `width`.
+    """
 
     ts: Float[Array, " n_t"]
     values: Float[Array, " n_t"]
+    width: Float[Array, ""]
 
     def __call__(self, t: Array, state: Any = None) -> Array:
-        # The end of a step is the beginning of the next sample, whichever way it was rounded.
-        i = jnp.sum(self.ts <= t + 1e-4 * (self.ts[1] - self.ts[0])) - 1
-        return self.values[jnp.clip(i, 0, self.ts.shape[0] - 1)]
+        done = jnp.clip((t - self.ts[1:]) / self.width + 0.5, 0.0, 1.0)
+        return self.values[0] + jnp.sum(done * jnp.diff(self.values))
 
 
 class Model(eqx.Module):
@@ -105,8 +109,11 @@ class Model(eqx.Module):
             bias = self.nuisance.of_trial(b, "bias of input", name, 0.0)
             if name in self.driven:
                 gain = roles.get(("gain", name), 1.0) * self.nuisance.of_trial(b, "gain of input", name, 1.0)
-                kind = ZeroOrderHold if name in self.held else Samples
-                signals[name] = kind(self._times_of(name, window, b, roles), gain * window.inputs[i] + bias)
+                times, values = self._times_of(name, window, b, roles), gain * window.inputs[i] + bias
+                if name in self.held and times is not window.t_input and self.settings.step is not None:
+                    signals[name] = Ramps(times, values, 2.0 * window.step)
+                else:
+                    signals[name] = Samples(times, values, hold=name in self.held)
             elif ("bias of input", name) in self.nuisance.trial:
                 signals[name] = bias
         settings = self.settings if self.settings.step is None else dataclasses.replace(self.settings, step=window.step)

@@ -116,8 +116,4 @@ def held_and_delayed(
     items = [free] if isinstance(free, Delay) else free if isinstance(free, (list, tuple)) else ()
     delayed = [name for kind, name in nuisance.trial if kind == "delay of input"]
     delayed += [item.input for item in items if isinstance(item, Delay)]
-    held = tuple(checked_names(system, "hold", hold, system.inputs))
-    stuck = sorted(set(delayed) & set(held))
-    if stuck:
-        raise ValueError(f"{stuck[0]} is held from sample to sample: nothing changes smoothly with its delay.")
-    return held, tuple(delayed)
+    return tuple(checked_names(system, "hold", hold, system.inputs)), tuple(delayed)

@@ -72,8 +72,8 @@ class Gain:
 class Delay:
     """The delay [s] with which an input acts, common to all trials: the system receives samples(t - delay).
 
-    Of samples that are taken as linear in between; earlier than `LONGEST_DELAY` the first sample stands. The rest as
-    in `Free`.
+    Earlier than `LONGEST_DELAY` the first sample stands. Of an input under a zero-order hold the jumps move; where the
+    steps of integration have one length, each is a ramp of two steps. The rest as in `Free`.
     """
 
     input: str
