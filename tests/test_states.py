@@ -236,6 +236,21 @@ def test_starts_of_all_kinds(cart):
     assert jk.simulate(cart, jk.State([0.0], [0.0], [np.nan, 0.0]), ts).status == jk.Status.INVALID
 
 
+def test_what_is_exported_takes_the_states_behind_the_inputs(cart):
+    written = {}
+    exec(str(jk.export.numpy(cart)), written)
+    at = (0.3, [0.1], [0.5])
+    w = {"command": 1.0, "force": 2.0, "filtered": 0.4}
+    np.testing.assert_allclose(
+        written["state_rates"](*at, [*w.values()]), [*jk.state_rates(cart, *at, w).values()][::-1]
+    )
+    np.testing.assert_allclose(written["rates"](*at, [*w.values()])[1], jk.accelerations(cart, *at, w), rtol=1e-15)
+    with pytest.raises(ValueError, match="no linear model in symbols"):
+        jk.symbolic.linearize(cart)
+    with pytest.raises(ValueError, match="no states of the first order"):
+        jk.export.numpy(jk.catalog.DoublePendulum(mass=1.0, length=1.0), functions=("state_rates",))
+
+
 def variant(**members):
     return type("Variant", (Cart,), members)()
 

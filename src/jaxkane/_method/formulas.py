@@ -32,6 +32,7 @@ from .equations import (
     partial_velocities,
 )
 from .kane import Reading, as_row
+from .now import rates
 from .rates import motion_rates
 
 
@@ -41,6 +42,7 @@ class Function(NamedTuple):
     outputs: tuple[str, ...]
     evaluate: Callable[..., tuple[Any, ...]]
     needs_constraints: bool = False
+    needs_states: bool = False
 
 
 def _all_rates(system, t, q, u, w, u_dep):
@@ -69,6 +71,7 @@ FUNCTIONS: dict[str, Function] = {
         ("J_dot",), lambda s, t, q, u, w, _: (constraint_jacobian_rate(s, t, q, u),), True
     ),
     "partial_velocities": Function(("V", "W"), lambda s, t, q, u, w, _: partial_velocities(s, t, q, u, w)),
+    "state_rates": Function(("x_dot",), lambda s, t, q, u, w, _: (rates(s, t, q, u, w).x,), needs_states=True),
     "kinetic_energy": Function(("energy",), lambda s, t, q, u, w, _: (kinetic_energy(s, t, q, u),)),
     "coordinate_rates": Function(("q_dot",), _all_rates),
     "velocity_residuals": Function(("c",), _velocity_residuals, True),
@@ -127,7 +130,9 @@ class Formulas:
             for (path, x), moves in zip(paths, self.moves, strict=True)
             if moves
         ]
-        vectors = {"q": system.coordinates, "u": system.speeds, "inputs": system.inputs}
+        vectors = {"q": system.coordinates, "u": system.speeds}
+        # At one time a state of the first order is one more number that loads read.
+        vectors |= {"inputs": (*system.inputs, *system.states)}
         vectors |= {"u_dep": system.dependent_speeds}
         self.arguments = (
             Argument("t", "t", (), ("t",)),
@@ -161,13 +166,15 @@ class Formulas:
         t, q, u, w, u_dep, *parameters = args
         given = iter(parameters)
         leaves = [next(given) if moves else leaf for leaf, moves in zip(self.leaves, self.moves, strict=True)]
-        inputs = {name: w[i] for i, name in enumerate(self.system.inputs)}
+        inputs = {name: w[i] for i, name in enumerate((*self.system.inputs, *self.system.states))}
         return tuple(FUNCTIONS[function].evaluate(jax.tree.unflatten(self.structure, leaves), t, q, u, inputs, u_dep))
 
     def _program(self, function: str) -> ClosedJaxpr:
         """A function as a program of JAX, in which no other is called."""
         if FUNCTIONS[function].needs_constraints and not self.system.dependent_speeds:
             raise ValueError(f"{self.name} has no dependent speeds, so that there is no {function!r}. Leave it out.")
+        if FUNCTIONS[function].needs_states and not self.system.states:
+            raise ValueError(f"{self.name} has no states of the first order, so that there is no {function!r}.")
         specs = [jax.ShapeDtypeStruct(a.shape, self.dtype) for a in self.arguments]
         with jax.enable_x64(self.dtype == "float64"):
             return without_repetition(jax.make_jaxpr(functools.partial(self.evaluate, function))(*specs))

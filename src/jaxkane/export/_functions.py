@@ -17,7 +17,8 @@ def chosen(formulas: Formulas, functions: Sequence[str] | None, usual: Sequence[
     """The functions that were asked for; by default the usual ones that the system has."""
     if functions is None:
         needs = {"dependent_speeds": "u_dep", "input_jacobian": "inputs", "parameter_jacobian": "parameters"}
-        return tuple(name for name in usual if name not in needs or formulas.names(needs[name]))
+        found = tuple(name for name in usual if name not in needs or formulas.names(needs[name]))
+        return (*found, "state_rates") if formulas.system.states else found
     if isinstance(functions, str):
         raise TypeError(f"functions is a sequence of names; one is ({functions!r},).")
     functions = tuple(dict.fromkeys(functions))

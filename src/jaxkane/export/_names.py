@@ -56,5 +56,5 @@ def identifiers(names: Iterable[str], taken: Collection[str], in_ascii_only: boo
 def variable_units(system: System) -> dict[str, str]:
     """Units of coordinates, speeds and inputs, where they are declared."""
     declared = units_of(system)
-    names = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.inputs)
+    names = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.inputs, *system.states)
     return {name: unit_of(name, declared) for name in names}

@@ -46,7 +46,8 @@ class Equations:
     - `replacements`: pairs (symbol, expression) in the order in which they can be evaluated, as `sympy.cse` gives them:
         the dependent speeds, which stand in formulas by their names; and, of a large system, every intermediate result
         that is read more than once.
-    - `symbols`: by name, as they were declared; `t`, `q`, `u`, `u_dep`, `inputs`, `parameters`: tuples of them.
+    - `symbols`: by name, as they were declared; `t`, `q`, `u`, `u_dep`, `inputs`, `parameters`: tuples of them. Behind
+        the inputs stand the states of the first order, which loads read as they do.
     - `operations`: scalar operations by quantity, each intermediate result counted once; "all" together.
 
     Formulas are those of generic finite numbers: x / x is 1, and 0 x is 0.

@@ -103,6 +103,11 @@ def linearize(
     equations are singular, and as `jaxkane.symbolic.equations`.
     """
     formulas = Formulas(system)
+    if system.states:
+        raise ValueError(
+            f"{formulas.name} has states of the first order ({', '.join(system.states)}), which no linear model in "
+            "symbols holds: jaxkane.stability.linearize gives its numbers."
+        )
     model = _At(formulas, dict(at or {}))
     names = (*system.coordinates, *system.speeds)
     dependent = tuple(system.dependent_coordinates if dependent is None else dependent)
