@@ -17,7 +17,7 @@ _AROUND = np.linspace(0.0, 2.0 * np.pi, 33)[:-1]
 
 def bicycle(system: Any, motion: Motion, s: Sketch) -> None:
     """Spoked wheels, frame, fork, a rider's outline, the mass centre of frame and rider, tracks of the contacts."""
-    rear_wheel, frame, fork, front_wheel = motion.bodies
+    rear_wheel, frame, fork, front_wheel = (motion[n] for n in ("rear wheel", "rear frame", "fork", "front wheel"))
     B, C = motion["B"], motion["C"]
     rear, front, S = rear_wheel.center.position, front_wheel.center.position, motion["S"].position
     w, rR = system.w, system.rR

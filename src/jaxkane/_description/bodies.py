@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import itertools
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, Self
 
 import jax
 import numpy as np
@@ -235,6 +236,39 @@ class Motion:
         self.N: Frame = self.bodies[0].center.velocity.frame.root
         for name, part in (*self.points.items(), *self.frames.items()):
             part.name = name
+
+    def extended(
+        self,
+        bodies: Iterable[Body] | Body = (),
+        constraints: Iterable[Component | Vector] = (),
+        *,
+        points: Mapping[str, Point] | None = None,
+        frames: Mapping[str, Frame] | None = None,
+    ) -> Self:
+        """The same motion and more, for a class that inherits from another system's.
+
+            def motion(self, t, q, u):
+                motion = super().motion(t, q, u)
+                basket = jk.Body(self.load, 0.0, motion["S"].fixed(0.3 * motion["H"].x), name="basket")
+                return motion.extended([basket])
+
+        **Arguments:** as of `Motion`: what comes behind the bodies and residuals that there are, and under other names.
+        """
+        more = copy.copy(self)  # with what a class that inherits from this one knows besides
+        bodies = (bodies,) if isinstance(bodies, Body) else tuple(bodies)
+        given = (constraints,) if isinstance(constraints, (Vector, float, int, jax.Array)) else tuple(constraints)
+        for kind, there, new in (("point", self.points, points), ("frame", self.frames, frames)):
+            twice = [name for name in new or {} if name in there]
+            if twice:
+                raise ValueError(f"Motion.extended: there is a {kind} of the name {twice[0]!r} already.")
+        Motion.__init__(
+            more,
+            (*self.bodies, *bodies),
+            (*self.vanishing, *given),
+            points={**self.points, **(points or {})},
+            frames={**self.frames, **(frames or {})},
+        )
+        return more
 
     def _by_name(self) -> dict[str, Body | Point | Frame]:
         named: dict[str, Any] = {}

@@ -33,7 +33,7 @@ def _prepared(system: str, name: str, value: Any) -> Any:
         return checked_names(system, name, value)
     if name == "units":
         return checked_units(system, value)
-    return _named(value) if name in METHODS and callable(value) else value
+    return _named(value, name) if name in METHODS and callable(value) else value
 
 
 def checked_units(system: str, given: Any) -> Mapping[str, str]:
@@ -76,8 +76,9 @@ _ASKED_FOR_A_VALUE = (
 )
 
 
-def _named(method: Callable[..., Any]) -> Callable[..., Any]:
-    """A method of a description whose `q` and `u` may be any sequence, and are read by place and by name."""
+def _named(method: Callable[..., Any], name: str) -> Callable[..., Any]:
+    """A method of a description, of that name, whose `q`, `u` and `x` may be any sequence, and are read by place and
+    by name."""
     if getattr(method, "reads_by_name", None) is method:  # what decorates such a method has a copy of this, and is none
         return method
 
@@ -88,7 +89,7 @@ def _named(method: Callable[..., Any]) -> Callable[..., Any]:
         if rest:
             names = (*self.speeds, *self.dependent_speeds, *self.auxiliary_speeds)
             rest = (_values(rest[0], names, f"{type(self).__name__}: u", len(self.auxiliary_speeds)), *rest[1:])
-        if method.__name__ == "state_rates" and len(rest) > 1:
+        if name == "state_rates" and len(rest) > 1:
             rest = (rest[0], _values(rest[1], self.states, f"{type(self).__name__}: x"), *rest[2:])
         began = now()
         try:
@@ -97,7 +98,7 @@ def _named(method: Callable[..., Any]) -> Callable[..., Any]:
             raise TypeError(kept_from_a_trace(type(self).__name__)) from error
         except _ASKED_FOR_A_VALUE as error:
             raise TypeError(
-                f"{type(self).__name__}.{method.__name__} asks for the value of a number that has none while the "
+                f"{type(self).__name__}.{name} asks for the value of a number that has none while the "
                 "description is traced: time, coordinates, speeds, parameters, and what follows from them. Write "
                 "jnp.sin for np.sin and math.sin, jnp.where(a > b, x, y) for `if`, jnp.maximum and jnp.minimum for max "
                 "and min, and neither float() nor .item(). A number that a description counts with, as that of its "

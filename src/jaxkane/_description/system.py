@@ -62,7 +62,8 @@ class System(eqx.Module, metaclass=Kind):
     states: ClassVar[tuple[str, ...]] = ()
     """Names of states of the first order, which `state_rates` drives: motors that lag, bristles, filters."""
     units: ClassVar[Mapping[Any, str]] = {}
-    """Units of coordinates, speeds, inputs, states and outputs by name, for pictures: `{"q0": "rad", "push": "N"}`."""
+    """Units of coordinates, speeds, inputs, states and outputs by name, for tables and pictures: `{"q0": "rad", "push":
+    "N"}`. Those of rates follow from what is declared; nothing is guessed from a name."""
     check_inertia: ClassVar[bool] = True
     """Whether bodies are refused whose principal moments of inertia break the triangle inequality by more than 5 %."""
 

@@ -58,7 +58,7 @@ class _Aircraft(System):
 
     def q_dot(self, t, q, u):
         N, _ = inertial()
-        velocity = self._airframe(N, q, u).vector(*u[:3])
+        velocity = self._airframe(N, q, u).vector(*u["v1":"v3"])
         return (*velocity.components_in(N), *self._orientation_rates(q, u))
 
     def motion(self, t, q, u):
@@ -66,7 +66,7 @@ class _Aircraft(System):
         xE, yE, zE = self.engine_x, self.engine_y, self.engine_z
         N, _ = inertial()
         A = self._airframe(N, q, u)
-        G = Point.at(A.vector(*u[:3]), N.vector(*q[:3]), "G")
+        G = Point.at(A.vector(*u["v1":"v3"]), N.vector(*q["x":"z"]), "G")
         G_A = G.fixed(A.vector(-2.0 * mE * xE / mA, 0.0, -2.0 * mE * zE / mA))  # G is the mass centre of the aircraft
         G_1, G_2 = G.fixed(A.vector(xE, yE, zE)), G.fixed(A.vector(xE, -yE, zE))
         Ixz = self.airframe_Ixz
@@ -129,10 +129,10 @@ class Aircraft(_Aircraft):
     units = {**_Aircraft.units, **dict.fromkeys(coordinates[:3], "m")} | dict.fromkeys(coordinates[3:], "rad")
 
     def _airframe(self, N, q, u):
-        return N.rotate_sequence("3-2-1", q[3:], angular_velocity=u[3:], name="A")
+        return N.rotate_sequence("3-2-1", q["psi":"phi"], angular_velocity=u["omega1":"omega3"], name="A")
 
     def _orientation_rates(self, q, u):
-        return rotations.angle_rates("3-2-1", q[3:], u[3:])
+        return rotations.angle_rates("3-2-1", q["psi":"phi"], u["omega1":"omega3"])
 
     def events(self, t, q, u):
         return {"gimbal_lock": jnp.cos(q["theta"])}
@@ -161,7 +161,7 @@ class AircraftEulerParameters(_Aircraft):
         return (q["e1"] ** 2 + q["e2"] ** 2 + q["e3"] ** 2 + q["e4"] ** 2 - 1.0,)
 
     def _airframe(self, N, q, u):
-        return N.rotate_euler(q[3:], u[3:], "A")
+        return N.rotate_euler(q["e1":"e4"], u["omega1":"omega3"], "A")
 
     def _orientation_rates(self, q, u):
-        return rotations.euler_parameter_rates(q[3:], u[3:])
+        return rotations.euler_parameter_rates(q["e1":"e4"], u["omega1":"omega3"])

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Self
 
 import jax.numpy as jnp
 
@@ -63,6 +64,11 @@ class WhippleBicycle(System):
     fall when riding forward: the speed is -rR * rear_wheel_rate), and the rear contact's place x, y. Pitch follows from
     roll and steer (`assemble`). Inputs: `roll_torque` on the frame about the heading, `drive_torque` on the rear wheel
     and `steer_torque` on the fork, the last two with their reactions on the frame.
+
+    Its motion names the bodies "rear wheel", "rear frame", "fork" (whose own frame is aligned with the rear frame at
+    zero steer) and "front wheel"; the frames "Y" (heading), "B" (rear frame) and "C" (fork, z along the steer axis);
+    the points "P" and "Q" (contacts) and "S" (on the steer axis). A class that inherits from this one adds to it with
+    `super().motion(t, q, u).extended([...])`.
     """
 
     w: Scalar = parameter(positive=True, unit="m")
@@ -102,15 +108,16 @@ class WhippleBicycle(System):
     units |= dict.fromkeys((*speeds, *dependent_speeds), "rad/s") | dict.fromkeys(inputs, "N m")
 
     @classmethod
-    def benchmark(cls) -> WhippleBicycle:
+    def benchmark(cls) -> Self:
         """The benchmark bicycle of Meijaard et al. (2007), Table 1."""
         return cls(**_BENCHMARK)
 
     @classmethod
-    def from_parameters(cls, parameters: Mapping[str, Any]) -> WhippleBicycle:
-        """A bicycle from a dict with Meijaard's names.
+    def from_parameters(cls, parameters: Mapping[str, Any]) -> Self:
+        """A bicycle from a dict with Meijaard's names, and those of a class that inherits from this one.
 
-        `g` and `steer_damping` may be left out. `IRzz`, `IFzz`, `yB` and `yH`, which the model implies, may be given.
+        What has a default may be left out, as `g` and `steer_damping`. `IRzz`, `IFzz`, `yB` and `yH`, which the model
+        implies, may be given.
 
         **Raises:** `ValueError` that names what is missing, unknown, or contradicts the model's symmetry.
         """
@@ -119,19 +126,19 @@ class WhippleBicycle(System):
             if name in values:
                 given, implied = float(values.pop(name)), 0.0 if twin is None else float(values.get(twin, jnp.nan))
                 if abs(given - implied) > 1e-9 * max(1.0, abs(implied)):
-                    raise ValueError(f"WhippleBicycle: {name} = {given:.6g}, but the model has {name} = {twin or 0.0}.")
-        known = parameter_info(cls)
-        unknown = sorted(set(values) - set(known))
-        missing = [name for name in known if name not in values and name not in ("g", "steer_damping")]
+                    raise ValueError(f"{cls.__name__}: {name} = {given:.6g}, but the model has {name} = {twin or 0.0}.")
+        fields = [field for field in dataclasses.fields(cls) if field.init]  # type: ignore[arg-type]
+        unknown = sorted(set(values) - {field.name for field in fields})
+        missing = [field.name for field in fields if field.name not in values and not _has_default(field)]
         if unknown or missing:
             parts = [f"missing: {', '.join(missing)}"] * bool(missing) + [f"unknown: {', '.join(unknown)}"] * bool(
                 unknown
             )
-            raise ValueError(f"WhippleBicycle takes Meijaard's parameters; {'; '.join(parts)}.")
+            raise ValueError(f"{cls.__name__} takes Meijaard's parameters; {'; '.join(parts)}.")
         return cls(**values)
 
     @classmethod
-    def from_file(cls, path: str | os.PathLike[str]) -> WhippleBicycle:
+    def from_file(cls, path: str | os.PathLike[str]) -> Self:
         """A bicycle from a text file of BicycleParameters (`NAME = value+/-deviation`).
 
         The deviations are read by `jaxkane.catalog.read_bicycle_file`. Where a file also splits the front assembly H
@@ -148,19 +155,19 @@ class WhippleBicycle(System):
     def q_dot(self, t, q, u):
         # P follows the wheel: v_P = v_A - omega_R x r_P_A, R the frame that rolls but does not pitch.
         forward = -self.rR * (u["rear_wheel_rate"] + u["pitch_rate"])
-        return (*u[:6], forward * jnp.cos(q["yaw"]), forward * jnp.sin(q["yaw"]))
+        turning = [u[f"{part}_rate"] for part in ("roll", "rear_wheel", "steer", "yaw", "pitch", "front_wheel")]
+        return (*turning, forward * jnp.cos(q["yaw"]), forward * jnp.sin(q["yaw"]))
 
     def motion(self, t, q, u):
-        roll, _, steer, yaw, pitch, _, x, y = q
-        roll_rate, rear_wheel_rate, steer_rate, yaw_rate, pitch_rate, front_wheel_rate = u
         N, O = inertial()
-        Y = N.rotate(3, yaw, yaw_rate, "Y")
-        R = Y.rotate(1, roll, roll_rate, "R")
-        B = R.rotate(2, pitch, pitch_rate, "B")  # rear frame
-        C = B.rotate(2, self.lam, 0.0, "tilt").rotate(3, steer, steer_rate, "C")  # fork, 3 along the steer axis
+        Y = N.rotate(3, q["yaw"], u["yaw_rate"], "Y")
+        R = Y.rotate(1, q["roll"], u["roll_rate"], "R")
+        B = R.rotate(2, q["pitch"], u["pitch_rate"], "B")  # rear frame
+        tilted = B.rotate(2, self.lam, 0.0, "tilt")
+        C = tilted.rotate(3, q["steer"], u["steer_rate"], "C")  # fork, 3 along the steer axis
         H = C.rotate(2, -self.lam, 0.0, "H")  # fork, aligned with B at zero steer
-        omega_A = B.angular_velocity + rear_wheel_rate * B.y
-        omega_D = C.angular_velocity + front_wheel_rate * C.y
+        omega_A = B.angular_velocity + u["rear_wheel_rate"] * B.y
+        omega_D = C.angular_velocity + u["front_wheel_rate"] * C.y
 
         # S on the steer axis, and everything else, from the rear wheel's centre G_A (Example 7).
         cos, sin = jnp.cos(self.lam), jnp.sin(self.lam)
@@ -170,7 +177,7 @@ class WhippleBicycle(System):
         def from_S(x, z):  # a place measured from P, upright, as a vector fixed in the fork
             return ((x - xS) * H.x + (z + self.rR + zS) * H.z).express(C)
 
-        P = O.fixed(x * N.x + y * N.y, N)  # the ground under the rear wheel, at rest
+        P = O.fixed(q["x"] * N.x + q["y"] * N.y, N)  # the ground under the rear wheel, at rest
         r_P_A = -self.rR * R.z
         G_A = Point(P.velocity + omega_A.cross(r_P_A), P, r_P_A)
         G_B = G_A.fixed(self.xB * B.x + (self.zB + self.rR) * B.z)
@@ -194,7 +201,7 @@ class WhippleBicycle(System):
         return Motion(bodies, [Q.velocity], points={"P": P, "Q": Q, "S": S}, frames={"Y": Y, "B": B, "C": C})
 
     def loads(self, t, q, u, motion, inputs):
-        wheel, frame, fork, _ = motion.bodies
+        wheel, frame, fork = (motion[name] for name in ("rear wheel", "rear frame", "fork"))
         steer_torque = inputs["steer_torque"] - self.steer_damping * u["steer_rate"]
         return (
             weight(motion, self.g * motion.N.z),
@@ -204,8 +211,12 @@ class WhippleBicycle(System):
         )
 
     def configuration_constraints(self, t, q):
-        motion = self.motion(t, q, (0.0,) * 6)
+        motion = self.motion(t, q, (0.0,) * (len(self.speeds) + len(self.dependent_speeds)))
         return [motion["Q"].position.dot(motion.N.z)]  # height of the front contact, downwards
 
     def events(self, t, q, u):
         return {"fell_over": jnp.cos(q["roll"]) - 0.2}  # beyond 78 degrees
+
+
+def _has_default(field: dataclasses.Field[Any]) -> bool:
+    return field.default is not dataclasses.MISSING or field.default_factory is not dataclasses.MISSING

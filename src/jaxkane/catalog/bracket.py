@@ -48,12 +48,12 @@ class Bracket(System):
     units = dict.fromkeys(coordinates, "rad") | dict.fromkeys(speeds, "rad/s") | dict.fromkeys(inputs, "N")
 
     def q_dot(self, t, q, u):
-        return rotations.angle_rates("1-2-3", q, u)
+        return rotations.angle_rates("1-2-3", q["theta1":"theta3"], u["omega1":"omega3"])
 
     def motion(self, t, q, u):
         m, L = self.mass, self.length
         N, O = inertial()
-        E = N.rotate_sequence("1-2-3", q, angular_velocity=u, name="E")
+        E = N.rotate_sequence("1-2-3", q["theta1":"theta3"], angular_velocity=u["omega1":"omega3"], name="E")
         G = O.fixed(0.5 * L * E.y)
         A = O.fixed(L * E.y)
         B = G.fixed(0.5 * L * E.x)

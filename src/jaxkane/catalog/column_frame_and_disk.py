@@ -56,7 +56,7 @@ class ColumnFrameAndDisk(System):
         return -u["omega1"] / jnp.sin(q["theta"]), u["omega2"], u["omega_disk"]
 
     def motion(self, t, q, u):
-        phi_dot, theta_dot, psi_dot = self.q_dot(t, q, u)
+        phi_dot, theta_dot, psi_dot, *_ = self.q_dot(t, q, u)
         N, O = inertial()
         C = N.rotate(3, q["phi"], phi_dot, "C")
         A = C.rotate(2, q["theta"], theta_dot, "A")

@@ -64,7 +64,7 @@ class DiskAndBar(System):
         return Motion((disk, bar), points={"P": P})
 
     def loads(self, t, q, u, motion, inputs):
-        disk, bar = motion.bodies
+        disk, bar = motion["disk"], motion["bar"]
         joint_torque = inputs["bar_torque"] - self.stiffness * q["theta"] - self.damping * u["theta_dot"]
         return (
             weight(motion, -self.gravity * motion.N.z),

@@ -46,15 +46,18 @@ class RigidBody(System):
 
     def q_dot(self, t, q, u):
         G = self.motion(t, q, u)["body"].center
-        return (*G.velocity.components_in(G.velocity.frame.root), *rotations.euler_parameter_rates(q[3:], u[3:]))
+        return (
+            *G.velocity.components_in(G.velocity.frame.root),
+            *rotations.euler_parameter_rates(q["e1":"e4"], u["omega1":"omega3"]),
+        )
 
     def configuration_constraints(self, t, q):
         return (q["e1"] ** 2 + q["e2"] ** 2 + q["e3"] ** 2 + q["e4"] ** 2 - 1.0,)
 
     def motion(self, t, q, u):
         N, _ = inertial()
-        B = N.rotate_euler(q[3:], u[3:], "B")
-        G = Point.at(B.vector(*u[:3]), N.vector(*q[:3]), "G")
+        B = N.rotate_euler(q["e1":"e4"], u["omega1":"omega3"], "B")
+        G = Point.at(B.vector(*u["v1":"v3"]), N.vector(*q["x":"z"]), "G")
         return Motion([Body(self.mass, (self.I11, self.I22, self.I33), G, B, name="body")], frames={"B": B})
 
     def loads(self, t, q, u, motion, inputs):

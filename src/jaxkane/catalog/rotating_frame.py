@@ -22,7 +22,7 @@ class _FrameAndBar(System):
 
     def motion(self, t, q, u):
         m, l, d = self.mass, self.length, self.distance
-        phi_dot, theta_dot = self.q_dot(t, q, u)
+        phi_dot, theta_dot, *_ = self.q_dot(t, q, u)
         N, O = inertial()
         F = N.rotate(3, q["phi"], phi_dot, "F")
         B = F.rotate(2, q["theta"], theta_dot, "B")

@@ -60,7 +60,7 @@ class ShaftAndBar(System):
     units = dict.fromkeys(coordinates, "rad") | dict.fromkeys(inputs, "N m")
 
     def motion(self, t, q, u):
-        O, S, bar = _shaft_and_bar(self.mass, self.length, q, u)
+        O, S, bar = _shaft_and_bar(self.mass, self.length, q, u["phi_dot", "theta_dot"])
         I = 0.25 * self.shaft_mass * self.shaft_radius**2
         shaft = Body(self.shaft_mass, (I, I, 2.0 * I), O, S, name="shaft")  # only the last matters: it turns about S.z
         return Motion((shaft, bar), frames={"S": S})

@@ -55,13 +55,16 @@ class SpatialDoublePendulum(System):
     units = dict.fromkeys(coordinates, "rad") | dict.fromkeys(speeds, "rad/s")
 
     def q_dot(self, t, q, u):
-        return (*rotations.angle_rates("3-1-3", q[:3], u[:3]), *rotations.angle_rates("3-1-3", q[3:], u[3:]))
+        first = rotations.angle_rates("3-1-3", q["theta11":"theta13"], u["omega11":"omega13"])
+        second = rotations.angle_rates("3-1-3", q["theta21":"theta23"], u["omega21":"omega23"])
+        return (*first, *second)
 
     def motion(self, t, q, u):
         l1, l2 = self.length1, self.length2
         N, O = inertial()
-        L1 = N.rotate_sequence("3-1-3", q[:3], angular_velocity=u[:3], name="L1")
-        L2 = N.rotate_sequence("3-1-3", q[3:], angular_velocity=u[3:], name="L2")
+        angles1, angles2 = q["theta11":"theta13"], q["theta21":"theta23"]
+        L1 = N.rotate_sequence("3-1-3", angles1, angular_velocity=u["omega11":"omega13"], name="L1")
+        L2 = N.rotate_sequence("3-1-3", angles2, angular_velocity=u["omega21":"omega23"], name="L2")
         G1 = O.fixed(-0.5 * l1 * L1.y)
         A = O.fixed(-l1 * L1.y)
         G2 = A.fixed(-0.5 * l2 * L2.y)

@@ -45,14 +45,14 @@ class SpinningTop(System):
     dependent_coordinates = ("e4",)
 
     def q_dot(self, t, q, u):
-        return rotations.euler_parameter_rates(q, u)
+        return rotations.euler_parameter_rates(q["e1":"e4"], u["omega1":"omega3"])
 
     def configuration_constraints(self, t, q):
         return (q["e1"] ** 2 + q["e2"] ** 2 + q["e3"] ** 2 + q["e4"] ** 2 - 1.0,)
 
     def motion(self, t, q, u):
         N, O = inertial()
-        T = N.rotate_euler(q, u, "T")
+        T = N.rotate_euler(q["e1":"e4"], u["omega1":"omega3"], "T")
         G = O.fixed(self.distance * T.z)
         I = self.transverse_inertia
         return Motion([Body(self.mass, (I, I, self.axial_inertia), G, T, name="top")], frames={"T": T})

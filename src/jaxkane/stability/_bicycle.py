@@ -23,8 +23,9 @@ LATERAL = ("roll", "steer", "roll_rate", "steer_rate")
 def straight_ahead(bicycle: WhippleBicycle, speed: Component) -> State:
     """A bicycle that rolls straight ahead and upright at `speed` [m/s]."""
     v = jnp.asarray(speed, dtype=jnp.result_type(bicycle.rR))
-    zero = jnp.zeros_like(v)
-    return State(jnp.zeros(len(bicycle.coordinates), v.dtype), jnp.stack([zero, -v / bicycle.rR, zero]))
+    wheel = bicycle.speeds.index("rear_wheel_rate")
+    u = jnp.zeros(len(bicycle.speeds), v.dtype).at[wheel].set(-v / bicycle.rR)
+    return State(jnp.zeros(len(bicycle.coordinates), v.dtype), u)
 
 
 class Canonical(eqx.Module):
@@ -45,7 +46,14 @@ def canonical(bicycle: WhippleBicycle) -> Canonical:
 
     -df/dx_dot is linear and -df/dx is quadratic in the speed, so that their values at speeds of -1, 0 and 1 m/s give
     their derivatives with respect to speed without an error. Pitch has no slope in roll and steer when upright.
+
+    **Raises:** `ValueError` for a bicycle with more speeds, whose equations are more than these two.
     """
+    if bicycle.speeds != WhippleBicycle.speeds:
+        raise ValueError(
+            f"canonical: {type(bicycle).__name__} has the speeds {', '.join(bicycle.speeds)}, and no equations in roll "
+            "and steer alone; jaxkane.stability.linearize gives all of them."
+        )
     lateral = np.array([0, 2])  # of (roll, rear wheel, steer), both coordinates and speeds
 
     def stiffness_and_damping(v):

@@ -109,7 +109,9 @@ def family_of(system: System, values: Any, motion: MotionAt, states: Sequence[st
     """Values, (system, value) -> motion, states, and whether the modes have the bicycle's names."""
     is_straight = motion is None and isinstance(system, WhippleBicycle)
     if is_straight:
-        motion, states = straight_ahead, LATERAL if states is None else tuple(states)
+        motion = straight_ahead
+        if system.speeds == WhippleBicycle.speeds:  # one with more has more states that move with these
+            states = LATERAL if states is None else tuple(states)
     if motion is None:
         raise ValueError(
             f"{type(system).__name__} has no family of steady motions by default: give `motion`, a function "

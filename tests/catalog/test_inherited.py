@@ -1,0 +1,238 @@
+"""Classes that inherit from the catalogue's add bodies, loads, coordinates and parameters in a few lines."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane.catalog import CATALOG, WhippleBicycle, read_bicycle_file
+
+RTOL = 1e-11
+
+
+def with_a_passenger(kind):
+    """A particle on a rail of its own that touches nothing: its coordinate stands behind the others, its speed among
+    them, before those that are dependent or auxiliary."""
+
+    class Extended(kind):
+        coordinates = (*kind.coordinates, "extra")
+        speeds = (*kind.speeds, "extra_speed")
+
+        def q_dot(self, t, q, u):
+            own = kind.q_dot(self, t, q, u)
+            return (*tuple(own)[: len(kind.coordinates)], u["extra_speed"])
+
+        def motion(self, t, q, u):
+            motion = kind.motion(self, t, q, u)
+            P = jk.Point.at(u["extra_speed"] * motion.N.x, q["extra"] * motion.N.x)
+            return motion.extended(jk.Body(0.7, 0.0, P, name="passenger"), points={"rail": P})
+
+        def loads(self, t, q, u, motion, inputs):
+            return kind.loads(self, t, q, u, motion, inputs), jk.Force(2.1 * motion.N.x, motion["passenger"])
+
+    return Extended
+
+
+def numbers(vectors):
+    return [np.array(v.to(v.frame.root), float) for v in vectors]
+
+
+@pytest.mark.parametrize("name", CATALOG)
+def test_every_entry_can_be_inherited_from(name):
+    """The parts that were there are those of the entry itself, at the same coordinates and speeds: read by name."""
+    entry, rng = CATALOG[name], np.random.default_rng(0)
+    system = entry.example()
+    kind = type(system)
+    values = {field: getattr(system, field) for field in vars(system)}
+    extended = with_a_passenger(kind)(**values)
+    n = len(kind.speeds)
+    u = [*entry.u, *rng.uniform(0.5, 1.0, len(kind.dependent_speeds) + len(kind.auxiliary_speeds))]
+    inputs = {name: 0.1 * (i + 1) for i, name in enumerate(kind.inputs)}
+    at, beside = (0.3, entry.q, u), (0.3, (*entry.q, 5.0), [*u[:n], 0.25, *u[n:]])
+    here, there = system.motion(*at), extended.motion(*beside)
+    for part in ("center", "angular_velocity"):
+        old, new = ([getattr(b, part) for b in bodies] for bodies in (here.bodies, there.bodies[: len(here.bodies)]))
+        if part == "center":
+            old, new = ([p.velocity for p in points] for points in (old, new))
+        np.testing.assert_allclose(numbers(new), numbers(old), rtol=1e-13, atol=1e-14)
+    old = [float(x) for x in system.q_dot(*at)][: len(kind.coordinates)]
+    np.testing.assert_allclose([float(x) for x in extended.q_dot(*beside)], [*old, 0.25], rtol=1e-13)
+    np.testing.assert_allclose(
+        np.array(there.constraints, float), np.array(here.constraints, float), rtol=1e-13, atol=1e-14
+    )
+    old, new = [
+        np.array(s.configuration_constraints(0.3, q), float) for s, q in ((system, entry.q), (extended, beside[1]))
+    ]
+    np.testing.assert_allclose(new, old, atol=1e-13)
+    loads = [
+        jk._description.bodies.flatten_loads(s.loads(*where, motion, inputs))
+        for s, where, motion in ((system, at, here), (extended, beside, there))
+    ]
+    active = [np.array(numbers([load.vector for load in found])) for found in loads]
+    kept = [
+        row
+        for row, load in zip(active[1], loads[1], strict=True)
+        if getattr(load, "point", None) is None or load.point is not there["passenger"].center
+    ]
+    np.testing.assert_allclose(np.array(kept).reshape(-1, 3), active[0].reshape(-1, 3), rtol=1e-13, atol=1e-13)
+
+
+def test_a_passenger_changes_nothing_else():
+    """The same through the method, of an entry with dependent speeds, and one with auxiliary ones."""
+    for name in ("WhippleBicycle", "BarWithPiston"):
+        entry = CATALOG[name]
+        system = entry.example()
+        extended = with_a_passenger(type(system))(**{field: getattr(system, field) for field in vars(system)})
+        found = jk.accelerations(extended, 0.0, jnp.array([*entry.q, 5.0]), jnp.array([*entry.u, 0.25]))
+        expected = jk.accelerations(system, 0.0, jnp.array(entry.q), jnp.array(entry.u))
+        np.testing.assert_allclose(found[:-1], expected, rtol=RTOL)
+        assert float(found[-1]) == pytest.approx(3.0, rel=RTOL)
+
+
+class Loaded(WhippleBicycle):
+    """A bicycle with a basket on its fork, and a parameter that has a default."""
+
+    load: jk.Scalar = jk.parameter(3.0, positive=True, unit="kg")
+    x_load: jk.Scalar = jk.parameter(0.8, unit="m")
+    z_load: jk.Scalar = jk.parameter(-0.9, unit="m")
+
+    def motion(self, t, q, u):
+        motion = super().motion(t, q, u)
+        fork = motion["fork"]
+        H = fork.frame
+        place = fork.center.fixed((self.x_load - self.xH) * H.x + (self.z_load - self.zH) * H.z)
+        return motion.extended([jk.Body(self.load, 0.0, place, name="basket")])
+
+
+def merged(loaded):
+    """The same bicycle with the basket in its front assembly, by the parallel axis theorem."""
+    m, M = float(loaded.load), float(loaded.mH)
+    x, z = (np.array([float(a), float(b)]) for a, b in ((loaded.xH, loaded.x_load), (loaded.zH, loaded.z_load)))
+    weights = np.array([M, m])
+    xc, zc = weights @ x / (M + m), weights @ z / (M + m)
+    dx, dz = x - xc, z - zc
+    more = {
+        "IHxx": weights @ dz**2,
+        "IHyy": weights @ (dx**2 + dz**2),
+        "IHzz": weights @ dx**2,
+        "IHxz": -weights @ (dx * dz),
+    }
+    values = {name: getattr(loaded, name) for name in vars(WhippleBicycle.benchmark())}
+    values |= {"mH": M + m, "xH": xc, "zH": zc} | {name: values[name] + x for name, x in more.items()}
+    return WhippleBicycle(**values)
+
+
+def test_a_basket_is_part_of_the_front_assembly():
+    q, u = (jnp.array(x) for x in (CATALOG["WhippleBicycle"].q, CATALOG["WhippleBicycle"].u))
+    loaded = Loaded.benchmark()
+    assert isinstance(loaded, Loaded)
+    f = jax.jit(lambda bicycle: jk.accelerations(bicycle, 0.0, q, u, {"steer_torque": 2.0}))
+    np.testing.assert_allclose(f(loaded), f(merged(loaded)), rtol=1e-10)
+
+
+def test_parameters_with_defaults_may_be_left_out(tmp_path):
+    values = {name: float(x) for name, x in vars(WhippleBicycle.benchmark()).items()}
+    del values["g"], values["steer_damping"]
+    assert float(Loaded.from_parameters(values).load) == 3.0
+    assert float(Loaded.from_parameters(values | {"load": 2.0, "IFzz": values["IFxx"]}).load) == 2.0
+    path = tmp_path / "loaded.txt"
+    path.write_text("\n".join(f"{name} = {x!r}" for name, x in (values | {"load": 1.5}).items()))
+    assert float(Loaded.from_file(path).load) == 1.5
+    assert read_bicycle_file(path)[0]["load"] == 1.5
+    with pytest.raises(ValueError, match=r"Loaded takes Meijaard's parameters; missing: mB; unknown: ballast"):
+        Loaded.from_parameters({name: x for name, x in values.items() if name != "mB"} | {"ballast": 1.0})
+
+
+class Leaning(WhippleBicycle):
+    """A bicycle whose rider leans to the side on a hinge along the frame, with a spring and a damper."""
+
+    rider: jk.Scalar = jk.parameter(40.0, positive=True, unit="kg")
+    height: jk.Scalar = jk.parameter(0.4, unit="m")
+    stiffness: jk.Scalar = jk.parameter(1500.0, unit="N m/rad")
+    coordinates = (*WhippleBicycle.coordinates, "lean")
+    speeds = (*WhippleBicycle.speeds, "lean_rate")
+
+    def q_dot(self, t, q, u):
+        return (*super().q_dot(t, q, u), u["lean_rate"])
+
+    def motion(self, t, q, u):
+        motion = super().motion(t, q, u)
+        L = motion["B"].rotate(1, q["lean"], u["lean_rate"], "L")
+        center = motion["rear frame"].center.fixed(-self.height * L.z)
+        return motion.extended([jk.Body(self.rider, 0.0, center, name="torso")], frames={"L": L})
+
+    def loads(self, t, q, u, motion, inputs):
+        B = motion["B"]
+        spring = jk.loads.torsional_spring(motion["L"], B, B.x, q["lean"], self.stiffness)
+        return super().loads(t, q, u, motion, inputs), spring
+
+
+@pytest.fixture(scope="module")
+def leaning():
+    return Leaning.benchmark()
+
+
+def not_leaning(leaning):
+    """The bicycle whose frame and torso are one body, by the parallel axis theorem."""
+    values = {name: getattr(leaning, name) for name in vars(WhippleBicycle.benchmark())}
+    m, M, h = 40.0, 85.0, 0.4
+    more = M * m / (M + m) * h**2
+    values |= {"mB": M + m, "zB": values["zB"] - m * h / (M + m)}
+    return WhippleBicycle(**values | {"IBxx": values["IBxx"] + more, "IByy": values["IByy"] + more})
+
+
+def test_a_rider_who_does_not_lean_is_part_of_the_frame(leaning):
+    """2 T of the four speeds at zero lean: its block of the bicycle's three is that of frame and torso in one; the
+    torso alone has m h^2 about its hinge."""
+    m, h = 40.0, 0.4
+    state = jk.assemble(leaning, {"roll": 0.2, "steer": 0.1}, {"rear_wheel_rate": -15.0, "roll_rate": 0.3})
+    M4, _ = jk.equations_of_motion(leaning, 0.0, state.q, state.u)
+    M3, _ = jk.equations_of_motion(not_leaning(leaning), 0.0, state.q[:-1], state.u[:-1])
+    np.testing.assert_allclose(M4[:3, :3], M3, rtol=1e-9, atol=1e-9)
+    assert float(M4[3, 3]) == pytest.approx(m * h**2, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_stability_of_a_bicycle_with_more_states(leaning):
+    """All that moves is in the model; a stiff rider has the modes of one who is part of the frame, and another."""
+    stiff = dataclasses.replace(leaning, stiffness=1e8)
+    found = jk.stability.eigenvalues(stiff, [4.0])
+    expected = np.sort_complex(jk.stability.eigenvalues(not_leaning(leaning), [4.0]).eigenvalues[0])
+    slow = np.asarray(found.eigenvalues[0])
+    slow = slow[(np.abs(slow) < 100.0) & (np.abs(slow) > 1e-6)]  # without the stiff pair, and that of the speed
+    np.testing.assert_allclose(np.sort_complex(slow), expected, rtol=1e-3)
+    assert set(found.states) == {"roll", "steer", "lean", "roll_rate", "steer_rate", "lean_rate", "rear_wheel_rate"}
+    with pytest.raises(ValueError, match=r"canonical: Leaning has the speeds .*lean_rate, and no equations in roll"):
+        jk.stability.canonical(leaning)
+
+
+# What is added to a motion.
+
+
+def test_a_motion_is_extended_by_parts_of_other_names():
+    N, O = jk.inertial()
+    A = N.rotate(3, 0.1, 0.2, "A")
+    one = jk.Body(1.0, 0.0, O.fixed(1.0 * A.x), name="one")
+    motion = jk.Motion([one], [0.5], points={"P": one.center}, frames={"A": A})
+    B = A.rotate(1, 0.3, 0.4, "B")
+    more = motion.extended(jk.Body(2.0, 0.0, O.fixed(2.0 * B.y), name="two"), 0.25, points={"Q": O}, frames={"B": B})
+    assert [body.name for body in more.bodies] == ["one", "two"]
+    assert more.constraints == (0.5, 0.25)
+    assert (more["P"], more["Q"], more["A"], more["B"]) == (one.center, O, A, B)
+    assert motion.constraints == (0.5,)
+    assert len(motion.bodies) == 1
+    with pytest.raises(ValueError, match="two parts have the name 'one'"):
+        motion.extended([one])
+    with pytest.raises(ValueError, match="there is a point of the name 'P' already"):
+        motion.extended(points={"P": O})
+
+
+def test_a_mechanism_of_joints_keeps_its_own_when_it_is_extended():
+    arm = jk.joints.mechanism([jk.joints.Link("a", joints=jk.joints.hinge("q"), mass=1.0, center=(1, 0, 0))])
+    motion = arm.motion(0.0, [0.3], [0.1])
+    more = motion.extended([jk.Body(1.0, 0.0, motion["a"].center, name="two")])
+    assert type(more) is type(motion)
+    assert more.placed is motion.placed
