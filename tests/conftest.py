@@ -6,6 +6,7 @@ How to run them:
     pytest tests/test_vectors.py  a file or a test, in this process
     JAXKANE_TEST_CACHE=FOLDER     keeps the compiled programs for the next run; by default they go with this one
     JAXKANE_TEST_CACHE=0          keeps none, and leaves XLA as a user has it
+    pytest -m ""                  the slow ones too, and with XLA's optimizations
 """
 
 import contextlib
@@ -43,6 +44,9 @@ def pytest_configure(config):
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
     kept = os.environ[CACHE]
     jk.configure(cache=False if kept == "0" else kept, verbose=False)
+    if kept != "0" and config.option.markexpr == "not slow":
+        # What runs for milliseconds need not be optimized for seconds; native kernels are written as ever.
+        jax.config.update("jax_disable_most_optimizations", True)
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     jax.config.update("jax_numpy_rank_promotion", "raise")
     touched.watch(config)

@@ -31,11 +31,21 @@ MODES = {
 }
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("f", [lambda A: eig(A).values, eigvals], ids=["eig", "eigvals"])
-def test_second_derivatives_have_closed_forms(f, mode):
+WAYS = {"eig": lambda A: eig(A).values, "eigvals": eigvals}
+QUICK = {("eig", "forward over forward"), ("eig", "reverse over reverse"), ("eigvals", "forward over reverse")}
+
+
+@pytest.mark.parametrize(
+    ("way", "mode"),
+    [
+        pytest.param(way, mode, marks=[] if (way, mode) in QUICK else pytest.mark.slow, id=f"{way}-{mode}")
+        for way in WAYS
+        for mode in MODES
+    ],
+)
+def test_second_derivatives_have_closed_forms(way, mode):
     rtol = 1e-11
-    second = jax.jit(MODES[mode](lambda p: largest(f(pair(p)))))
+    second = jax.jit(MODES[mode](lambda p: largest(WAYS[way](pair(p)))))
     oscillating = jax.hessian(lambda p: (-p[0], jnp.sqrt(p[1] - p[0] ** 2)))
     decaying = jax.hessian(lambda p: (-p[0] + jnp.sqrt(p[0] ** 2 - p[1]), 0.0 * p[0]))
     for p, exact in ((jnp.array([0.3, 2.0]), oscillating), (jnp.array([1.5, 0.7]), decaying)):
@@ -53,40 +63,52 @@ def test_third_derivatives_and_vectors_against_differences():
         found = eig(A + p * B + p**2 * C)
         return found.values, found.vectors, found.left, found.condition
 
-    second = jax.jit(jax.jacfwd(jax.jacfwd(lambda p: along(p)[0])))
-    third = jax.jit(jax.jacfwd(jax.jacfwd(jax.jacfwd(lambda p: along(p)[0]))))
+    @jax.jit
+    def found(p):
+        """Of all of them the values and slopes; of the eigenvalues the second and the third derivatives."""
+        second = jax.jacfwd(jax.jacfwd(lambda p: along(p)[0]))
+        twice = lambda f: lambda p: (value := f(p), value)  # noqa: E731
+        return *jax.jacfwd(twice(along), has_aux=True)(p)[::-1], *jax.jacfwd(twice(second), has_aux=True)(p)[::-1]
+
     h = 1e-4
-    differences = (8 * (second(h) - second(-h)) - (second(2 * h) - second(-2 * h))) / (12 * h)
-    np.testing.assert_allclose(third(0.0), differences, rtol=rtol, atol=rtol * np.abs(differences).max())
-    at = jax.jit(along)
-    for x, y in zip(
-        jax.jit(jax.jacfwd(along))(0.0), zip(at(h), at(-h), at(2 * h), at(-2 * h), strict=True), strict=True
-    ):
-        a, b, c, d = y
-        np.testing.assert_allclose(x, (8 * (a - b) - (c - d)) / (12 * h), rtol=rtol, atol=1e-9)
+    _, slopes, _, third = found(0.0)
+    by_differences = jax.tree.map(
+        lambda a, b, c, d: (8 * (a - b) - (c - d)) / (12 * h), *(found(k * h) for k in (1, -1, 2, -2))
+    )
+    for x, y in zip(slopes, by_differences[0], strict=True):
+        np.testing.assert_allclose(x, y, rtol=rtol, atol=1e-9)
+    y = by_differences[2]
+    np.testing.assert_allclose(third, y, rtol=rtol, atol=rtol * np.abs(y).max())
 
 
-def test_one_that_is_separated_does_not_mind_that_others_coalesce():
-    """1, 1 and 3, of which the first two are one defective (or one semisimple) double root."""
+# 1, 1 and 3, of which the first two are one defective, or one semisimple double root
+COALESCING = [jnp.array([[1.0, coupled, 0.2], [0.0, 1.0, 0.3], [0.0, 0.0, 3.0]]) for coupled in (1.0, 0.0)]
+
+
+@pytest.mark.parametrize(
+    "mode", [m if m == "reverse over reverse" else pytest.param(m, marks=pytest.mark.slow) for m in MODES]
+)
+def test_one_that_is_separated_does_not_mind_that_others_coalesce(mode):
     rtol = 1e-11
     B = jnp.array([[0.1, 0.4, 0.2], [0.3, 0.2, -0.5], [0.7, 0.6, 0.5]])
-    second = [jax.jit(mode(lambda p, A: eigvals(A + p * B).real)) for mode in MODES.values()]
-    hessian_of_third = jax.jit(jax.hessian(lambda A: eigvals(A).real[2]))
-    for coupled in (1.0, 0.0):
-        A = jnp.array([[1.0, coupled, 0.2], [0.0, 1.0, 0.3], [0.0, 0.0, 3.0]])
-        for derivative in second:
-            found = derivative(0.0, A)
-            np.testing.assert_array_equal(np.isnan(found), [True, True, False])
-            # lambda'' = 2 y B (lambda - A)^+ B x, the pseudoinverse clear of x and y: by the projection off x y^T
-            values, left, right = map(np.asarray, (eig(A).values.real, eig(A).left.real, eig(A).vectors.real))
-            x, y = right[:, 2], left[:, 2] / (left[:, 2] @ right[:, 2])
-            P = np.eye(3) - np.outer(x, y)
-            S = P @ np.linalg.inv(values[2] * np.eye(3) - np.asarray(A) + np.outer(x, y)) @ P
-            np.testing.assert_allclose(found[2], 2 * y @ B @ S @ B @ x, rtol=rtol)
-        of_third = hessian_of_third(A)
-        assert np.isfinite(of_third).all()  # in reverse mode what is not read says nothing
+    second = jax.jit(MODES[mode](lambda p, A: eigvals(A + p * B).real))
+    for A in COALESCING:
+        found = second(0.0, A)
+        np.testing.assert_array_equal(np.isnan(found), [True, True, False])
+        # lambda'' = 2 y B (lambda - A)^+ B x, the pseudoinverse clear of x and y: by the projection off x y^T
+        values, left, right = map(np.asarray, (eig(A).values.real, eig(A).left.real, eig(A).vectors.real))
+        x, y = right[:, 2], left[:, 2] / (left[:, 2] @ right[:, 2])
+        P = np.eye(3) - np.outer(x, y)
+        S = P @ np.linalg.inv(values[2] * np.eye(3) - np.asarray(A) + np.outer(x, y)) @ P
+        np.testing.assert_allclose(found[2], 2 * y @ B @ S @ B @ x, rtol=rtol)
         assert np.isinf(eig(A).condition[:2]).all()
         assert np.isfinite(eig(A).condition[2])
+
+
+@pytest.mark.slow
+def test_in_reverse_mode_what_is_not_read_says_nothing():
+    hessian_of_third = jax.jit(jax.hessian(lambda A: eigvals(A).real[2]))
+    assert all(np.isfinite(hessian_of_third(A)).all() for A in COALESCING)
 
 
 def test_in_single_precision_and_in_batches_of_none():
@@ -178,7 +200,8 @@ def test_a_critical_value_among_those_given_and_one_beside_none():
     np.testing.assert_allclose(found.values, [-LIMIT], rtol=1e-12)
     with pytest.raises(ValueError, match="there is no steady motion at nan"):
         critical_speeds(Pushed(), jnp.array([-20.0, jnp.nan, 0.0]), at)
-    assert np.isnan(jax.jit(lambda x: critical_speeds(Pushed(), x, at).values)(jnp.array([-20.0, jnp.nan, 0.0]))).all()
+    hidden = jax.jit(lambda x: critical_speeds(Pushed(), x, at).values)
+    assert np.isnan(hidden(jnp.array([-20.0, jnp.nan, 0.0]))).all()
     assert critical_speeds(Pushed(), jnp.zeros(0), at).values.shape == (0,)
 
 

@@ -188,6 +188,7 @@ def test_python_control_gets_the_names_or_is_asked_for(at_four, monkeypatch):
 # -- a turn
 
 
+@pytest.mark.slow
 def test_linear_model_of_a_steady_turn_is_the_return_map():
     """Deviations after 0.5 s on a hands-free turn: expm(A t) against central differences of simulated rides."""
     atol = 1e-6

@@ -5,6 +5,7 @@ import sys
 import types
 
 import cloudpickle
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +16,9 @@ from jaxkane._common.digest import digest
 from jaxkane._method.checks import check_system, configuration_residual
 
 distributed = pytest.importorskip("distributed")
+
+TS = np.linspace(0.0, 1.0, 3)
+STEPS = {"step": 0.5, "solver": diffrax.Midpoint()}  # exact for what falls freely
 
 WEIGHT = """
 import jaxkane as jk
@@ -52,7 +56,7 @@ def client():
 
 def fallen(module, client):
     start, table = jk.State(q=[0.0], u=[0.0]), {"mass": np.linspace(1.0, 2.0, 3)}
-    return jk.sweep.sweep(module.Drop(), start, np.linspace(0.0, 1.0, 3), table=table, client=client)["x"][:, -1]
+    return jk.sweep.sweep(module.Drop(), start, TS, table=table, client=client, **STEPS)["x"][:, -1]
 
 
 def test_a_worker_with_another_global_is_refused(module, client, monkeypatch):

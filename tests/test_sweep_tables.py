@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +14,7 @@ from jaxkane.catalog import DoublePendulum, WhippleBicycle
 PENDULUM = DoublePendulum(mass=1.0, length=1.0)
 REST = jk.State(np.zeros(2), np.zeros(2))
 TS = np.linspace(0.0, 1.0, 6)
+STEPS = {"step": 0.05, "solver": diffrax.Midpoint()}  # enough to compare members
 GRID = jk.sweep.grid(theta1=np.linspace(0.1, 1.0, 12), mass=[1.0, 2.0, 3.0], elbow_torque=[0.0, 0.5])
 
 
@@ -22,7 +24,7 @@ def largest(ride):
 
 @pytest.fixture(scope="module")
 def rides():
-    return jk.sweep.sweep(PENDULUM, REST, TS, table=GRID, chunk=32)
+    return jk.sweep.sweep(PENDULUM, REST, TS, table=GRID, chunk=32, **STEPS)
 
 
 def test_a_grid_has_an_axis_for_every_name(rides):
@@ -37,7 +39,7 @@ def test_a_grid_has_an_axis_for_every_name(rides):
 
 def test_members_of_a_grid_move_as_if_alone(rides):
     state = jk.State(np.array([GRID.axis("theta1")[7], 0.0]), np.zeros(2))
-    alone = jk.simulate(DoublePendulum(mass=3.0, length=1.0), state, TS, {"elbow_torque": 0.5})
+    alone = jk.simulate(DoublePendulum(mass=3.0, length=1.0), state, TS, {"elbow_torque": 0.5}, **STEPS)
     np.testing.assert_allclose(rides.member(7, 2, 1).q, alone.q, atol=1e-12)
     np.testing.assert_allclose(rides["elbow_torque"][7, 2, 1], 0.5)
     with pytest.raises(ValueError, match="3 places"):
@@ -45,7 +47,7 @@ def test_members_of_a_grid_move_as_if_alone(rides):
 
 
 def test_what_reduce_keeps_is_what_it_would_make_of_the_motions(rides):
-    kept = jk.sweep.sweep(PENDULUM, REST, TS, table=GRID, chunk=32, reduce=largest)
+    kept = jk.sweep.sweep(PENDULUM, REST, TS, table=GRID, chunk=32, reduce=largest, **STEPS)
     np.testing.assert_array_equal(kept["largest"], np.abs(rides["theta2"]).max(axis=-1))
     np.testing.assert_array_equal(kept["end"], rides.q[..., -1, :])
     np.testing.assert_array_equal(kept.status, rides.status)
