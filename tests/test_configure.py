@@ -1,8 +1,14 @@
-"""One call at the top of a script: precision, kept programs, devices. Each in a process of its own."""
+"""One call at the top of a script: precision, kept programs, devices. Each in a process of its own.
 
+To import JAX takes longer than most of these scripts: one process does so for all of them, and starts nothing; each
+script runs in a fork of it.
+"""
+
+import json
 import os
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import pytest
 
@@ -10,7 +16,28 @@ from jaxkane._scalars import native
 from jaxkane._scalars.configure import _split_cpu, _store_programs
 
 KERNELS = f"no native kernels ({native.why_not()})" if native.why_not() else "native kernels"
-HEAD = "import jaxkane as jk, numpy as np, jax\n"
+CLEAN = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "EQX_", "XLA_"))}
+FORKS = """
+import json, os, sys, traceback, warnings
+import jaxkane as jk, numpy as np, jax
+
+warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)  # no thread of JAX has been started
+for line in sys.stdin:
+    case = json.loads(line)
+    if not (child := os.fork()):
+        status = 0
+        for descriptor, file in enumerate(case["files"], start=1):
+            os.dup2(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_TRUNC), descriptor)
+        try:
+            exec(case["code"], {"__name__": "__main__", "jk": jk, "np": np, "jax": jax})
+        except BaseException:
+            traceback.print_exc()
+            status = 1
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+"""
 RIDE = """
 hits, misses = [], []
 jax.monitoring.register_event_listener(
@@ -18,8 +45,8 @@ jax.monitoring.register_event_listener(
                         ).append(event))
 P = jk.catalog.DoublePendulum(mass=1.0, length=1.0)
 start = jk.State(np.array([0.5, -0.2]), np.zeros(2))
-ride = jk.simulate(P, start, np.linspace(0.0, 1.0, 6))
-rides = jk.sweep.sweep(P, start, np.linspace(0.0, 1.0, 6), table={"length": [1.0, 2.0, np.nan]})
+ride = jk.simulate(P, start, np.linspace(0.0, 1.0, 6), step=0.1)
+rides = jk.sweep.sweep(P, start, np.linspace(0.0, 1.0, 6), table={"length": [1.0, 2.0, np.nan]}, step=0.1)
 assert rides.reason == ["completed", "completed", "invalid"]
 print(len(hits), len(misses), ride.q.dtype, np.asarray(ride.q).tobytes().hex(), rides.q.tobytes().hex())
 """
@@ -29,10 +56,20 @@ def refused(message, f, *args):
     with pytest.raises(ValueError, match=message):
         f(*args)
 ts = np.linspace(0.0, 1.0, 6)
-bicycle = jk.catalog.WhippleBicycle.benchmark()
-refused("violate the configuration constraints", jk.simulate, bicycle,
-        jk.State(np.array([0, 0, 0, 0, 0.3, 0, 0, 0]), np.zeros(3)), ts)
-refused("no pitch satisfies", jk.assemble, bicycle, {"roll": 1.5, "steer": 1.5}, {})
+class Ring(jk.System):
+    coordinates = ("x", "y")
+    speeds = ("v",)
+    dependent_coordinates = ("y",)
+    def q_dot(self, t, q, u):
+        return -q[1] * u[0], q[0] * u[0]
+    def configuration_constraints(self, t, q):
+        return [q[0] ** 2 + q[1] ** 2 - 1.0]
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(q[0] * N.x + q[1] * N.y, -q[1] * u[0] * N.x + q[0] * u[0] * N.y)
+        return jk.Motion([jk.Body(1.0, 0.0, P)])
+refused("violate the configuration constraints", jk.simulate, Ring(), jk.State(np.array([0.3, 0.3]), np.zeros(1)), ts)
+refused("no y satisfies", jk.assemble, Ring(), {"x": 1.5}, {})
 class Light(jk.System):
     mass: jk.Scalar = jk.parameter(0.0)
     coordinates = ("x",)
@@ -44,13 +81,21 @@ refused("Light", jk.simulate, Light(), jk.State(np.zeros(1), np.zeros(1)), ts)
 """
 
 
-def python(code, *, status=0, env=None):
-    clean = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "EQX_", "XLA_"))}
-    run = subprocess.run(
-        [sys.executable, "-c", HEAD + code], env=clean | (env or {}), capture_output=True, text=True, timeout=120
-    )
-    assert run.returncode == status, run.stderr
-    return run
+@pytest.fixture(scope="module")
+def python(tmp_path_factory):
+    files = [tmp_path_factory.mktemp("streams") / name for name in ("stdout", "stderr")]
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "bufsize": 1}
+    with subprocess.Popen([sys.executable, "-c", FORKS], env=CLEAN, **pipes) as forks:
+
+        def run(code, *, status=0):
+            print(json.dumps({"code": code, "files": [*map(str, files)]}), file=forks.stdin)
+            told = forks.stdout.readline().strip()
+            stdout, stderr = (file.read_text() for file in files)
+            assert told == str(status), stderr
+            return SimpleNamespace(stdout=stdout, stderr=stderr)
+
+        yield run
+        forks.stdin.close()
 
 
 @pytest.fixture(scope="module")
@@ -59,7 +104,7 @@ def cache(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def first(cache):
+def first(cache, python):
     return python(f"jk.configure(cache={str(cache)!r})\n" + RIDE).stdout.splitlines()
 
 
@@ -69,7 +114,7 @@ def test_it_says_what_it_did(first, cache):
     assert first[2].startswith("  numerical checks inside programs give NaN")
 
 
-def test_programs_of_simulations_are_kept_for_the_next_process(first, cache):
+def test_programs_of_simulations_are_kept_for_the_next_process(first, cache, python):
     assert {"jit_solve", "jit__solve"} <= {path.name.rsplit("-", 2)[0] for path in cache.iterdir()}
     hits, misses, dtype, *bytes_of_first = first[-1].split()
     assert int(misses) > 10
@@ -81,11 +126,11 @@ def test_programs_of_simulations_are_kept_for_the_next_process(first, cache):
     assert len(second) == 1  # and nothing else was printed
 
 
-def test_errors_are_errors_with_a_cache(cache):
+def test_errors_are_errors_with_a_cache(cache, python):
     python(f"jk.configure(cache={str(cache)!r}, verbose=False)\n" + REFUSALS)
 
 
-def test_child_processes_inherit_it_and_nothing_is_said_twice(cache):
+def test_child_processes_inherit_it_and_nothing_is_said_twice(cache, python):
     code = (
         f"import os, subprocess, sys\nfor _ in range(2): jk.configure(cache={str(cache)!r}, devices=3)\n"
         "print(len(jax.local_devices()))\n"
@@ -97,7 +142,7 @@ def test_child_processes_inherit_it_and_nothing_is_said_twice(cache):
     assert lines[3:] == ["3", f"True {cache} nan"]
 
 
-def test_without_a_cache_nothing_but_the_precision_changes():
+def test_without_a_cache_nothing_but_the_precision_changes(python):
     code = (
         "print(jk.configure(cache=False, native=False))\nimport equinox._errors as e\n"
         "print(e.EQX_ON_ERROR, jax.numpy.ones(1).dtype)"
@@ -109,7 +154,7 @@ def test_without_a_cache_nothing_but_the_precision_changes():
     ]
 
 
-def test_it_warns_when_it_comes_too_late_and_refuses_no_devices():
+def test_it_warns_when_it_comes_too_late_and_refuses_no_devices(python):
     code = (
         "x = jax.numpy.ones(3)\nimport warnings\nwith warnings.catch_warnings(record=True) as told:\n"
         "    warnings.simplefilter('always')\n    jk.configure(cache=False, devices=2, verbose=False)\n"
@@ -123,7 +168,7 @@ def test_it_warns_when_it_comes_too_late_and_refuses_no_devices():
     assert "ValueError: `devices` is a number of CPU devices" in run.stderr
 
 
-def test_without_llvm_xla_does_the_work_and_says_so():
+def test_without_llvm_xla_does_the_work_and_says_so(python):
     code = (
         "import sys, warnings\nsys.modules['llvmlite'] = sys.modules['llvmlite.binding'] = None\n"
         "warnings.simplefilter('error')\njk.configure(cache=False)\n"
@@ -138,7 +183,8 @@ def test_without_llvm_xla_does_the_work_and_says_so():
 
 
 def test_the_environment_may_switch_native_kernels_off():
-    assert "switched off" in python("jk.configure(cache=False)", env={"JAXKANE_NATIVE": "0"}).stdout
+    code = [sys.executable, "-c", "import jaxkane\njaxkane.configure(cache=False)"]
+    assert b"switched off" in subprocess.check_output(code, env=CLEAN | {"JAXKANE_NATIVE": "0"})
 
 
 @pytest.mark.parametrize("devices", ["2", True, 2.5, 0])

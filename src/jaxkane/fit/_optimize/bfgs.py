@@ -97,7 +97,7 @@ class BFGS(Optimizer):
 @compiled
 def _begun(model, windows, by_trial, solver, origin, unit, y):
     f = _of_round_unknowns(half_cost(model, windows, by_trial), origin, unit)
-    return solver.init(f, y, None, {}, *jax.eval_shape(f, y, None), frozenset())
+    return _of_strong_types(solver.init(f, y, None, {}, *jax.eval_shape(f, y, None), frozenset()))
 
 
 @compiled
@@ -106,7 +106,12 @@ def _step(model, windows, by_trial, solver, memory):
     y, state, _ = solver.step(f, memory.y, None, {}, memory.of_optimistix, frozenset())
     done, result = solver.terminate(f, y, None, {}, state, frozenset())
     success = result == optx.RESULTS.successful
-    return Memory(memory.origin, memory.unit, y, state, done | ~success, success)
+    return _of_strong_types(Memory(memory.origin, memory.unit, y, state, done | ~success, success))
+
+
+def _of_strong_types(memory):
+    """As it comes back from a file, so that a fit that goes on does not compile its step anew."""
+    return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype) if eqx.is_array(x) else x, memory)
 
 
 def _of_round_unknowns(f, origin, unit):
