@@ -145,7 +145,15 @@ def test_derivatives_in_every_argument_both_modes_and_twice(name):
     def f(x):
         return weights @ jk.accelerations(*unflatten(x))
 
-    forward, reverse = jax.jit(jax.jacfwd(f))(flat), jax.jit(jax.grad(f))(flat)
+    d = jnp.cos(jnp.arange(flat.size))
+
+    @jax.jit
+    def derivatives(x):
+        """Forward and reverse; and twice, along one direction: forward over reverse, reverse over forward."""
+        reverse, second = jax.jvp(jax.grad(f), (x,), (d,))
+        return jax.jacfwd(f)(x), reverse, second, jax.grad(lambda x: jax.jvp(f, (x,), (d,))[1])(x)
+
+    forward, reverse, second, other = derivatives(flat)
     h = 1e-5
     values = jax.jit(jax.vmap(lambda step: f(flat + step)))
     steps = h * jnp.eye(flat.size)
@@ -153,13 +161,8 @@ def test_derivatives_in_every_argument_both_modes_and_twice(name):
     scale = float(jnp.abs(differences).max())
     np.testing.assert_allclose(forward, differences, atol=rtol * scale)
     np.testing.assert_allclose(reverse, forward, atol=1e-12 * scale)
-    # twice, along one direction: forward over reverse, reverse over forward
-    d = jnp.cos(jnp.arange(flat.size))
-    second = jax.jit(lambda x: jax.jvp(jax.grad(f), (x,), (d,))[1])(flat)
-    other = jax.jit(jax.grad(lambda x: jax.jvp(f, (x,), (d,))[1]))(flat)
     np.testing.assert_allclose(second, other, atol=1e-11 * float(jnp.abs(second).max()))
-    gradient = jax.jit(jax.grad(f))
-    numeric = (gradient(flat + h * d) - gradient(flat - h * d)) / (2 * h)
+    numeric = (derivatives(flat + h * d)[1] - derivatives(flat - h * d)[1]) / (2 * h)
     np.testing.assert_allclose(second, numeric, atol=1e-5 * float(jnp.abs(second).max()))
 
 
@@ -227,6 +230,6 @@ def test_more_than_three_dependent_speeds_and_a_long_chain_use_lapack():
     np.testing.assert_allclose(M, left * np.cos(difference), atol=1e-13)
     expected = -(left * np.sin(difference)) @ np.asarray(u) ** 2 - 9.81 * (n - r) * np.sin(q)
     np.testing.assert_allclose(f, expected, atol=1e-12)
-    gradient = jax.jit(jax.grad(lambda q: jk.accelerations(chain, 0.0, q, u).sum()))(q)
-    forward = jax.jit(jax.jacfwd(lambda q: jk.accelerations(chain, 0.0, q, u).sum()))(q)
+    total = lambda q: jk.accelerations(chain, 0.0, q, u).sum()  # noqa: E731
+    gradient, forward = jax.jit(lambda q: (jax.grad(total)(q), jax.jacfwd(total)(q)))(q)
     np.testing.assert_allclose(gradient, forward, rtol=1e-9)
