@@ -141,7 +141,9 @@ def beyond():
     return Problem.of(guess, pushed, Free("stiffness", bounds=(None, None)), simulation=Simulation(step=0.05))
 
 
-@pytest.mark.parametrize("method", [LeastSquares(), GradientDescent(), BFGS()], ids=lambda m: m.name)
+@pytest.mark.parametrize(
+    "method", [LeastSquares(), GradientDescent(), pytest.param(BFGS(), marks=pytest.mark.slow)], ids=lambda m: m.name
+)
 def test_no_method_converges_where_nothing_can_be_simulated(beyond, method):
     found = minimize(beyond, method)
     assert found.status in ("stuck", "steps"), found
