@@ -1,7 +1,8 @@
-"""Whether the tests that are not marked `slow` call every module of the library.
+"""Whether the tests that were run call every module of the library.
 
-`pytest` runs those alone, and so does CI with the lowest versions. On Python 3.12 or later it looks at it, at no cost,
-and fails if slow tests alone call a module, or none: mark other tests, or add a cheap one.
+`pytest` leaves out the slow ones, and so does CI with the lowest versions. On Python 3.12 or later it looks at it, at no
+cost, and fails if slow tests alone call a module, or none: mark other tests, or add a cheap one. Under `pytest -m ""` all
+tests count, since a program that a slow one has compiled is not traced again by those that follow.
 """
 
 import ast
@@ -29,19 +30,20 @@ def modules_with_functions():
 
 
 class Touched:
-    """Listens for the first call of every function of the library while a test runs that is not slow."""
+    """Listens for the first call of every function of the library while a test runs."""
 
     def __init__(self, config):
-        self.config, self.files, self.counts, self.ask_again, self.missing = config, set(), False, False, []
+        self.config, self.files, self.missing = config, set(), []
+        self.in_a_test, self.ask_again = False, False
         sys.monitoring.use_tool_id(TOOL, "jaxkane's tests")
         sys.monitoring.register_callback(TOOL, sys.monitoring.events.PY_START, self._started)
         sys.monitoring.set_events(TOOL, sys.monitoring.events.PY_START)
 
     def _started(self, code, _):
-        """The first call of a function; there is no second, whatever a slow test does."""
+        """The first call of a function; there is no second, unless that was between tests."""
         file = code.co_filename
         if file not in self.files and file.startswith(PREFIX):
-            if self.counts:
+            if self.in_a_test:
                 self.files.add(file)
             else:
                 self.ask_again = True
@@ -49,14 +51,14 @@ class Touched:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_protocol(self, item):
-        self.counts = item.get_closest_marker("slow") is None
-        if self.counts and self.ask_again:
+        self.in_a_test = True
+        if self.ask_again:
             self.ask_again = False
             sys.monitoring.restart_events()
         try:
             return (yield)
         finally:
-            self.counts = False
+            self.in_a_test = False
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_testnodedown(self, node):
@@ -73,9 +75,9 @@ class Touched:
                 session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
     def pytest_terminal_summary(self, terminalreporter):
+        tests = "test" if self.config.option.markexpr == "" else "test that is not marked slow"
         for path in self.missing:
-            name = Path(path).relative_to(SOURCE)
-            terminalreporter.write_line(f"no test that is not marked slow calls {name}", red=True)
+            terminalreporter.write_line(f"no {tests} calls {Path(path).relative_to(SOURCE)}", red=True)
 
 
 def watch(config):
