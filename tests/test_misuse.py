@@ -100,7 +100,11 @@ def test_names_and_units_set_on_a_class_are_checked():
         ({"angle": None}, TypeError, r"got 'angle': None"),
         ({3: "rad"}, TypeError, r"got 3: 'rad'"),
         (["angle"], TypeError, r"is a dict of texts by name.*got \['angle'\]"),
-        ({"angel": "rad"}, ValueError, r"names what is no coordinate, speed, input or state: angel; did you mean 'angle'"),
+        (
+            {"angel": "rad"},
+            ValueError,
+            r"names what is no coordinate, speed, input or state: angel; did you mean 'angle'",
+        ),
     ],
 )
 def test_units_are_texts_of_names_that_there_are(units, error, match):

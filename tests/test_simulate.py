@@ -401,3 +401,12 @@ def test_a_step_that_ends_beside_a_sample():
     by_scipy = solve_ivp(motion, (0.0, 2.5), [0.1, 0.0], t_eval=ts, rtol=1e-9, atol=1e-9, max_step=0.05).y
     np.testing.assert_allclose(sampled.q[:, 0], by_scipy[0], atol=1e-6)
     assert sampled.stats["accepted"] < 4 * len(ts)
+
+
+def test_a_motion_that_ends_at_a_sample_with_others_behind_it():
+    """The last step ended a rounding error before that sample, which then was never reached: NaN, and "completed"."""
+    ts, start = jnp.linspace(0.0, 2.5, 51), jk.State(jnp.array([0.1]), jnp.zeros(1))
+    torque = {"torque": jk.Samples(ts, 3.0 * jnp.sin(2.0 * ts))}
+    whole = jk.simulate(Pendulum(), start, ts, inputs=torque)
+    part = jk.simulate(Pendulum(), start, ts[:3], inputs=torque)
+    np.testing.assert_allclose(part.q, whole.q[:3], atol=1e-8)

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 
 class ToKinks(diffrax.AbstractAdaptiveStepSizeController[Any, Any]):
-    """A controller whose steps do not run over `times` (n,), in rising order.
+    """A controller whose steps do not run over those of `times` (n,), in rising order, that come before `end`.
 
     A step over a kink would be of first order, whatever the solver. What is left before a kink is gone in one step, or
     in two halves, so that no step is as short as a rounding error: after that, `dtmin` would end the solution.
@@ -27,8 +27,10 @@ class ToKinks(diffrax.AbstractAdaptiveStepSizeController[Any, Any]):
     times: Float[Array, " n"]
     anew: bool = eqx.field(static=True)
 
-    def __init__(self, controller: Any, times: Float[Array, " n"], anew: bool = False):
-        self.controller, self.times, self.anew = controller, times, anew
+    def __init__(self, controller: Any, times: Float[Array, " n"], anew: bool = False, end: Any = jnp.inf):
+        self.controller, self.anew = controller, anew
+        # A step that ends beside a kink at the end would leave the end out.
+        self.times = jnp.where(times < end - _rounding(times), times, jnp.inf)
 
     @property
     def rtol(self) -> Any:  # type: ignore[override]
@@ -61,7 +63,7 @@ class ToKinks(diffrax.AbstractAdaptiveStepSizeController[Any, Any]):
     @property
     def _here(self) -> Array:
         """A kink as near as a rounding error is where a step starts."""
-        return 64 * jnp.finfo(self.times.dtype).eps * jnp.max(jnp.abs(jax.lax.stop_gradient(self.times)))
+        return _rounding(self.times)
 
     def _end(self, t0: Any, t1: Any) -> Any:
         t1 = jax.lax.stop_gradient(t1)
@@ -69,3 +71,9 @@ class ToKinks(diffrax.AbstractAdaptiveStepSizeController[Any, Any]):
         kink = jnp.where(i < len(self.times), self.times[jnp.minimum(i, len(self.times) - 1)], jnp.inf)
         halfway = jax.lax.stop_gradient(t0 + 0.5 * (kink - t0))
         return jnp.where(t1 >= kink, kink - 0.25 * self._here, jnp.minimum(t1, halfway))
+
+
+def _rounding(times: Array) -> Array:
+    """How near to one of these times rounding errors keep another."""
+    times = jax.lax.stop_gradient(times)
+    return 64 * jnp.finfo(times.dtype).eps * jnp.max(jnp.where(jnp.isfinite(times), jnp.abs(times), 0.0))

@@ -52,14 +52,19 @@ class Now(eqx.Module):
 
 
 @compiled
-def solve(system: System, state: State, ts: Array, signals: Any, settings: Settings) -> Trajectory:
-    """`simulate` without its checks: one compiled program."""
+def solve(
+    system: System, state: State, ts: Array, signals: Any, settings: Settings, disturbance: Any = None
+) -> Trajectory:
+    """`simulate` without its checks: one compiled program.
+
+    `disturbance`: of t, inputs and state, gives the inputs as disturbed, and a `State` of what is added to its rates.
+    """
     signals = with_own_times(signals)
     if settings.step is not None:
         refuse_held(settings.solver, signals)
         signals = for_fixed_steps(signals)
-    origin = (system, state, ts, signals)
-    valid = _is_valid(*origin)
+    origin = (system, state, ts, signals, disturbance)
+    valid = _is_valid(system, state, ts, signals)
     # What is not finite must not enter the solver, where it would spoil the gradient of what is shared.
     system, state = jax.tree.map(
         lambda x: jnp.where(valid, x, jnp.ones_like(x)) if eqx.is_inexact_array(x) else x, (system, state)
@@ -69,8 +74,14 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
     constrained = has_configuration_constraints(system, ts[0], state.q)
 
     def vector_field(t, y, args):
-        system, signals = args
-        y_dot = rates(system, t, y.q, y.u, values_of(system, y.x, inputs_at(system, signals, t, y)))
+        system, signals, disturbance = args
+        inputs = inputs_at(system, signals, t, y)
+        if disturbance is None:
+            y_dot = rates(system, t, y.q, y.u, values_of(system, y.x, inputs))
+        else:
+            inputs, more = disturbance(t, inputs, y)
+            y_dot = rates(system, t, y.q, y.u, values_of(system, y.x, inputs))
+            y_dot = jax.tree.map(jnp.add, y_dot, more)
         if constrained and settings.stabilize:
             y_dot = State(y_dot.q + settings.stabilize * correction(system, t, y.q), y_dot.u, y_dot.x)
         return jax.tree.map(lambda rate: jnp.where(valid, rate, jnp.zeros_like(rate)), y_dot)
@@ -92,7 +103,7 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
         ts[-1],
         step,
         state,
-        (system, signals),
+        (system, signals, disturbance),
         saveat=diffrax.SaveAt(subs=(diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)), controller_state=stops),
         stepsize_controller=controller,
         adjoint=settings.adjoint,
@@ -111,7 +122,7 @@ def solve(system: System, state: State, ts: Array, signals: Any, settings: Setti
     if events.names:
         happened = status >= Status.EVENT
         beside = jax.tree.map(lambda x, first: jnp.where(happened, x, first), (t_end, end), (ts[0], state))
-        moving = lambda t, y: vector_field(t, y, (system, signals))  # noqa: E731
+        moving = lambda t, y: vector_field(t, y, (system, signals, disturbance))  # noqa: E731
         found = at_zero(system, beside[0], beside[1], jnp.maximum(which, 0), happened, moving, 4 * reach)
         t_end, end = jax.tree.map(lambda x, y: jnp.where(happened, x, y), (found.t, found.state), (t_end, end))
         smooth |= happened & found.smooth
@@ -176,7 +187,7 @@ def _steps(ts: Array, signals: Any, settings: Settings) -> tuple[Any, Any, Array
     step = jnp.minimum(whole / 1000, jax.lax.stop_gradient(ts[1] - ts[0]))
     controller = diffrax.PIDController(rtol=settings.rtol, atol=settings.atol, dtmin=rounding, force_dtmin=False)
     kinks = sample_times(signals, ts.dtype)
-    return step, controller if kinks is None else ToKinks(controller, *kinks), reach
+    return step, controller if kinks is None else ToKinks(controller, *kinks, end=ts[-1]), reach
 
 
 def _to_stops(controller: Any, vector_field: Any, events: Events, system: System, ts: Array, reach: Array) -> ToStops:

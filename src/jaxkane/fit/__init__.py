@@ -14,6 +14,8 @@ from ._analysis.multistart import multi_start as multi_start
 from ._analysis.profile import Profile as Profile
 from ._analysis.profile import profile as profile
 from ._analysis.signs import contrary_signs as contrary_signs
+from ._analysis.smoothed import Smoothed as Smoothed
+from ._analysis.smoothed import smoothed as smoothed
 from ._data.read import read_trials as read_trials
 from ._data.trial import Trial as Trial
 from ._fit import fit as fit
@@ -32,6 +34,8 @@ from ._problem.parameters import Delay as Delay
 from ._problem.parameters import Free as Free
 from ._problem.parameters import Gain as Gain
 from ._problem.parameters import Inertia as Inertia
+from ._problem.parameters import Intensity as Intensity
+from ._problem.parameters import Sigma as Sigma
 from ._problem.problem import Problem as Problem
 from ._problem.simulation import Simulation as Simulation
 from ._report.report import report as report

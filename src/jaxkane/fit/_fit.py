@@ -37,6 +37,7 @@ def fit(
     hold: Sequence[str] = (),
     window: float | None = None,
     continuity: Mapping[str, float] | None = None,
+    noise: Mapping[str, float] | None = None,
     processes: bool = False,
     simulation: Simulation | None = None,
     optimizer: Optimizer | None = None,
@@ -69,6 +70,11 @@ def fit(
     - `continuity`: by name, the standard deviation of the jump from a window's end to the next one's start, for what is
         `unknown`; names left out jump freely. Small ones ask for one motion through all windows; with windows as short
         as the samples they are a process noise, and the sum of squares is that of a Kalman filter's prediction errors.
+    - `noise`: by name, intensities of the white noise that disturbs independent speeds and states [unit^2/s] and inputs
+        [unit^2 s]. The motion is then a random one, the cost is minus twice the log likelihood by an extended Kalman
+        filter, and `Intensity` and `Sigma` in `free` have intensities and the sensors' deviations found. {} for no
+        noise but the sensors'. `unknown` starts with a deviation are what the filter begins with, those without are
+        found; `window` is not needed, since the filter follows an unstable motion too.
     - `processes`: let all processes of `jax.distributed` simulate together. Each is started with the same script,
         calls `jax.distributed.initialize(...)` before anything else, and this with all trials; each simulates a share
         of the windows, all take the same steps and return the same `Fit`, that of one process alone.
@@ -95,6 +101,7 @@ def fit(
         hold=hold,
         window=window,
         continuity=continuity,
+        noise=noise,
         simulation=simulation,
         processes=processes,
     )

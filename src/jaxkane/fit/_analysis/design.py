@@ -123,6 +123,8 @@ def design(
         raise ValueError(f"`criterion` is 'D' or 'A', got {criterion!r}.")
     places = np.array([names.index(name) for name in about or names])
     plan = _Plan(t, inputs, dict(rms or {}), dict(sigma), initial)
+    if options.get("noise") is not None:
+        raise ValueError("design: `noise` is no option, since an experiment is planned for a motion without noise.")
     problem = Problem.of(system, plan.trial(coefficients), free, **options)
     if problem.model.settings.step is None:
         raise ValueError("`inputs` must vary in time where the search starts, or give `Simulation(step=...)`.")

@@ -122,5 +122,6 @@ def costs_by_trial(problem: Problem, point: Unknowns) -> np.ndarray:
     windows = eqx.tree_at(lambda w: w.very_first, problem.windows, jnp.zeros_like(problem.windows.very_first))
     problem = dataclasses.replace(problem, windows=windows)
     _, at = solve_nuisance(problem, point, rtol=1e-5)
-    costs = np.sum(np.asarray(at.blocks.R)[:, :, -1] ** 2, axis=1)
+    value = at.seen.value
+    costs = np.sum(np.asarray(at.blocks.R)[:, :, -1] ** 2, axis=1) if value is None else np.asarray(value)
     return np.bincount(np.asarray(problem.windows.trial), costs, minlength=len(problem.trials))

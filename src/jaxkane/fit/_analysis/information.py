@@ -75,10 +75,10 @@ def _information(
 
     def of_window(arguments):
         window, z, b, start, start_dot = arguments
-        r, J, (simulated, _) = jacobian_of(model, window, start, start_dot, z, b, point.x)
+        r, J, seen = jacobian_of(model, window, start, start_dot, z, b, point.x)
         links = by_next(model, window, r.shape[0])[:, :n_next]
         J = jnp.column_stack([J[:, :n_z], links, J[:, n_z:]])  # by [z, z_next, b, x]
-        return J.T @ J, simulated
+        return J.T @ J, seen.simulated
 
     N, simulated = each(of_window, (windows, point.z, point.b[windows.trial], starts, starts_dot))
     # What a window and those before it say about [z_next, b, x] is known of [z, b, x] in the next.

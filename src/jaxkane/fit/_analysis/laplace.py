@@ -63,7 +63,7 @@ def laplace(fit: Fit) -> Laplace:
             f"These data do not determine {', '.join(undetermined)}: give a prior, or leave something out."
         )
     eliminated = eliminate(fit.linearization.blocks, 0.0)
-    to_gain = fit.cost - float(eliminated.step(1e-9)[1])
+    to_gain = fit.linearization.squares - float(eliminated.step(1e-9)[1])
     if fit.status == "applied" or not to_gain < 0.1:
         raise ValueError(
             f"This is no minimum ({fit.status}): a step would lower the sum of squares by {to_gain:.3g}. Go on with "
@@ -79,6 +79,8 @@ def laplace(fit: Fit) -> Laplace:
 
 def log_likelihood(problem: Problem, cost: float) -> float:
     """-cost/2 with the constants of the measurements' densities, so that they integrate to one."""
+    if problem.model.noise is not None:
+        return -0.5 * cost
     weight = np.asarray(problem.windows.weight, float)
     return -0.5 * cost + float(np.sum(np.log(weight[weight > 0]) - 0.5 * LOG_2PI))
 

@@ -88,7 +88,8 @@ class BFGS(Optimizer):
         at = linearize(problem, best.point) if best.at is None else best.at
         if at is None or not usable(at):
             return best, status
-        if status == "converged" and at.cost - float(eliminate(at.blocks, 0.0).step(1e-9)[1]) > 0.01 * at.cost:
+        to_gain = at.squares - float(eliminate(at.blocks, 0.0).step(1e-9)[1])
+        if status == "converged" and to_gain > 0.01 * at.squares:
             # Steps also become short before what cannot be simulated: no minimum while others would lower the cost.
             status = "stuck"
         return dataclasses.replace(best, cost=at.cost, at=at), status

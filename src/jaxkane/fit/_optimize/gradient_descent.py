@@ -90,7 +90,7 @@ class GradientDescent(Optimizer):
             return "converged"
         directions, unit, gradient = memory.directions, memory.unit, _gradient(eliminated)
         if taken == 0 or (self.refresh and taken % self.refresh == 0):
-            directions = _directions(eliminated, at.cost / problem.size[0] if self.refresh else None)
+            directions = _directions(eliminated, at.squares / problem.size[0] if self.refresh else None)
         unit = unit if unit > 0 else jnp.linalg.norm(directions.T @ gradient)
         step, y, of_optax = _descend(self.transform)(directions, unit, gradient, memory.of_optax, memory.y)
         after = _guarded(problem, now.point, at, step, eliminated)
@@ -137,7 +137,7 @@ def _directions(eliminated: Eliminated, variance: float | None) -> Array:
 
 def _is_minimum(at: Linearization, eliminated: Eliminated, rtol: float) -> bool:
     """Whether the linearized problem promises to lower the cost by less than `rtol` of it."""
-    return at.cost - float(eliminated.step(1e-9)[1]) <= max(rtol * at.cost, 1e-12)
+    return at.squares - float(eliminated.step(1e-9)[1]) <= max(rtol * at.squares, 1e-12)
 
 
 def _guarded(problem: Problem, point: Unknowns, at: Linearization, step: Array, eliminated: Eliminated):
@@ -145,7 +145,7 @@ def _guarded(problem: Problem, point: Unknowns, at: Linearization, step: Array, 
     for _ in range(12):
         tried = moved(point, step, eliminated)
         there = linearize(problem, tried)
-        if there is not None and usable(there) and there.cost <= 4 * at.cost:
+        if there is not None and usable(there) and there.cost <= at.cost + 3 * at.squares:
             return tried, there
         step = step / 2
         # The nuisance values' own step may be what fails.

@@ -64,9 +64,9 @@ class LeastSquares(Optimizer):
         assert at is not None
         eliminated = eliminate(at.blocks, damping)
         x, promised = eliminated.step(damping)
-        gain = at.cost - float(promised)
+        gain = at.squares - float(promised)
         # What is left of a cost that vanishes is rounding: a millionth of a standard error.
-        if gain <= max(self.rtol * at.cost, 1e-12) and damping <= 1e-2:
+        if gain <= max(self.rtol * at.squares, 1e-12) and damping <= 1e-2:
             return "converged"
         tried = moved(now.point, x, eliminated)
         there = linearize(problem, tried)

@@ -93,9 +93,9 @@ def _nuisance_steps(problem: Problem, point: Unknowns, at: Linearization, steps:
         if there is not None and usable(there) and there.cost <= at.cost:
             gained = at.cost - there.cost
             point, at, damping = tried, there, damping / 10
-            if gained <= rtol * at.cost:
+            if gained <= rtol * at.squares:
                 break
-        elif there is not None and usable(there) and there.cost <= at.cost * (1 + 1e-9):
+        elif there is not None and usable(there) and there.cost <= at.cost + 1e-9 * at.squares:
             break
         else:
             damping = max(10 * damping, 1e-2)

@@ -14,7 +14,7 @@ from .problem import Problem, refuse_other
 
 
 def half_cost(model: Model, windows: Windows, by_trial: Array) -> Callable[[Unknowns], Array]:
-    """Half a problem's sum of squares as a function of `Unknowns` that JAX can differentiate, once, in either mode.
+    """Half a problem's cost as a function of `Unknowns` that JAX can differentiate, once, in either mode.
 
     The derivatives are those of `linearize`: forward through the simulation, a few directions a window, which is
     cheaper than one reverse pass and needs none of its memory.
@@ -22,17 +22,18 @@ def half_cost(model: Model, windows: Windows, by_trial: Array) -> Callable[[Unkn
 
     @jax.custom_jvp
     def f(point: Unknowns) -> Array:
-        return linearized(point).cost / 2
+        return linearized(point)[1] / 2
 
     def linearized(point: Unknowns):
-        return blocks_of(model, windows, by_trial, point, *starts_of(model, windows, point))[0]
+        blocks, seen = blocks_of(model, windows, by_trial, point, *starts_of(model, windows, point))
+        return blocks, blocks.cost if seen.value is None else jnp.sum(seen.value)
 
     @f.defjvp
     def f_jvp(primals, tangents):
-        blocks, (direction,) = linearized(*primals), tangents
+        (blocks, cost), (direction,) = linearized(*primals), tangents
         z, b, x = blocks.gradient
         slope = jnp.sum(z * direction.z) + jnp.sum(b * direction.b) + jnp.sum(x * direction.x)
-        return blocks.cost / 2, slope
+        return cost / 2, slope
 
     return f
 
@@ -40,11 +41,11 @@ def half_cost(model: Model, windows: Windows, by_trial: Array) -> Callable[[Unkn
 def log_density(problem: Problem, *, over: str = "values") -> Callable[[Unknowns], Array]:
     """The logarithm of the posterior density, up to a constant, as a function of `Unknowns`.
 
-        log p = -1/2 sum of squares + log |det d values / d x|
+        log p = -1/2 cost + log |det d values / d x|
 
     `Unknowns` are unconstrained numbers only, so a sampler may go anywhere: parameters stay inside their bounds, and
-    bodies possible. Priors are among the residuals; `sigma` is taken as it was given. It may be differentiated once, in
-    either mode (`jax.grad`, `jax.jvp`).
+    bodies possible. Priors are part of the cost; `sigma` is taken as it was given, unless a factor of it is free. It
+    may be differentiated once, in either mode (`jax.grad`, `jax.jvp`).
 
         density = log_density(fit.problem)
         blackjax.nuts(density, ...)                                       # starts from fit.point

@@ -14,7 +14,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..._description.system import State, System
 from ..._method.assembly import assemble
@@ -23,8 +23,10 @@ from ..._simulation.ride import solve
 from ..._simulation.settings import Settings
 from ..._simulation.signals import Samples, with_one_times
 from ..._simulation.trajectory import Trajectory
-from .._data.windows import Windows, state_names
+from .._data.windows import Windows, joined, parts_of, state_names
 from .blocks import Blocks
+from .filtered import Filtered, filtered, information_of, minus_twice_log_likelihood
+from .noise import Noise
 from .parameters import Parameters
 
 
@@ -73,10 +75,24 @@ class Ramps(eqx.Module):
         return self.values[0] + jnp.sum(done * jnp.diff(self.values))
 
 
+class Seen(eqx.Module):
+    """What the model says of every window: `simulated` (W, n_c, n_t), with process noise predicted from what was
+    measured before; `status` (W,). With process noise only: `deviation` (W, n_c, n_t) of what is predicted, `value`
+    (W,), minus twice the log likelihood, and `unknowns` (W, n_b), what is unknown of the trial as it was found."""
+
+    simulated: Float[Array, "W n_c n_t"]
+    status: Int[Array, " W"]
+    deviation: Float[Array, "W n_c n_t"] | None = None
+    value: Float[Array, " W"] | None = None
+    unknowns: Float[Array, "W n_b"] | None = None
+
+
 class Model(eqx.Module):
     """A system, its free parameters, what else is unknown, and how measurements are compared with simulations.
 
-    residual = (gain * simulated + bias - measured) / sigma
+        residual = (gain * simulated + bias - measured) / sigma
+
+    With process noise (`noise`), a window is a trial, and `filtered` says what its measurements tell.
     """
 
     system: System
@@ -87,6 +103,14 @@ class Model(eqx.Module):
     driven: tuple[str, ...] = eqx.field(static=True)  # inputs of which there are samples
     held: tuple[str, ...] = eqx.field(static=True)
     assembled: tuple[str, ...] | None = eqx.field(static=True)  # coordinates that `assemble` moves, if not its own
+    noise: Noise | None = None
+
+    @property
+    def moved(self) -> tuple[int, ...]:
+        """The places of the coordinates that `assemble` moves."""
+        names = self.system.coordinates
+        chosen = self.system.dependent_coordinates or names if self.assembled is None else self.assembled
+        return tuple(i for i, name in enumerate(names) if name in chosen)
 
     @property
     def unknown_places(self) -> np.ndarray:
@@ -97,14 +121,22 @@ class Model(eqx.Module):
     def consistent(self, window: Windows, z: Array, x: Array) -> Array:
         """The start (n_q + n_u + n_x,) of one window, its dependent coordinates found by `assemble`."""
         system, _ = self.parameters.apply(self.system, x)
+        if self.noise is not None:  # a start with a deviation is no unknown of a filter, but what it begins with
+            z = jnp.where(jnp.isfinite(self.nuisance.start_deviation), 0.0, z)
         start = window.start.at[self.unknown_places].add(z)
-        state = assemble(system, *_parts(system, start), t=window.t[0], free=self.assembled)
+        state = assemble(system, *parts_of(system, start), t=window.t[0], free=self.assembled)
         return joined(state.q, state.u, state.x)
 
     def simulate(self, window: Windows, start: Array, b: Array, x: Array) -> Trajectory:
         """One window's motion."""
         system, roles = self.parameters.apply(self.system, x)
-        signals: dict[str, Any] = {}
+        settings = self.settings if self.settings.step is None else dataclasses.replace(self.settings, step=window.step)
+        signals = with_one_times(self.signals(window, b, roles))
+        return solve(system, State(*parts_of(system, start)), window.t, signals, settings)
+
+    def signals(self, window: Windows, b: Array, roles: dict[tuple[str, str], Array]) -> dict[str, Any]:
+        """The inputs of one window by name."""
+        system, signals = self.system, {}
         for i, name in enumerate(system.inputs):
             bias = self.nuisance.of_trial(b, "bias of input", name, 0.0)
             if name in self.driven:
@@ -116,8 +148,7 @@ class Model(eqx.Module):
                     signals[name] = Samples(times, values, hold=name in self.held)
             elif ("bias of input", name) in self.nuisance.trial:
                 signals[name] = bias
-        settings = self.settings if self.settings.step is None else dataclasses.replace(self.settings, step=window.step)
-        return solve(system, State(*_parts(system, start)), window.t, with_one_times(signals), settings)
+        return signals
 
     def _times_of(self, name: str, window: Windows, b: Array, roles: dict[tuple[str, str], Array]) -> Array:
         """When an input's samples act (n_in,) [s]: the same array for all that have no delay, since kinks that are
@@ -137,29 +168,24 @@ class Model(eqx.Module):
 
     def residuals(self, window: Windows, start: Array, z: Array, b: Array, x: Array) -> tuple[Array, Any]:
         """Residuals of one window, priors included (m,), in which the next window starts where it is first thought to;
-        and what was simulated (n_c, n_t), with the simulation's status."""
+        and what was seen."""
         ride = self.simulate(window, start, b, x)
         simulated, n = self.simulated(ride, b), self.nuisance
         difference = jnp.where(window.weight > 0, (simulated - window.measured) * window.weight, 0.0)
         end = joined(ride.q[-1], ride.u[-1], ride.x[-1])
         jump = jnp.where(window.linked > 0, (end - window.next_start)[self.unknown_places] / n.jump, 0.0)
+        rows = [difference.ravel(), *([jump] if n.chained else []), self.priors(window, z, b, x)]
+        return jnp.concatenate(rows), Seen(simulated, ride.status)
+
+    def priors(self, window: Windows, z: Array, b: Array, x: Array) -> Array:
+        """Of starts, a trial's unknowns and the parameters, each divided by its standard deviation."""
+        n = self.nuisance
         # A prior of infinite width is a row of zeros. A trial's prior is counted in its first window, and so is that of
         # a start from which all else follows.
         of_start = jnp.where(window.first, z / n.start_deviation, 0.0) if n.chained else z / n.start_deviation
         of_trial = jnp.where(window.first, b / n.trial_deviation, 0.0)
         of_all = jnp.where(window.very_first, self.parameters.prior_residuals(x), 0.0)
-        rows = [difference.ravel(), *([jump] if n.chained else []), of_start, of_trial, of_all]
-        return jnp.concatenate(rows), (simulated, ride.status)
-
-
-def _parts(system: System, start: Array) -> list[Array]:
-    """q, u and, where there are states of the first order, x of a start (n,)."""
-    n_q, n = len(system.coordinates), len(system.coordinates) + len(system.speeds)
-    return [start[:n_q], start[n_q:n], *([start[n:]] if system.states else [])]
-
-
-def joined(q: Array, u: Array, x: Array | None) -> Array:
-    return jnp.concatenate([q, u] if x is None else [q, u, x])
+        return jnp.concatenate([of_start, of_trial, of_all])
 
 
 @compiled
@@ -178,7 +204,7 @@ def starts_of(model: Model, windows: Windows, point: Unknowns) -> tuple[Array, A
 
 
 def jacobian_of(model: Model, window: Windows, start: Array, start_dot: Array, z: Array, b: Array, x: Array):
-    """Residuals (m,) of a window, their derivatives (m, n_z + n_b + p), what was simulated and its status."""
+    """Residuals (m,) of a window, their derivatives (m, n_z + n_b + p), and what was seen."""
     n_z, n_b = z.shape[0], b.shape[0]
     unit = jnp.eye(n_z + n_b + x.shape[0], dtype=z.dtype)
     directions = (start_dot.T, unit[:, :n_z], unit[:, n_z : n_z + n_b], unit[:, n_z + n_b :])
@@ -191,14 +217,20 @@ def jacobian_of(model: Model, window: Windows, start: Array, start_dot: Array, z
 
 
 @compiled
-def blocks_of(model: Model, windows: Windows, by_trial: Array, point: Unknowns, starts: Array, starts_dot: Array):
-    """Blocks, what was simulated (W, n_c, n_t) and the status of every window (W,)."""
+def blocks_of(
+    model: Model, windows: Windows, by_trial: Array, point: Unknowns, starts: Array, starts_dot: Array
+) -> tuple[Blocks, Seen]:
+    """Blocks, and what was seen of every window."""
     n_z, n_b = point.z.shape[1], point.b.shape[1]
     n_next = n_z if model.nuisance.chained else 0
 
     def window_block(arguments):
         window, z, z_next, b, start, start_dot = arguments
-        r, J, more = jacobian_of(model, window, start, start_dot, z, b, point.x)
+        if model.noise is None:
+            r, J, more = jacobian_of(model, window, start, start_dot, z, b, point.x)
+        else:
+            J, r, value, found = information_of(model, window, start, start_dot, z, b, point.x)
+            more = _seen_by_filter(found, value)
         links = by_next(model, window, r.shape[0])[:, :n_next]
         A = jnp.column_stack([J[:, :n_z], links, J[:, n_z:], r + links @ z_next[:n_next]])
         # The triangle says all that the (m, k) matrix says about least squares. QR of NaN is not everywhere NaN.
@@ -206,20 +238,25 @@ def blocks_of(model: Model, windows: Windows, by_trial: Array, point: Unknowns, 
         A = jnp.concatenate([jnp.where(bad, 0.0, A), jnp.zeros((A.shape[1], A.shape[1]), A.dtype)])
         return jnp.where(bad, jnp.nan, jnp.linalg.qr(A, mode="r")), more
 
-    R, (simulated, status) = each(window_block, _arguments(windows, point, starts, starts_dot))
-    return Blocks(R, by_trial, n_z, n_next, n_b), simulated, status
+    R, seen = each(window_block, _arguments(windows, point, starts, starts_dot))
+    return Blocks(R, by_trial, n_z, n_next, n_b), seen
 
 
 @compiled
-def costs_of(model: Model, windows: Windows, point: Unknowns, starts: Array) -> tuple[Array, Array]:
-    """Sums of squares (W,), and what was simulated (W, n_c, n_t): `blocks_of` without derivatives."""
+def costs_of(model: Model, windows: Windows, point: Unknowns, starts: Array) -> tuple[Array, Seen]:
+    """Costs (W,), and what was seen: `blocks_of` without derivatives."""
 
     def window_cost(arguments):
         window, z, z_next, b, start = arguments
-        r, (simulated, _) = model.residuals(window, start, z, b, point.x)
+        if model.noise is not None:
+            found = filtered(model, window, start, b, point.x)
+            priors = model.priors(window, z, b, point.x)
+            value = minus_twice_log_likelihood(found, window) + jnp.sum(priors**2)
+            return value, _seen_by_filter(found, value)
+        r, seen = model.residuals(window, start, z, b, point.x)
         if model.nuisance.chained:
             r = r + by_next(model, window, r.shape[0]) @ z_next
-        return jnp.sum(r**2), simulated
+        return jnp.sum(r**2), seen
 
     return each(window_cost, _arguments(windows, point, starts))
 
@@ -228,6 +265,10 @@ def costs_of(model: Model, windows: Windows, point: Unknowns, starts: Array) -> 
 def rides_of(model: Model, windows: Windows, point: Unknowns, starts: Array) -> Trajectory:
     """The motion of every window, stacked."""
     return each(lambda now: model.simulate(now[0], now[4], now[3], point.x), _arguments(windows, point, starts))
+
+
+def _seen_by_filter(found: Filtered, value: Array) -> Seen:
+    return Seen(found.predicted, found.status, found.deviation, value, found.unknowns)
 
 
 def _arguments(windows: Windows, point: Unknowns, *more: Array) -> tuple[Any, ...]:

@@ -19,24 +19,24 @@ from jaxtyping import Array
 from ..._scalars.jax_internals import process_allgather
 from .._data.windows import Windows
 from .blocks import Blocks
-from .model import Model, Unknowns, blocks_of, costs_of
+from .model import Model, Seen, Unknowns, blocks_of, costs_of
 
 
 def blocks_of_all(
     model: Model, windows: Windows, by_trial: Array, point: Unknowns, starts: Array, starts_dot: Array
-) -> tuple[Blocks, Array, Array]:
+) -> tuple[Blocks, Seen]:
     """`blocks_of`, by all processes together."""
 
     def own(windows, point, starts, starts_dot):
-        blocks, simulated, status = blocks_of(model, windows, by_trial, point, starts, starts_dot)
-        return blocks.R, simulated, status
+        blocks, seen = blocks_of(model, windows, by_trial, point, starts, starts_dot)
+        return blocks.R, seen
 
-    R, simulated, status = _by_all(own, windows, point, starts, starts_dot)
+    R, seen = _by_all(own, windows, point, starts, starts_dot)
     n_z, n_b = point.z.shape[1], point.b.shape[1]
-    return Blocks(R, by_trial, n_z, n_z if model.nuisance.chained else 0, n_b), simulated, status
+    return Blocks(R, by_trial, n_z, n_z if model.nuisance.chained else 0, n_b), seen
 
 
-def costs_of_all(model: Model, windows: Windows, point: Unknowns, starts: Array) -> tuple[Array, Array]:
+def costs_of_all(model: Model, windows: Windows, point: Unknowns, starts: Array) -> tuple[Array, Seen]:
     """`costs_of`, by all processes together."""
     return _by_all(lambda *share: costs_of(model, *share), windows, point, starts)
 

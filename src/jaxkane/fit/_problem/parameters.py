@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from ..._common.lookup import hint
 from ..._description.parameters import declared, leaf_name
 from ..._description.system import System
+from ..._description.units import unit_of, units_of
 from .bijections import Interval, PossibleBody
 
 Prior = tuple[float, float]
@@ -86,6 +87,40 @@ class Delay:
 
 
 @dataclasses.dataclass(frozen=True)
+class Intensity:
+    """The intensity of the process noise of a speed, a state or an input, common to all trials: see `noise` in `fit`.
+
+    `of`: the name of an independent speed or a state, [unit^2/s], or of an input, [unit^2 s], that stands in `noise`.
+    `start`: by default what stands there. It stays positive; the rest as in `Free`.
+    """
+
+    of: str
+    start: float | None = None
+    bounds: tuple[float | None, float | None] | None = None
+    scale: float | None = None
+    prior: Prior | None = None
+    name: str | None = None
+    unit: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class Sigma:
+    """The factor by which `Trial.sigma` of a channel is to be multiplied, common to all trials, in a fit with `noise`.
+
+    `channel`: its name. Where `sigma` was given as 1, the factor is the standard deviation in the channel's unit. It
+    stays positive; the rest as in `Free`.
+    """
+
+    channel: str
+    start: float = 1.0
+    bounds: tuple[float | None, float | None] | None = None
+    scale: float | None = None
+    prior: Prior | None = None
+    name: str | None = None
+    unit: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
 class Inertia:
     """A rigid body's inertia, and with it mass and mass centre, that stays what a body can have.
 
@@ -120,7 +155,7 @@ class _Entry:
     name: str
     unit: str
     targets: tuple[tuple[int, int, float], ...] = ()
-    role: tuple[str, str] | None = None  # ("gain" or "delay", input)
+    role: tuple[str, str] | None = None  # ("gain" or "delay", input), ("intensity", disturbed), ("sigma", channel)
 
 
 class Parameters(eqx.Module):
@@ -168,7 +203,7 @@ class Parameters(eqx.Module):
         return split(x, np.cumsum(self.sizes)[:-1])
 
     def apply(self, system: System, x: Float[Array, " p"]) -> tuple[System, dict[tuple[str, str], Array]]:
-        """The system with these parameters, and gains and delays by ("gain", input)."""
+        """The system with these parameters, and by ("gain", input) gains, delays, intensities and factors of sigma."""
         leaves, structure = jax.tree.flatten(system)
         roles = {}
         values = self.values(x)
@@ -210,17 +245,25 @@ def _checked_prior(name: str, prior: Any) -> Prior:
     return float(prior[0]), float(prior[1])
 
 
-def parameters_of(system: System, free: Sequence[Any] | Any) -> Parameters:
-    """The free parameters of a system.
+def parameters_of(
+    system: System,
+    free: Sequence[Any] | Any,
+    noise: Mapping[str, float] | None = None,
+    channels: Sequence[str] = (),
+) -> Parameters:
+    """The free parameters of a system, and of its process noise and sensors.
 
-    **Raises:** `ValueError` that names a parameter or input that does not exist, is named twice, starts outside its
-    bounds, or as a body that cannot be.
+    **Raises:** `ValueError` that names a parameter, input, disturbed speed or channel that does not exist, is named
+    twice, starts outside its bounds, or as a body that cannot be.
     """
-    free = [free] if isinstance(free, (str, Free, Gain, Delay, Inertia)) or callable(free) else list(free)
+    alone = (str, Free, Gain, Delay, Inertia, Intensity, Sigma)
+    free = [free] if isinstance(free, alone) or callable(free) else list(free)
     parts: list[tuple[list[_Entry], Any, list[float], list[float], list[Prior | None]]] = []
     for item in free:
         if isinstance(item, (Gain, Delay)):
             parts.append(_of_input(system, item))
+        elif isinstance(item, (Intensity, Sigma)):
+            parts.append(_of_noise(system, item, noise, channels))
         elif isinstance(item, Inertia):
             parts.append(_of_body(system, item))
         else:
@@ -257,6 +300,31 @@ def _of_input(system: System, item: Gain | Delay):
     return _scalar(entry, item, item.start, positive=False)
 
 
+def _of_noise(system: System, item: Intensity | Sigma, noise: Mapping[str, float] | None, channels: Sequence[str]):
+    kind = type(item).__name__.lower()
+    what, of = (item.of, noise or {}) if isinstance(item, Intensity) else (item.channel, channels)
+    if noise is None:
+        raise ValueError(
+            f"{type(item).__name__}({what!r}) is estimated by its likelihood, and this is a fit of least squares: give "
+            "`noise`, the intensities of what disturbs the motion by name, or {} where nothing does."
+        )
+    if what not in of:
+        where = "`noise`" if isinstance(item, Intensity) else "the measured channels"
+        raise ValueError(f"{type(item).__name__}({what!r}): {hint(what, tuple(of), f'{where} has')}")
+    start = float(noise[what] if item.start is None else item.start)
+    if not 0 < start < math.inf:
+        raise ValueError(f"{kind} of {what} starts at {start}: it is searched for among positive numbers.")
+    if item.bounds is not None:
+        lower, upper = item.bounds
+        if lower is not None and lower < 0:
+            raise ValueError(f"{kind} of {what}: nothing below zero is possible, got the bounds {item.bounds}.")
+        item = dataclasses.replace(item, bounds=(lower or 0.0, upper))
+    known = unit_of(what, units_of(system)) if kind == "intensity" else ""
+    unit = (f"({known})^2 s" if what in system.inputs else f"({known})^2/s") if known else ""
+    entry = _Entry(item.name or f"{kind} of {what}", item.unit or unit, role=(kind, what))
+    return _scalar(entry, item, start, positive=True)
+
+
 def _of_leaves(system: System, item: Free):
     chosen, leaves = _find(system, item.where)
     followers = [follower for name, factor in item.tied.items() for follower in _followers(system, name, factor)]
@@ -286,7 +354,7 @@ def _followers(system: System, name: str, factor: float) -> list[tuple[int, int,
     return [(i, place, float(factor)) for i in chosen for place in range(leaves[i][1].size)]
 
 
-def _scalar(entry: _Entry, item: Free | Gain | Delay, start: float, positive: bool):
+def _scalar(entry: _Entry, item: Free | Gain | Delay | Intensity | Sigma, start: float, positive: bool):
     name = entry.name
     lower, upper = _checked_bounds(name, item.bounds, positive)
     if not math.isfinite(start):

@@ -18,8 +18,9 @@ from ..._simulation.trajectory import Trajectory
 from .._data.trial import Trial
 from .._data.windows import Place, Windows, cut
 from .blocks import Blocks
-from .model import Model, Unknowns, blocks_of, costs_of, rides_of, starts_of
+from .model import Model, Seen, Unknowns, blocks_of, costs_of, rides_of, starts_of
 from .names import Names, checked_trials, held_and_delayed, nuisance_of, starts_found
+from .noise import noise_of
 from .parallel import blocks_of_all, check_same, costs_of_all
 from .parameters import Parameters, Prior, parameters_of
 from .simulation import Simulation
@@ -66,6 +67,7 @@ class Problem:
         hold: Sequence[str] = (),
         window: float | None = None,
         continuity: Mapping[str, float] | None = None,
+        noise: Mapping[str, float] | None = None,
         simulation: Simulation | None = None,
         processes: bool = False,
     ) -> Problem:
@@ -76,11 +78,12 @@ class Problem:
         trials = (trials,) if isinstance(trials, Trial) else tuple(trials)
         channels = checked_trials(system, trials)
         _check_windows(window, continuity)
+        of_noise = noise_of(system, noise, window, continuity)
         driven = tuple(name for name in system.inputs if any(name in trial.inputs for trial in trials))
         nuisance = nuisance_of(system, channels, driven, posed)
         held, delayed = held_and_delayed(system, hold, free, nuisance)
         assembled, guess = starts_found(system, trials, nuisance.start)
-        parameters = parameters_of(system, free).with_priors(priors or {})
+        parameters = parameters_of(system, free, noise, channels).with_priors(priors or {})
         options = {"chained": nuisance.chained, "delayed": bool(delayed), "guess": guess}
         windows, places = cut(system, trials, window, channels, **options)
         check_system(system, windows.t[0, 0], jnp.nan_to_num(windows.start[0, : len(system.coordinates)]))
@@ -89,11 +92,12 @@ class Problem:
             system=system,
             parameters=parameters,
             nuisance=nuisance,
-            settings=simulation.settings(windows.t[0], varying),
+            settings=simulation.settings(windows.t[0], varying or of_noise is not None),
             channels=channels,
             driven=driven,
             held=held,
             assembled=assembled,
+            noise=of_noise,
         )
         if simulation.step is not None:  # one step in all windows; none is longer than they, so that it can be halved
             step = jnp.minimum(simulation.step, windows.t[:, -1] - windows.t[:, 0])
@@ -104,9 +108,19 @@ class Problem:
         return problem.finer(problem.start) if problem.chooses_steps else problem
 
     @property
+    def cost_name(self) -> str:
+        """For tables."""
+        return "sum of squares" if self.model.noise is None else "-2 log likelihood"
+
+    @property
     def chooses_steps(self) -> bool:
         """Whether fixed steps of integration are halved until they are fine enough: nobody has given any."""
-        return self.model.settings.step is not None and self.posed["simulation"].step is None
+        return self._steps and self.posed["simulation"].step is None
+
+    @property
+    def _steps(self) -> bool:
+        """Whether something follows from fixed steps: the motion, or what noise adds to it."""
+        return self.model.settings.step is not None or self.model.noise is not None
 
     def finer(self, point: Unknowns) -> Problem:
         """With steps halved where that changes what is simulated at a point by more than a share of the noise.
@@ -129,7 +143,7 @@ class Problem:
                 break
             problem = problem.with_steps(jnp.where(jnp.asarray(going), half, problem.windows.step))
             before, last = np.where(going[:, None, None], after, before), apart
-        lost = ~np.all(np.isfinite(np.where(np.asarray(self.windows.weight) > 0, before, 0.0)), axis=(1, 2))
+        lost = ~np.all(np.isfinite(np.where(self._weight_of(before) > 0, before, 0.0)), axis=(1, 2))
         return problem.with_steps(jnp.where(jnp.asarray(lost), first, problem.windows.step))
 
     @property
@@ -142,9 +156,9 @@ class Problem:
         """By how much halving the step moves all residuals of every window (W,) together, in standard deviations; NaN
         where a window is not simulated to its end, or where the step follows from tolerances.
 
-        `now` (W, n_c, n_t): what is simulated at the point, where that is known.
+        `now`: what is simulated at the point, where that is known.
         """
-        if self.model.settings.step is None:
+        if not self._steps:
             return np.full(len(self.places), np.nan)
         now = simulated(self, point) if now is None else now
         return self._apart(now, simulated(self.with_steps(self.windows.step / 2), point))
@@ -156,11 +170,16 @@ class Problem:
     def _apart(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """The norm (W,) of a difference of simulations, in standard deviations; infinite where one of the two ended
         earlier, NaN where both did."""
-        weight = np.asarray(self.windows.weight)
+        weight = self._weight_of(a)
         lost = [np.any((weight > 0) & ~np.isfinite(x), axis=(1, 2)) for x in (a, b)]
         with np.errstate(invalid="ignore"):
             moved = np.linalg.norm(np.where(weight > 0, (b - a) * weight, 0.0), axis=(1, 2))
         return np.where(lost[0] & lost[1], np.nan, np.where(lost[0] | lost[1], np.inf, moved))
+
+    def _weight_of(self, simulated: np.ndarray) -> np.ndarray:
+        """One over the standard deviations of what `simulated` gives."""
+        weight = np.asarray(self.windows.weight)
+        return np.tile(weight, (1, simulated.shape[1] // weight.shape[1], 1))
 
     @property
     def system(self) -> System:
@@ -287,15 +306,31 @@ def refuse_other(given: Any, wanted: type, name: str, instead: str) -> None:
 
 
 class Linearization(eqx.Module):
-    """A problem at a point: its blocks, what was simulated (W, n_c, n_t) and the status of every window (W,)."""
+    """A problem at a point: its blocks, and what was seen of every window."""
 
     blocks: Blocks
-    simulated: Array
-    status: Array
+    seen: Seen
+
+    @property
+    def simulated(self) -> Array:
+        """(W, n_c, n_t)."""
+        return self.seen.simulated
+
+    @property
+    def status(self) -> Array:
+        """Of every window (W,)."""
+        return self.seen.status
 
     @property
     def cost(self) -> float:
-        """Sum of squares; NaN or infinite where a window could not be simulated."""
+        """Sum of squares, with process noise minus twice the log likelihood; NaN or infinite where a window could not
+        be simulated."""
+        return float(self.blocks.cost if self.seen.value is None else jnp.sum(self.seen.value))
+
+    @property
+    def squares(self) -> float:
+        """The rows' sum of squares: what relative tolerances refer to, and what promises are counted from. It is the
+        cost, but with process noise about twice the number of measurements, where the cost may have any sign."""
         return float(self.blocks.cost)
 
     @property
@@ -314,7 +349,8 @@ def linearize(problem: Problem, point: Unknowns) -> Linearization | None:
 
 
 def cost(problem: Problem, point: Unknowns) -> float:
-    """Sum of squares, without derivatives; NaN or infinite where a window could not be simulated."""
+    """Sum of squares, with process noise minus twice the log likelihood, without derivatives; NaN or infinite where a
+    window could not be simulated."""
     found = _starts(problem, point)
     if found is None:
         return float("nan")
@@ -322,14 +358,22 @@ def cost(problem: Problem, point: Unknowns) -> float:
 
 
 def simulated(problem: Problem, point: Unknowns) -> np.ndarray:
-    """What the sensors would have said (W, n_c, n_t); NaN where that cannot be simulated."""
+    """What the sensors would have said (W, n_c, n_t), with process noise followed by its deviations (W, 2 n_c, n_t);
+    NaN where that cannot be simulated."""
     found = _starts(problem, point)
     if found is None:
-        return np.full(problem.windows.measured.shape, np.nan)
-    return np.asarray(_costs(problem, point, found[0])[1])
+        several = 1 if problem.model.noise is None else 2
+        return np.full(np.tile(problem.windows.measured, (1, several, 1)).shape, np.nan)
+    return all_of(_costs(problem, point, found[0])[1])
 
 
-def _costs(problem: Problem, point: Unknowns, starts: Array) -> tuple[Array, Array]:
+def all_of(seen: Seen) -> np.ndarray:
+    """What `simulated` gives, of what was seen."""
+    parts = [x for x in (seen.simulated, seen.deviation) if x is not None]
+    return np.concatenate(parts, axis=1)
+
+
+def _costs(problem: Problem, point: Unknowns, starts: Array) -> tuple[Array, Seen]:
     return (costs_of_all if problem.processes else costs_of)(problem.model, problem.windows, point, starts)
 
 

@@ -15,6 +15,7 @@ import numpy as np
 from ..._common.digest import digest
 from ..._common.whole_file import write_whole
 from ..._description.parameters import leaf_name
+from .filtered import filtered
 from .problem import Problem
 
 
@@ -69,7 +70,10 @@ def described(problem: Problem) -> dict[str, Any]:
 
     def residuals(numbers, window, z, b, x):
         model = eqx.combine(numbers, rest)
-        return model.residuals(window, model.consistent(window, z, x), z, b, x)[0]
+        start = model.consistent(window, z, x)
+        if model.noise is not None:
+            return filtered(model, window, start, b, x)[:2], model.priors(window, z, b, x)
+        return model.residuals(window, start, z, b, x)[0]
 
     return {
         "system": type(problem.system).__name__,
@@ -77,6 +81,7 @@ def described(problem: Problem) -> dict[str, Any]:
         "unknown starts": ", ".join(model.nuisance.start) or "none",
         "unknowns of trials": ", ".join(" ".join(pair) for pair in model.nuisance.trial) or "none",
         "channels": ", ".join(model.channels),
+        "process noise": ", ".join(model.noise.names) or "zero" if model.noise is not None else "none",
         "windows": len(problem.places),
         "rtol": settings.rtol,
         "atol": settings.atol,

@@ -57,11 +57,13 @@ def draw_history(fit: Fit) -> Any:
     """The cost by step."""
     figure = _figure(6, 2.4)
     ax = figure.subplots()
-    ax.semilogy(fit.history, "o-", markersize=3)
-    n_r, n_unknown = fit.problem.size
-    ax.axhline(n_r - n_unknown, color="0.6", linestyle="--", linewidth=1)
-    ax.annotate("sigma alone", (0, n_r - n_unknown), color="0.4", va="bottom", fontsize="small")
-    ax.set(xlabel="step", ylabel="sum of squares")
+    ax.plot(fit.history, "o-", markersize=3)
+    ax.set(xlabel="step", ylabel=fit.problem.cost_name)
+    if fit.problem.model.noise is None:
+        n_r, n_unknown = fit.problem.size
+        ax.set_yscale("log")
+        ax.axhline(n_r - n_unknown, color="0.6", linestyle="--", linewidth=1)
+        ax.annotate("sigma alone", (0, n_r - n_unknown), color="0.4", va="bottom", fontsize="small")
     ax.grid(alpha=0.3)
     return figure
 
@@ -115,7 +117,7 @@ def draw_profiles(fit: Fit, profiles: Sequence[Profile]) -> Any:
         ax.plot(profile.values, fit.cost + fit.variance * ((profile.values - best) / error) ** 2, "--", color="0.6")
         for end in profile.interval:
             ax.axvline(end, color="C3", linewidth=1)
-        ax.set(xlabel=profile.name, ylabel="sum of squares")
+        ax.set(xlabel=profile.name, ylabel=fit.problem.cost_name)
     for ax in axes[len(profiles) :]:
         ax.remove()
     return figure

@@ -120,10 +120,13 @@ def _parameters(fit: Fit, truth: Any) -> tuple[Row, Sequence[Row]]:
 
 
 def _ending(fit: Fit) -> str:
-    return (
-        f"Sum of squares {fit.history[0]:.6g} → {fit.cost:.6g} by {fit.method} in {len(fit.history) - 1} steps: "
-        f"{STATUS[fit.status]}. Variance of a residual: {fit.variance:.3g} (one where sigma and the model are right)."
-    )
+    name = fit.problem.cost_name
+    how = f"by {fit.method} in {len(fit.history) - 1} steps: {STATUS[fit.status]}."
+    if fit.problem.model.noise is None:
+        size = f"Variance of a residual: {fit.variance:.3g} (one where sigma and the model are right)."
+    else:
+        size = f"Mean square of the normalized innovations: {fit.innovation:.3g} (one where the noise is right)."
+    return f"{name[0].upper()}{name[1:]} {fit.history[0]:.6g} → {fit.cost:.6g} {how} {size}"
 
 
 def _how_sure(fit: Fit) -> str:

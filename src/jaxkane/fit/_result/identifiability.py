@@ -76,7 +76,10 @@ class Identifiability:
 
 
 def residual_variance(problem: Problem, cost: float) -> float:
-    """The sum of squares by residuals less unknowns; NaN where there are no more residuals than unknowns."""
+    """The sum of squares by residuals less unknowns; NaN where there are no more residuals than unknowns. One with
+    process noise, whose likelihood knows how large residuals are."""
+    if problem.model.noise is not None:
+        return 1.0
     n_r, n_unknown = problem.size
     return cost / (n_r - n_unknown) if n_r > n_unknown else float("nan")
 

@@ -23,6 +23,7 @@ def notes_of(fit: Fit) -> tuple[str, ...]:
         *fit.identifiability.messages,
         *trade_offs(fit),
         *coloured_residuals(fit),
+        *wrong_noise(fit),
         *no_freedom(fit),
         *coarse_steps(fit),
         *impossible_bodies(fit),
@@ -94,6 +95,19 @@ def coloured_residuals(fit: Fit) -> list[str]:
     return [
         f"The residuals are not noise: neighbours correlate by {lag:.2f}. The formal standard errors are too "
         f"small by a factor of about {((1 + lag) / max(1 - lag, 0.01)) ** 0.5:.1f}; compare `clustered_errors`."
+    ]
+
+
+def wrong_noise(fit: Fit) -> list[str]:
+    """Innovations of another size than the noise that they are judged by: the standard errors are as wrong."""
+    if fit.problem.model.noise is None:
+        return []
+    n = sum(int(np.isfinite(r).sum()) for channels in fit.residuals.values() for r in channels.values())
+    if not abs(fit.innovation - 1) > 4 * (2 / n) ** 0.5:
+        return []
+    return [
+        f"The innovations have the mean square {fit.innovation:.2f}, where the noise as it was given says one: the "
+        "standard errors are wrong. Have intensities and `sigma` found: Intensity(...), Sigma(...) among `free`."
     ]
 
 
@@ -183,8 +197,11 @@ def only_priors(fit: Fit) -> list[str]:
 def far_from_start(fit: Fit) -> list[str]:
     """Estimates that left what the user thought plausible by far, and are still called precise."""
     notes = []
+    of_noise = {e.name for e in fit.parameters.entries if e.role and e.role[0] in ("intensity", "sigma")}
     for name, value in fit.estimates.items():
         start, error = fit.start[name], fit.standard_errors[name]
+        if name in of_noise:  # nobody knows the size of noise beforehand
+            continue
         if start != 0 and not 0.4 <= value / start <= 2.5 and error < 0.2 * abs(value):
             notes.append(
                 f"{name} went to {value / start:.2g} times its initial guess with a small formal error. Unless that "

@@ -36,13 +36,13 @@ def by_trial(problem: Problem, simulated: np.ndarray) -> ByTrial:
     return found
 
 
-def scaled_residuals(problem: Problem, fitted: ByTrial) -> ByTrial:
-    """(fitted - measured) / sigma; NaN in gaps."""
-    pairs = zip(fitted.items(), problem.trials, strict=True)
-    return {
-        name: {channel: (y - trial.measured[channel]) / trial.sigma[channel] for channel, y in channels.items()}
-        for (name, channels), trial in pairs
-    }
+def scaled_residuals(problem: Problem, fitted: ByTrial, deviation: ByTrial | None = None) -> ByTrial:
+    """(fitted - measured) / deviation, by default sigma; NaN in gaps."""
+    found = {}
+    for (name, channels), trial in zip(fitted.items(), problem.trials, strict=True):
+        known = trial.sigma if deviation is None else deviation[name]
+        found[name] = {channel: (y - trial.measured[channel]) / known[channel] for channel, y in channels.items()}
+    return found
 
 
 def variance_accounted_for(problem: Problem, fitted: ByTrial) -> dict[str, float]:

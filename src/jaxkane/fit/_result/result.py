@@ -18,7 +18,7 @@ from ..._common.lookup import refuse_unknown
 from ..._description.system import System
 from .._problem.model import Unknowns
 from .._problem.parameters import Parameters, leaf_names
-from .._problem.problem import STEP_TOLERANCE, Linearization, Problem
+from .._problem.problem import STEP_TOLERANCE, Linearization, Problem, all_of
 from .._problem.state_file import described, write_state
 from . import covariance, notes, residuals
 from .identifiability import Identifiability, identifiability_at, residual_variance
@@ -46,12 +46,14 @@ class Fit:
     - `clustered_errors`: by name, cluster-robust, for residuals that are correlated within a trial (sandwich, one
         cluster a trial); NaN with fewer trials than parameters plus two.
     - `intervals(level)`: by name. `correlation` (p, p) of the estimates, in the order of `names`.
-    - `cost`: sum of squared residuals; `history`: of the cost. `status`, `message`: how it ended, in a word and in
-        words.
+    - `cost`: sum of squared residuals, with process noise minus twice the log likelihood; `history`: of the cost.
+        `status`, `message`: how it ended, in a word and in words.
     - `identifiability`: singular values and directions of the sensitivity, and what the data do not determine.
     - `residuals`: by trial and channel, (simulated - measured) / sigma (n_t,), NaN in gaps; `fitted`: simulated (n_t,).
+        With process noise: predicted, from all that was measured before, and the normalized innovations.
         `tests`: by trial and channel, a `ResidualTest`. `variance_accounted_for`: by channel, over all trials.
-    - `nuisance`: by trial, values of the biases and of the windows' starts by name.
+    - `nuisance`: by trial, values of the biases and of the windows' starts by name; with process noise, starts that
+        were given a deviation are part of the filter (`jaxkane.fit.smoothed`).
     - `step_error`: by how much halving the step of integration moves the residuals.
     - `notes`: what a reader should know, in words.
     """
@@ -75,7 +77,7 @@ class Fit:
         errors = np.full(len(problem.places), np.nan)
         if status != "interrupted":
             try:
-                errors = problem.step_errors(point, np.asarray(at.simulated))
+                errors = problem.step_errors(point, all_of(at.seen))
             except KeyboardInterrupt:
                 status = "interrupted"
         return cls(problem, point, at, errors, tuple(history), status, method)
@@ -95,8 +97,14 @@ class Fit:
     @property
     def variance(self) -> float:
         """Of a residual: the sum of squares by residuals less unknowns; one where `sigma` and the model are right, and
-        NaN where there are no more residuals than unknowns."""
+        NaN where there are no more residuals than unknowns. With process noise it is taken to be one."""
         return residual_variance(self.problem, self.cost)
+
+    @property
+    def innovation(self) -> float:
+        """The mean square of the normalized residuals; with process noise one where all noise is as it was taken."""
+        flat = np.concatenate([r for channels in self.residuals.values() for r in channels.values()])
+        return float(np.nanmean(flat**2))
 
     @property
     def system(self) -> System:
@@ -204,7 +212,9 @@ class Fit:
 
     @functools.cached_property
     def residuals(self) -> ByTrial:
-        return residuals.scaled_residuals(self.problem, self.fitted)
+        deviation = self.linearization.seen.deviation
+        known = None if deviation is None else residuals.by_trial(self.problem, np.asarray(deviation))
+        return residuals.scaled_residuals(self.problem, self.fitted, known)
 
     @functools.cached_property
     def tests(self) -> dict[str, dict[str, ResidualTest]]:
@@ -236,12 +246,15 @@ class Fit:
         starts = np.asarray(problem.windows.start)[:, problem.model.unknown_places] + np.asarray(self.point.z)
         owner = np.array([k for k, _, _ in problem.places])
         found = {}
+        seen = self.linearization.seen
+        b = self.point.b if seen.unknowns is None else seen.unknowns  # with process noise a window is a trial
+        given = np.isfinite(np.asarray(n.start_deviation)) & (problem.model.noise is not None)
         for k, name in enumerate(self.trial_names):
             found[name] = {}
             for j, (kind, what) in enumerate(n.trial):
-                value = float(self.point.b[k, j]) + (1.0 if kind.startswith("gain") else 0.0)
+                value = float(b[k, j]) + (1.0 if kind.startswith("gain") else 0.0)
                 found[name][f"{kind.split()[0]} of {what}"] = value
-            found[name] |= {f"start of {s}": starts[owner == k, j] for j, s in enumerate(n.start)}
+            found[name] |= {f"start of {s}": starts[owner == k, j] for j, s in enumerate(n.start) if not given[j]}
         return found
 
     @functools.cached_property
@@ -261,7 +274,7 @@ class Fit:
             **described(self.problem),
         }
         at, step = self.linearization, self.problem.windows.step
-        numbers = {"R": at.blocks.R, "simulated": at.simulated, "status": at.status, "step_errors": self.step_errors}
+        numbers = {"R": at.blocks.R, "seen": at.seen, "step_errors": self.step_errors}
         write_state(path, key, {"point": self.point, "step": step, "history": np.array(self.history), **numbers})
         return path
 
@@ -280,7 +293,8 @@ class Fit:
         return "\n".join(lines)
 
     def __str__(self) -> str:
-        end = f"sum of squares {self.history[0]:.6g} -> {self.cost:.6g} by {self.method}: {STATUS[self.status]}"
+        name = self.problem.cost_name
+        end = f"{name} {self.history[0]:.6g} -> {self.cost:.6g} by {self.method}: {STATUS[self.status]}"
         return "\n".join([self.title, self.table(), end, *self.notes])
 
     @property

@@ -6,11 +6,12 @@ import os
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from ..._common.digest import differences
 from .._problem.blocks import Blocks
-from .._problem.model import Unknowns
+from .._problem.model import Seen, Unknowns
 from .._problem.problem import Linearization, Problem, cost, refuse_other
 from .._problem.state_file import described, read_state, tree_of
 from .result import Fit
@@ -41,18 +42,20 @@ def load(path: str | os.PathLike[str], problem: Problem) -> Fit:
     of_fit: dict[str, Any] = there.pop("fit", {})
     if not of_fit:
         raise ValueError(f"{path} is the checkpoint of a fit, not a fit that was saved: give it as `checkpoint=`.")
-    like = {"point": problem.start, "step": problem.windows.step, "R": 0.0, "simulated": 0.0, "status": 0}
-    like |= {"step_errors": 0.0, "history": 0.0}
-    found = {name: tree_of(path, arrays, name, tree) for name, tree in like.items()}
-    if problem.chooses_steps and found["step"].shape == problem.windows.step.shape:
-        problem = problem.with_steps(found["step"])
+    step = tree_of(path, arrays, "step", problem.windows.step)
+    if problem.chooses_steps and step.shape == problem.windows.step.shape:
+        problem = problem.with_steps(step)
     here = described(problem)
     wrong = differences(*({key: d[key] for key in d if key not in ("program", "versions")} for d in (there, here)))
     if wrong:
         raise ValueError(f"{path} is the fit of another problem. It differs in {wrong}. Pose the problem as it was.")
+    like: dict[str, Any] = {"point": problem.start, "R": 0.0, "step_errors": 0.0, "history": 0.0}
+    there_too = jnp.zeros(()) if problem.model.noise is not None else None
+    like["seen"] = Seen(jnp.zeros(()), jnp.zeros(()), there_too, there_too, there_too)
+    found = {name: tree_of(path, arrays, name, tree) for name, tree in like.items()}
     point, n_z, n_b = found["point"], found["point"].z.shape[1], found["point"].b.shape[1]
     blocks = Blocks(found["R"], problem.by_trial, n_z, n_z if problem.model.nuisance.chained else 0, n_b)
-    at = Linearization(blocks, found["simulated"], found["status"])
+    at = Linearization(blocks, found["seen"])
     if there["program"] != here["program"]:
         _refuse_changed(path, problem, point, at, there["versions"])
     errors, history = np.asarray(found["step_errors"]), tuple(float(c) for c in found["history"])
@@ -62,8 +65,8 @@ def load(path: str | os.PathLike[str], problem: Problem) -> Fit:
 def _refuse_changed(path: Path, problem: Problem, point: Unknowns, at: Linearization, versions: str) -> None:
     """`ValueError` where what the code computes today is not what was computed for the fit."""
     now = cost(problem, point)
-    if not abs(now - at.cost) <= SAME_COST * at.cost:
+    if not abs(now - at.cost) <= SAME_COST * at.squares:
         raise ValueError(
-            f"{path}: the code has changed since this fit was saved (by {versions}), and the sum of squares with it: "
+            f"{path}: the code has changed since this fit was saved (by {versions}), and {problem.cost_name} with it: "
             f"{at.cost:.6g} then, {now:.6g} now. Fit anew, from `start=` if you like, or go back to that code."
         )

@@ -1,0 +1,439 @@
+"""Process noise: the filter's likelihood, its slopes and its smoother, against what is exact for a linear motion.
+
+The exact values are those of a Gaussian: transitions and what noise adds to them by the matrix exponential (Van Loan,
+Computing integrals involving the matrix exponential, 1978), the filter by its covariance, and the smoothed motion by
+conditioning all states at once on all measurements.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.optimize
+from systems import Cart
+
+import jaxkane as jk
+from jaxkane.fit import (
+    BFGS,
+    Fit,
+    GradientDescent,
+    Intensity,
+    LeastSquares,
+    Problem,
+    Sigma,
+    Simulation,
+    Trial,
+    fit,
+    load,
+    log_density,
+    minimize,
+    report,
+    smoothed,
+    trajectories,
+)
+from jaxkane.fit._problem.problem import cost, linearize
+
+EXACT = 1e-8
+STIFFNESS, DAMPING, Q = 4.0, 0.3, 0.2  # of the cart of 1 kg; the noise's intensity [m^2/s^3]
+SIGMA = {"x": 0.02, "x_dot": 0.1}
+START, DEVIATION = np.array([0.4, 0.1]), np.array([0.1, 0.2])
+T = np.sort(np.append(np.arange(0.0, 2.0, 0.1), [0.734, 1.61]))  # irregular
+N = T.size
+FREE = ("stiffness", "damping", Intensity("x_dot"), Sigma("x"))
+OPTIONS = {"unknown": {"x": DEVIATION[0], "x_dot": DEVIATION[1]}, "noise": {"x_dot": Q}}
+TIGHT = Simulation(rtol=1e-10)
+
+
+def transition(h, stiffness, damping, q):
+    """Phi (2, 2) over a time h, and the covariance (2, 2) that noise adds."""
+    A = np.array([[0.0, 1.0], [-stiffness, -damping]])
+    M = np.zeros((4, 4))
+    M[:2, :2], M[2:, 2:], M[1, 3] = -A, A.T, q
+    E = scipy.linalg.expm(M * h)
+    return E[2:, 2:].T, E[2:, 2:].T @ E[:2, 2:]
+
+
+def joint(t, stiffness=STIFFNESS, damping=DAMPING, q=Q, deviation=DEVIATION):
+    """Mean (2 n_t,) and covariance (2 n_t, 2 n_t) of all states."""
+    mean, blocks, rows = [START], [np.diag(deviation**2)], []
+    for h in np.diff(t):
+        Phi, more = transition(h, stiffness, damping, q)
+        rows.append(Phi)
+        mean.append(Phi @ mean[-1])
+        blocks.append(Phi @ blocks[-1] @ Phi.T + more)
+    n = len(t)
+    P = np.zeros((2 * n, 2 * n))
+    for i in range(n):
+        C = blocks[i]
+        P[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = C
+        for j in range(i + 1, n):
+            C = rows[j - 1] @ C
+            P[2 * j : 2 * j + 2, 2 * i : 2 * i + 2], P[2 * i : 2 * i + 2, 2 * j : 2 * j + 2] = C, C.T
+    return np.concatenate(mean), P
+
+
+def drawn(seed, t=T, q=Q):
+    """A motion (n_t, 2) with its measurements by name, some missing."""
+    rng, (mean, P) = np.random.default_rng(seed), joint(t, q=q)
+    motion = (mean + np.linalg.cholesky(P + 1e-14 * np.eye(len(P))) @ rng.normal(size=mean.size)).reshape(-1, 2)
+    y = {name: motion[:, j] + s * rng.normal(size=len(t)) for j, (name, s) in enumerate(SIGMA.items())}
+    y["x"][5:8], y["x_dot"][::3], y["x"][0] = np.nan, np.nan, np.nan
+    return motion, y
+
+
+def trial_of(measured, t=T, **more):
+    options = {"initial": {"x": START[0], "x_dot": START[1]}, "sigma": SIGMA} | more
+    return Trial(t, measured, {"push": np.zeros_like(t)}, **options)
+
+
+def minus_twice_log_likelihood(y, stiffness=STIFFNESS, damping=DAMPING, q=Q, factor=1.0, t=T, deviation=DEVIATION):
+    """Of all measurements at once."""
+    mean, P = joint(t, stiffness, damping, q, deviation)
+    values = np.stack([y["x"], y["x_dot"]], axis=1).ravel()
+    sigma = np.tile([factor * SIGMA["x"], SIGMA["x_dot"]], len(t))
+    seen = np.isfinite(values)
+    C = (P + np.diag(sigma**2))[np.ix_(seen, seen)]
+    e = (values - mean)[seen]
+    return e @ np.linalg.solve(C, e) + np.linalg.slogdet(2 * np.pi * C)[1]
+
+
+@pytest.fixture(scope="module")
+def case():
+    motion, y = drawn(0)
+    problem = Problem.of(Cart(), trial_of(y), FREE, simulation=TIGHT, **OPTIONS)
+    return motion, y, problem
+
+
+@pytest.fixture(scope="module")
+def found(case):
+    return minimize(case[2], LeastSquares(rtol=1e-9))
+
+
+def test_the_likelihood_is_that_of_the_linear_motion(case):
+    _, y, problem = case
+    there = linearize(problem, problem.start)
+    assert there.cost == pytest.approx(minus_twice_log_likelihood(y), rel=EXACT)
+    assert cost(problem, problem.start) == pytest.approx(there.cost, rel=1e-13)
+    # By stiffness, damping, intensity and the factor of sigma.
+    d, values = 1e-4, np.array([STIFFNESS, DAMPING, Q, 1.0])
+    by = lambda p: minus_twice_log_likelihood(y, *p)  # noqa: E731
+    differences = [(by(values + d * e) - by(values - d * e)) / (2 * d) for e in np.eye(4)]
+    slopes = (
+        2 * np.asarray(there.blocks.gradient[2]) / np.asarray(problem.parameters.slopes(problem.start.x)).diagonal()
+    )
+    np.testing.assert_allclose(slopes, differences, rtol=1e-5, atol=1e-5)
+
+
+def test_the_information_is_fishers_on_average(case):
+    """1/2 tr (C^-1 dC C^-1 dC) + dm^T C^-1 dm, of all measurements at once."""
+    _, y, problem = case
+    seen = np.isfinite(np.stack([y["x"], y["x_dot"]], axis=1).ravel())
+
+    def moments(p):
+        mean, P = joint(T, *p[:3])
+        C = P + np.diag(np.tile([p[3] * SIGMA["x"], SIGMA["x_dot"]], N) ** 2)
+        return mean[seen], C[np.ix_(seen, seen)]
+
+    d, values = 1e-4, np.array([STIFFNESS, DAMPING, Q, 1.0])
+    ends = [(moments(values + d * e), moments(values - d * e)) for e in np.eye(4)]
+    (dm, dC), C = zip(*(((a - b) / (2 * d) for a, b in zip(*pair, strict=True)) for pair in ends), strict=True), None
+    C = np.linalg.inv(moments(values)[1])
+    exact = np.array([[0.5 * np.trace(C @ a @ C @ b) for a in dC] for b in dC]) + np.array(dm) @ C @ np.array(dm).T
+    to_values = np.linalg.inv(np.asarray(problem.parameters.slopes(problem.start.x)))
+    told = []
+    for seed in range(40):
+        other = np.stack(list(drawn(seed)[1].values()))
+        windows = dataclasses.replace(problem.windows, measured=jnp.asarray(np.nan_to_num(other)[None]))
+        R = np.asarray(linearize(dataclasses.replace(problem, windows=windows), problem.start).blocks.R)[0]
+        told.append(to_values @ R[:, 2:-1].T @ R[:, 2:-1] @ to_values)
+    error = np.std(told, axis=0) / len(told) ** 0.5
+    assert np.all(np.abs(np.mean(told, axis=0) - exact) < 3.5 * error + 1e-6 * np.abs(exact))
+    assert np.all(error < 0.1 * np.sqrt(np.outer(exact.diagonal(), exact.diagonal())))
+
+
+def test_the_fit_is_the_maximum(case, found):
+    _, y, _ = case
+    assert found.status == "converged"
+    values = lambda p: (np.exp(p[0]), p[1], np.exp(p[2]), np.exp(p[3]))  # noqa: E731
+    best = scipy.optimize.minimize(
+        lambda p: minus_twice_log_likelihood(y, *values(p)), [np.log(STIFFNESS), DAMPING, np.log(Q), 0.0], tol=1e-8
+    )
+    assert found.cost == pytest.approx(best.fun, abs=1e-4)
+    errors = np.array(list(found.standard_errors.values()))
+    assert np.all(np.abs(np.array(list(found.estimates.values())) - values(best.x)) < 0.02 * errors)
+    assert list(found.estimates) == ["stiffness", "damping", "intensity of x_dot", "sigma of x"]
+    # What is printed and drawn is of innovations.
+    assert "-2 log likelihood" in str(found)
+    assert "normalized innovations" in report(found)
+    assert found.innovation == pytest.approx(1.0, abs=0.3)
+    assert found.variance == 1.0
+    n = sum(np.isfinite(v).sum() for v in y.values())
+    assert sum(np.isfinite(r).sum() for r in found.residuals["trial"].values()) == n
+    assert found.nuisance == {"trial": {}}
+    with pytest.raises(ValueError, match="smoothed"):
+        trajectories(found)
+
+
+@pytest.mark.slow
+def test_other_optimizers_end_there_too(case, found):
+    problem = case[2]
+    for optimizer in (GradientDescent(), BFGS()):
+        assert minimize(problem, optimizer).cost == pytest.approx(found.cost, abs=1e-3), optimizer
+    slope = jax.jit(jax.grad(log_density(problem, over="x")))(problem.start).x
+    np.testing.assert_allclose(slope, -linearize(problem, problem.start).blocks.gradient[2], rtol=1e-9)
+
+
+def test_a_fit_is_saved(case, found, tmp_path):
+    again = load(found.save(tmp_path / "fit.npz"), case[2])
+    assert again.estimates == found.estimates
+    assert again.cost == found.cost
+    assert again.innovation == found.innovation
+    quiet = dataclasses.replace(case[2], model=dataclasses.replace(case[2].model, noise=None))
+    with pytest.raises(ValueError, match="process noise"):
+        load(tmp_path / "fit.npz", quiet)
+
+
+def conditioned(y, q=Q, deviation=DEVIATION, **values):
+    """Mean and covariance of all states, measurements known."""
+    mean, P = joint(T, q=q, deviation=deviation, **values)
+    data = np.stack([y["x"], y["x_dot"]], axis=1).ravel()
+    seen = np.isfinite(data)
+    gain = np.linalg.solve((P + np.diag(np.tile(list(SIGMA.values()), N) ** 2))[np.ix_(seen, seen)], P[seen]).T
+    return mean + gain @ (data - mean)[seen], P - gain @ P[seen]
+
+
+def applied(problem, point):
+    return Fit(problem, point, linearize(problem, point), np.zeros(1), (0.0,), "applied", "none")
+
+
+def test_the_smoother_knows_all_measurements(case):
+    _, y, problem = case
+    mean, P = conditioned(y)
+    motion = smoothed(applied(problem, problem.start))["trial"]
+    assert motion.names == ("x", "x_dot")
+    scale = np.sqrt(P.diagonal()).reshape(-1, 2)
+    assert np.all(np.abs(motion.mean - mean.reshape(-1, 2)) < 1e-6 * scale)
+    for i in range(N):
+        block = P[2 * i : 2 * i + 2, 2 * i : 2 * i + 2]
+        np.testing.assert_allclose(motion.covariance[i], block, rtol=1e-6, atol=1e-6 * block.max())
+    low, high = motion.band("x", 0.9)
+    np.testing.assert_allclose(high - low, 2 * 1.6448536269514722 * motion.deviation("x"))
+    with pytest.raises(KeyError, match="x_dot"):
+        motion["xdot"]
+    with pytest.raises(ValueError, match="level"):
+        motion.band("x", 95)
+
+
+def test_a_start_without_a_deviation_may_be_anywhere(case):
+    """Found with the parameters, it is the mean of the smoother that began with any start, whose band is its own."""
+    _, y, _ = case
+    options = OPTIONS | {"unknown": ("x", "x_dot")}
+    problem = Problem.of(Cart(), trial_of(y), FREE, simulation=TIGHT, **options)
+    held = minimize(problem, LeastSquares(rtol=1e-12), steps=0)
+    mean, P = conditioned(y, deviation=np.array([1e3, 1e3]))
+    motion = smoothed(held)["trial"]
+    deviation = np.sqrt(P.diagonal()).reshape(-1, 2)
+    assert np.all(np.abs(motion.mean - mean.reshape(-1, 2)) < 1e-3 * deviation)
+    np.testing.assert_allclose(np.stack([motion.deviation("x"), motion.deviation("x_dot")], 1), deviation, rtol=1e-3)
+    assert held.nuisance["trial"]["start of x"][0] == pytest.approx(mean[0], abs=1e-3 * deviation[0, 0])
+
+
+@pytest.mark.slow
+def test_without_noise_it_is_least_squares(case):
+    """A start that is found and no intensity: the same numbers as a plain fit, but for the residuals' variance."""
+    _, y, _ = case
+    free, options = ("stiffness", "damping"), {"unknown": ("x", "x_dot"), "simulation": TIGHT}
+    plain = fit(Cart(), trial_of(y), free, optimizer=LeastSquares(rtol=1e-12), **options)
+    quiet = fit(Cart(), trial_of(y), free, noise={"x_dot": 0.0}, optimizer=LeastSquares(rtol=1e-12), **options)
+    for name, error in plain.standard_errors.items():
+        assert quiet.estimates[name] == pytest.approx(plain.estimates[name], abs=1e-5 * error)
+        assert quiet.standard_errors[name] == pytest.approx(error / plain.variance**0.5, rel=1e-5)
+    n, logs = np.isfinite(np.concatenate([*y.values()])).sum(), 0.0
+    for name, values in y.items():
+        logs += 2 * np.log(SIGMA[name]) * np.isfinite(values).sum()
+        np.testing.assert_allclose(quiet.residuals["trial"][name], plain.residuals["trial"][name], atol=1e-5)
+    assert quiet.cost == pytest.approx(plain.cost + logs + n * np.log(2 * np.pi), rel=1e-9)
+
+
+def test_what_cannot_be_noise():
+    _, y = drawn(1)
+    trial = trial_of(y)
+
+    def posed(free="stiffness", **options):
+        return Problem.of(Cart(), trial, free, **({"noise": {"x_dot": 0.1}} | options))
+
+    for noise, said in (
+        ({"x_dot": -0.1}, "not negative and finite; got -0.1"),
+        ({"x_dot": np.nan}, "not negative"),
+        ({"x_dot": [0.1, 0.2]}, "not negative"),
+        ({"x": 0.1}, "A coordinate follows"),
+        ({"xdot": 0.1}, "x_dot"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            posed(noise=noise)
+    with pytest.raises(TypeError, match="dict of intensities"):
+        posed(noise=0.1)
+    for free, said in (
+        (Intensity("push"), "`noise` has"),
+        (Sigma("roll"), "measured channels"),
+        (Intensity("x_dot", start=0.0), "positive"),
+        (Sigma("x", start=-1.0), "positive"),
+        (Sigma("x", bounds=(-1.0, 2.0)), "below zero"),
+        ((Intensity("x_dot"), Intensity("x_dot")), "twice"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            posed(free)
+    with pytest.raises(ValueError, match="least squares: give `noise`"):
+        posed(Sigma("x"), noise=None)
+    for more in ({"window": 0.5}, {"window": 0.5, "continuity": {}}):
+        with pytest.raises(ValueError, match="two ways"):
+            posed(**more)
+
+
+@pytest.mark.slow
+def test_biases_inputs_and_several_trials():
+    """Of a cart of 2 kg: noise of the input (N) and of the speed, an offset of every trial's sensor, a trial at another
+    rate with a gap of a second, in which the filter takes several steps."""
+    mass, of_push, bias = 2.0, 0.3, 0.05
+    cart = Cart(mass=mass, stiffness=mass * STIFFNESS, damping=mass * DAMPING)
+    other = np.concatenate([np.arange(0.0, 0.6, 0.05), np.arange(1.6, 2.0, 0.05)])
+    trials, exact, estimates = [], 0.0, []
+    q = Q + of_push / mass**2
+    for seed, t in enumerate((T, other)):
+        rng, (_, y) = np.random.default_rng(seed + 100), drawn(seed, t, q)
+        y["x"] = y["x"] + bias * rng.normal()
+        trials.append(trial_of(y, t))
+        mean, P = joint(t, q=q)
+        values, sigma = np.stack([y["x"], y["x_dot"]], 1).ravel(), np.tile(list(SIGMA.values()), len(t))
+        seen, of_bias = np.isfinite(values), np.tile([bias, 0.0], len(t))
+        C = (P + np.diag(sigma**2) + np.outer(of_bias, of_bias))[np.ix_(seen, seen)]
+        e = (values - mean)[seen]
+        exact += e @ np.linalg.solve(C, e) + np.linalg.slogdet(2 * np.pi * C)[1]
+        estimates.append(bias * (of_bias[seen] @ np.linalg.solve(C, e)))
+    options = OPTIONS | {"noise": {"push": of_push, "x_dot": Q}, "sensor_bias": {"x": bias}}
+    problem = Problem.of(cart, trials, ("stiffness", Intensity("push")), simulation=TIGHT, **options)
+    assert cost(problem, problem.start) == pytest.approx(exact, rel=EXACT)
+    held = applied(problem, problem.start)
+    assert held.parameters.units[1] == ""  # of a push without a declared unit
+    for k, name in enumerate(held.trial_names):
+        motion = smoothed(held)[name]
+        assert motion.names[-1] == "bias of x"
+        np.testing.assert_allclose(motion["bias of x"], estimates[k], rtol=1e-6)
+        assert held.nuisance[name]["bias of x"] == pytest.approx(estimates[k], rel=1e-6)
+
+
+class Swing(jk.System):
+    """A pendulum by its angle."""
+
+    length: jk.Scalar = jk.parameter(1.5)
+    coordinates = ("angle",)
+    speeds = ("rate",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        L = N.rotate(3, q[0], u[0])
+        P = O.fixed(-self.length * L.y, name="P")
+        return jk.Motion([jk.Body(1.0, 0.0, P, name="bob")], frames={"N": N})
+
+    def loads(self, t, q, u, motion, inputs):
+        return (jk.weight(motion, -9.81 * motion.N.y),)
+
+    def outputs(self, t, q, u, motion, now):
+        return {"place": self.length * jnp.sin(q["angle"])}
+
+
+class Bound(jk.System):
+    """The same by the place of its mass, which a rod binds, and the angle's rate."""
+
+    length: jk.Scalar = jk.parameter(1.5)
+    coordinates = ("x", "y")
+    speeds = ("rate",)
+    dependent_coordinates = ("y",)
+
+    def q_dot(self, t, q, u):
+        return (-q["y"] * u[0], q["x"] * u[0])
+
+    def configuration_constraints(self, t, q):
+        return (q["x"] ** 2 + q["y"] ** 2 - self.length**2,)
+
+    def motion(self, t, q, u):
+        N, _ = jk.inertial()
+        x_dot, y_dot = self.q_dot(t, q, u)
+        P = jk.Point.at(x_dot * N.x + y_dot * N.y, q["x"] * N.x + q["y"] * N.y, "P")
+        return jk.Motion([jk.Body(1.0, 0.0, P, name="bob")], frames={"N": N})
+
+    def loads(self, t, q, u, motion, inputs):
+        return (jk.weight(motion, -9.81 * motion.N.y),)
+
+    def outputs(self, t, q, u, motion, now):
+        return {"place": q["x"]}
+
+
+@pytest.mark.slow
+def test_coordinates_that_constraints_bind():
+    """A pendulum by its angle and by its place: the same likelihood, but for the order of the noise squared."""
+    rng, t, length, begun = np.random.default_rng(3), np.arange(0.0, 1.0, 0.05), 1.5, 0.5
+    ride = jk.simulate(Swing(), jk.State([begun], [0.2]), jnp.asarray(t))
+    place = length * np.sin(np.asarray(ride["angle"])) + 1e-3 * rng.normal(size=t.size)
+    costs, roots = [], []
+    for system, initial in (
+        (Swing(), {"angle": begun}),
+        (Bound(), {"x": length * np.sin(begun), "y": -length * np.cos(begun)}),
+    ):
+        name = next(iter(initial))
+        unknown = {name: 0.01 if name == "angle" else 0.01 * length * np.cos(begun), "rate": 0.1}
+        trial = Trial(t, {"place": place}, sigma=1e-3, initial=initial | {"rate": 0.2})
+        problem = Problem.of(system, trial, "length", unknown=unknown, noise={"rate": 1e-3})
+        costs.append(cost(problem, problem.start))
+        motion = smoothed(applied(problem, problem.start))["trial"]
+        roots.append(motion.deviation("rate"))
+        if name == "x":
+            assert np.all(np.abs(np.hypot(motion["x"], motion["y"]) - length) < 1e-12)
+            along = np.stack([motion["x"], motion["y"], 0 * t], axis=1)
+            across = np.einsum("tij,tj->ti", motion.covariance, along)
+            assert np.all(np.abs(across) < 1e-12)
+    assert costs[0] == pytest.approx(costs[1], abs=0.02)
+    np.testing.assert_allclose(roots[0], roots[1], rtol=1e-3)
+
+
+@pytest.fixture(scope="module")
+def many():
+    """A hundred sets of three runs of 8 s, disturbed, fitted with first guesses that are wrong: estimates, and whether
+    the intervals of 95 % hold the truth, (100, 4)."""
+    t = np.arange(0.0, 8.0, 0.1)
+    truth = np.array([STIFFNESS, DAMPING, Q, 1.5])
+    mean, P = joint(t)
+    L = np.linalg.cholesky(P + 1e-14 * np.eye(len(P)))
+    rng, problem, estimates, held = np.random.default_rng(12), None, [], []
+    for _ in range(100):
+        runs = (mean[:, None] + L @ rng.normal(size=(mean.size, 3))).T.reshape(3, -1, 2)
+        noisy = runs + np.array([1.5 * SIGMA["x"], SIGMA["x_dot"]]) * rng.normal(size=runs.shape)
+        if problem is None:
+            trials = [trial_of({"x": run[:, 0], "x_dot": run[:, 1]}, t) for run in noisy]
+            problem = Problem.of(
+                Cart(stiffness=3.0, damping=0.5), trials, FREE, **(OPTIONS | {"noise": {"x_dot": 1.0}})
+            )
+        windows = dataclasses.replace(problem.windows, measured=jnp.asarray(np.swapaxes(noisy, 1, 2)))
+        one = minimize(dataclasses.replace(problem, windows=windows), LeastSquares())
+        assert one.status == "converged"
+        estimates.append(list(one.estimates.values()))
+        held.append([low < x < high for x, (low, high) in zip(truth, one.intervals().values(), strict=True)])
+    return truth, np.array(estimates), np.array(held)
+
+
+@pytest.mark.slow
+def test_intensity_and_sigma_are_found(many):
+    truth, estimates, _ = many
+    error = estimates[:50].std(axis=0, ddof=1) / 50**0.5
+    print("bias in standard errors:", (estimates[:50].mean(axis=0) - truth) / error)
+    assert np.all(np.abs(estimates[:50].mean(axis=0) - truth)[2:] < 2 * error[2:])
+
+
+@pytest.mark.slow
+def test_intervals_cover_under_process_noise(many):
+    covered = many[2].sum(axis=0)
+    print("of 100:", covered)
+    assert np.all((covered >= 90) & (covered <= 99)), covered
