@@ -70,7 +70,7 @@ PAGES = {
     "symbolic": "symbolic",
     "export": "export",
 }
-PAGES |= {"loads": "describing", "rotations": "describing", "sensors": "sensors"}
+PAGES |= {"loads": "elements", "rotations": "describing", "sensors": "sensors"}
 
 
 def reference(module):

@@ -4,9 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import jaxkane as jk
-from jaxkane.loads import coulomb, dc_motor, dead_zone, lag, lugre, quadratic, smooth_abs, smooth_sign, stribeck
+from jaxkane.loads import bouc_wen, coulomb, dc_motor, dead_zone, lugre, quadratic, smooth_abs, smooth_sign, stribeck
 
 RTOL = 1e-12
 V = np.array([-3.0, -0.4, -0.07, -0.011, 0.0, 0.011, 0.07, 0.4, 3.0])  # rates [m/s]
@@ -363,5 +364,96 @@ def test_a_rotor_feels_its_carrier_turn():
     jk.assemble(Gimbal(), {}, {})  # the moments (0.05, 0, 0) are no body's, but a rotor's
 
 
-def test_a_lag_follows_its_command():
-    assert lag(0.5, 2.0, 0.25) == 6.0
+# Elements with states.
+
+YIELDS = {"stiffness": 500.0, "yield_force": 2.0, "share": 0.7, "exponent": 1.5}
+TOUCHES = BRISTLES | {"stiffness": 1e3, "falloff": 0.05, "damping": 40.0, "viscous": 0.4}
+
+
+@pytest.mark.parametrize("share", [0.5, 0.7, 1.0])
+def test_what_yields_gives_back_no_more_than_it_took_and_stays_within(share):
+    v, z = (x.ravel() for x in np.meshgrid(np.linspace(-0.3, 0.3, 21), np.linspace(-4e-3, 4e-3, 101)))
+    force, z_dot = bouc_wen(jnp.array(v), jnp.array(z), **YIELDS | {"share": share})
+    assert np.min(np.asarray(force) * v - 500.0 * z * np.asarray(z_dot)) > -1e-12
+    _, outwards = bouc_wen(jnp.array(v), jnp.full_like(v, 4e-3), **YIELDS | {"share": share})
+    assert np.max(np.asarray(outwards)) < 1e-12
+
+
+def test_what_yields_is_a_spring_at_first_and_then_has_its_yield_force():
+    force = lambda v, z: bouc_wen(v, z, **YIELDS)  # noqa: E731
+    (dv, dz), (z_dot_v, z_dot_z) = jax.jacrev(force, (0, 1))(0.0, 0.0)
+    assert (float(dv), float(dz), float(z_dot_v), float(z_dot_z)) == pytest.approx((0.0, 500.0, 1.0, 0.0), abs=1e-9)
+    pulled, z_dot = force(0.2, 4e-3)
+    assert (float(pulled), float(z_dot)) == pytest.approx((2.0, 0.0), abs=1e-9)
+
+
+class Held(jk.System):
+    """Two blocks that are pushed alike: one on bristles, one on a spring that yields and a damper."""
+
+    coordinates = ("rubbed", "tied")
+    speeds = ("rubbed_rate", "tied_rate")
+    states = ("bent", "extended")
+    inputs = ("push",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        bodies = [jk.Body(1.0, 0.0, O.moving(q[i] * N.x, u[i] * N.x), name=self.coordinates[i]) for i in (0, 1)]
+        return jk.Motion(bodies)
+
+    def elements(self, u, x):
+        return lugre(u["rubbed_rate"], x["bent"], **TOUCHES), bouc_wen(u["tied_rate"], x["extended"], **YIELDS)
+
+    def loads(self, t, q, u, motion, inputs):
+        (rubs, _), (holds, _) = self.elements(u, inputs)
+        forces = inputs["push"] - rubs, inputs["push"] - holds - 5.0 * u["tied_rate"]
+        return [jk.Force(F * motion.N.x, body) for F, body in zip(forces, motion.bodies, strict=True)]
+
+    def state_rates(self, t, q, u, x, motion, now):
+        (_, bent), (_, extended) = self.elements(u, x)
+        return {"bent": bent, "extended": extended}
+
+
+@pytest.fixture(scope="module")
+def held():
+    """Pushed by less than what static friction holds, and by more."""
+    push, ts = np.array([[1.2], [2.2]]), np.linspace(0.0, 2.0, 21)
+    return jk.sweep.sweep(Held(), jk.State({}, {}, {}), ts, {"push": push}, rtol=1e-9, atol=1e-11)
+
+
+def test_bristles_and_yielding_as_integrated_by_hand(held):
+    def rates(t, y, push):
+        v, w, z, s = y[2:]
+        friction = 1.0 + 0.5 * np.exp(-((v / 0.05) ** 2))
+        z_dot = v - 1e3 * abs(v) / friction * z
+        s_dot = w * (1 - (0.7 * np.sign(w * s) + 0.3) * abs(s / 4e-3) ** 1.5)
+        return [v, w, push - 1e3 * z - 40.0 * z_dot - 0.4 * v, push - 500.0 * s - 5.0 * w, z_dot, s_dot]
+
+    for i, push in enumerate((1.2, 2.2)):
+        options = {"args": (push,), "rtol": 1e-10, "atol": 1e-12}
+        by_hand = solve_ivp(rates, (0.0, 2.0), np.zeros(6), "LSODA", np.linspace(0.0, 2.0, 21), **options).y
+        for k, name in enumerate(("rubbed", "tied", "rubbed_rate", "tied_rate", "bent", "extended")):
+            np.testing.assert_allclose(held[name][i], by_hand[k], rtol=1e-6, atol=1e-7, err_msg=name)
+
+
+def test_bristles_hold_what_smoothed_friction_lets_creep(held):
+    """Less than static: the block comes to rest where the bristles carry the push, and stays there."""
+    assert held["bent"][0, -1] == pytest.approx(1.2 / 1e3, rel=1e-6)
+    assert np.ptp(held["rubbed"][0, 10:]) < 1e-9
+    assert held["rubbed_rate"][1, -1] > 0.5
+
+
+def test_slopes_of_states_at_rest(kernels):
+    """By hand: of accelerations by speeds, and by states."""
+    system, zeros = Held(), jnp.zeros(2)
+
+    @jax.jit
+    def slopes(u, x):
+        def f(u, x):
+            return jk.accelerations(system, 0.0, zeros, u, {"push": 1.0, "bent": x[0], "extended": x[1]})
+
+        return jax.jacfwd(f, (0, 1))(u, x), jax.jacrev(f, (0, 1))(u, x)
+
+    forward, reverse = slopes(zeros, zeros)
+    np.testing.assert_allclose(forward[0], np.diag([-40.4, -5.0]), rtol=RTOL)
+    np.testing.assert_allclose(forward[1], np.diag([-1e3, -500.0]), rtol=RTOL)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=RTOL), forward, reverse)

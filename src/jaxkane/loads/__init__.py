@@ -10,8 +10,9 @@ end, for `System.loads`:
 A follower needs no function of its own: `jk.Force(10.0 * B.x, P)` turns with the frame B. Where a law is not linear,
 give a function of the extension, the rate or the angle in the place of the coefficient: `lambda x: k * x + k3 * x**3`.
 
-Laws are such functions, of numbers: `coulomb`, `stribeck`, `quadratic`, `dead_zone`, `lugre`. They are the resistance,
-of the sign of the rate; a load is minus that. They may be added, and used along any speed:
+Laws are such functions, of numbers: `coulomb`, `stribeck`, `quadratic`, `dead_zone`; and of a state of the first order
+beside them, `lugre` and `bouc_wen`. They are the resistance, of the sign of the rate; a load is minus that. They may be
+added, and used along any speed:
 
     friction = lambda w: jk.loads.stribeck(w, 0.3, 0.5, 0.1) + 0.02 * w
     jk.loads.torsional_damper(arm, None, N.z, friction)
@@ -26,6 +27,7 @@ from ._between import spring as spring
 from ._between import torsional_damper as torsional_damper
 from ._between import torsional_friction as torsional_friction
 from ._between import torsional_spring as torsional_spring
+from ._laws import bouc_wen as bouc_wen
 from ._laws import coulomb as coulomb
 from ._laws import dead_zone as dead_zone
 from ._laws import lugre as lugre
@@ -34,5 +36,4 @@ from ._laws import smooth_abs as smooth_abs
 from ._laws import smooth_sign as smooth_sign
 from ._laws import stribeck as stribeck
 from ._motors import dc_motor as dc_motor
-from ._motors import lag as lag
 from ._motors import rotor as rotor

@@ -124,3 +124,33 @@ def lugre(
     level = kinetic + (static - kinetic) * jnp.exp(-((v / falloff) ** 2))
     z_dot = v - stiffness * jnp.abs(v) / level * z
     return stiffness * z + damping * z_dot + viscous * v, z_dot
+
+
+def bouc_wen(
+    v: Component,
+    z: Component,
+    *,
+    stiffness: Component,
+    yield_force: Component,
+    share: Component = 0.5,
+    exponent: Component = 1.0,
+    width: Component = 1e-9,
+) -> tuple[Any, Any]:
+    """Hysteresis of a spring that yields, with a state: a rope, rubber, a wire, a bolted joint.
+
+        z_dot = v (1 - (share sign(v z) + 1 - share) |z / z_y|^exponent),   z_y = yield_force / stiffness
+        force = stiffness * z
+
+    Bouc (1967) and Wen (1976), *Method for random vibration of hysteretic systems*, where it has beta = share / z_y^n
+    and gamma = (1 - share) / z_y^n. Begun at |z| <= z_y it stays there, and never gives back more than it has taken,
+    where `share` is 1/2 to 1. An elastic part beside it is a spring of its own.
+
+    **Arguments:** `v`: the rate [m/s, rad/s]; `z`: the elastic extension [m, rad]; `stiffness` [N/m, N m/rad] before it
+    yields; `yield_force` [N, N m], positive; `exponent`: how sharply it yields, 1 at least; `width` of |z / z_y|, of no
+    unit.
+
+    **Returns:** the force, which resists v, and z_dot.
+    """
+    bent = z * stiffness / yield_force
+    along = share * jnp.sign(v * z) + 1.0 - share
+    return stiffness * z, v * (1.0 - along * smooth_abs(bent, width) ** exponent)

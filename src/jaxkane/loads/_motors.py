@@ -54,8 +54,3 @@ def dc_motor(voltage: Component, rate: Component, constant: Component, resistanc
     [V s/rad]; `resistance` [ohm].
     """
     return constant * (voltage - constant * rate) / resistance
-
-
-def lag(x: Component, command: Component, time_constant: Component) -> Component:
-    """The rate (command - x) / time_constant of a state that follows a command: a motor's torque, a filter."""
-    return (command - x) / time_constant
