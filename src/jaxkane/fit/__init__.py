@@ -1,11 +1,16 @@
 """Parameters from measured motion: trials, exact derivatives, optimizers, and how far to trust what is found."""
 
+from ._analysis.base_parameters import base_parameters as base_parameters
 from ._analysis.design import Design as Design
 from ._analysis.design import design as design
+from ._analysis.first_guess import FirstGuess as FirstGuess
+from ._analysis.first_guess import first_guess as first_guess
 from ._analysis.held_back import CrossValidation as CrossValidation
 from ._analysis.held_back import applied_to as applied_to
 from ._analysis.held_back import cross_validate as cross_validate
 from ._analysis.identifiability import identifiability as identifiability
+from ._analysis.instants import Instants as Instants
+from ._analysis.instants import instants_of as instants_of
 from ._analysis.laplace import Laplace as Laplace
 from ._analysis.laplace import laplace as laplace
 from ._analysis.motions import trajectories as trajectories
@@ -13,6 +18,8 @@ from ._analysis.multistart import MultiStart as MultiStart
 from ._analysis.multistart import multi_start as multi_start
 from ._analysis.profile import Profile as Profile
 from ._analysis.profile import profile as profile
+from ._analysis.regressor import Regressor as Regressor
+from ._analysis.regressor import regressor as regressor
 from ._analysis.signs import contrary_signs as contrary_signs
 from ._analysis.smoothed import Smoothed as Smoothed
 from ._analysis.smoothed import smoothed as smoothed
@@ -28,6 +35,7 @@ from ._optimize.optimizer import Optimizer as Optimizer
 from ._problem.bijections import Interval as Interval
 from ._problem.bijections import PossibleBody as PossibleBody
 from ._problem.density import log_density as log_density
+from ._problem.inertia_of import inertia_of as inertia_of
 from ._problem.model import Model as Model
 from ._problem.model import Unknowns as Unknowns
 from ._problem.parameters import Delay as Delay
@@ -40,6 +48,7 @@ from ._problem.problem import Problem as Problem
 from ._problem.simulation import Simulation as Simulation
 from ._report.report import report as report
 from ._report.report import save_report as save_report
+from ._result.base_parameters import BaseParameters as BaseParameters
 from ._result.identifiability import Direction as Direction
 from ._result.identifiability import Identifiability as Identifiability
 from ._result.residuals import ResidualTest as ResidualTest

@@ -326,7 +326,7 @@ def _of_noise(system: System, item: Intensity | Sigma, noise: Mapping[str, float
 
 
 def _of_leaves(system: System, item: Free):
-    chosen, leaves = _find(system, item.where)
+    chosen, leaves = find_leaves(system, item.where)
     followers = [follower for name, factor in item.tied.items() for follower in _followers(system, name, factor)]
     parts = []
     for i in chosen:
@@ -346,7 +346,7 @@ def _of_leaves(system: System, item: Free):
 
 def _followers(system: System, name: str, factor: float) -> list[tuple[int, int, float]]:
     """(leaf, place, factor) of every entry of what is tied."""
-    chosen, leaves = _find(system, name)
+    chosen, leaves = find_leaves(system, name)
     for path in (leaves[i][0] for i in chosen):
         if not math.isfinite(factor) or (factor <= 0 and declared(system, path).positive):
             must = "positive, as the parameter is declared" if math.isfinite(factor) else "a finite number"
@@ -437,13 +437,13 @@ def _of_body(system: System, item: Inertia):
 
 def _one(system: System, name: str, shape: tuple[int, ...] = ()) -> int:
     """The leaf of this name, which has this shape."""
-    (chosen, leaves) = _find(system, name)
+    (chosen, leaves) = find_leaves(system, name)
     if len(chosen) != 1 or leaves[chosen[0]][1].shape != shape:
         raise ValueError(f"{type(system).__name__}.{name} must have the shape {shape}.")
     return chosen[0]
 
 
-def _find(system: System, where: str | Callable[[Any], Any]) -> tuple[list[int], list[Any]]:
+def find_leaves(system: System, where: str | Callable[[Any], Any]) -> tuple[list[int], list[Any]]:
     """Numbers of the leaves that are meant, and all (path, leaf)."""
     title = type(system).__name__
     leaves, structure = jax.tree_util.tree_flatten_with_path(system)
