@@ -63,9 +63,10 @@ def pytest_collection_finish():
 
 @pytest.fixture(autouse=True, scope="module")
 def _programs_are_forgotten():
-    """Thousands of compiled programs would fill the memory of a small machine."""
+    """Thousands of compiled programs would fill the memory of a small machine; half of it is left to others."""
     yield
-    if psutil.Process().memory_info().rss > psutil.virtual_memory().total / 8:
+    processes = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    if psutil.Process().memory_info().rss > psutil.virtual_memory().total / (2 * processes):
         jax.clear_caches()
 
 

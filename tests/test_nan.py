@@ -33,6 +33,8 @@ def flat(tree):
 
 
 ORDERS = [modes for n in (1, 2) for modes in itertools.product((jax.jacfwd, jax.jacrev), repeat=n)]
+# Of second derivatives, forward over reverse and reverse over reverse are enough for a plain run.
+ORDERS = [pytest.param(m, marks=pytest.mark.slow) if m[1:] and m[0] is jax.jacfwd else m for m in ORDERS]
 named = lambda modes: "-".join(mode.__name__ for mode in modes)  # noqa: E731
 
 

@@ -142,13 +142,14 @@ def test_degrees_go_by_the_units_that_were_declared():
             B = N.rotate(3, q["q0"], u["u0"])
             return jk.Motion([jk.Body(1.0, (1.0, 1.0, 1.0), O.moving(q["q1"] * N.x, u["u1"] * N.x), B)])
 
-    ride = jk.simulate(Cart(), jk.State([1.0, 2.0], [0.5, 0.0]), [0.0, 0.5, 1.0])
+    coarse = {"step": 0.5, "solver": diffrax.Euler()}
+    ride = jk.simulate(Cart(), jk.State([1.0, 2.0], [0.5, 0.0]), [0.0, 0.5, 1.0], **coarse)
     axes = jk.plot.trajectories(ride, ["q0", "u0", "q1"], degrees=True)
     assert [ax.get_ylabel() for ax in axes] == ["q0\n[deg]", "u0\n[deg/s]", "q1"]
     np.testing.assert_allclose(axes[0].lines[0].get_ydata(), np.degrees(ride["q0"]))
     with pytest.raises(ValueError, match=r"none of q1 is declared to be an angle.*units = \{'q1': \"rad\"\}"):
         jk.plot.trajectories(ride, ["q1"], degrees=True)
-    several = jk.sweep.sweep(Cart(), jk.State({"q0": np.array([0.1, 0.2])}, {}), [0.0, 0.5, 1.0])
+    several = jk.sweep.sweep(Cart(), jk.State({"q0": np.array([0.1, 0.2])}, {}), [0.0, 0.5, 1.0], **coarse)
     assert dict(several.trajectory.units) == {"q0": "rad", "push": "N", "u0": "rad/s"}
     with pytest.raises(ValueError, match=r"Wrong\.units names what is no coordinate, speed, input or state: q9"):
         jk.simulate(type("Wrong", (Cart,), {"units": {"q9": "m"}})(), jk.State([0.0, 0.0], [0.0, 0.0]), [0.0, 1.0])

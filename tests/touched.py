@@ -1,8 +1,8 @@
 """Whether the tests that were run call every module of the library.
 
-`pytest` leaves out the slow ones, and so does CI with the lowest versions. On Python 3.12 or later it looks at it, at no
-cost, and fails if slow tests alone call a module, or none: mark other tests, or add a cheap one. Under `pytest -m ""` all
-tests count, since a program that a slow one has compiled is not traced again by those that follow.
+`pytest` leaves out the slow ones, and so does CI with the lowest versions. On Python 3.12 or later it looks at it, at
+no cost, and fails if slow tests alone call a module, or none: mark other tests, or add a cheap one. Under
+`pytest -m ""` all tests count, since a program that a slow one has compiled is not traced again by those that follow.
 """
 
 import ast

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import pytest
+from test_laws import QUICK, SLOW
 
 import jaxkane as jk
 from jaxkane._method.rates import _motion_rates
@@ -42,7 +43,7 @@ OF_CONSTRAINTS = "dependent_speeds dependent_accelerations constraint_jacobian_r
 
 
 @pytest.mark.filterwarnings("error:.*its description uses")
-@pytest.mark.parametrize("name", CATALOG)
+@pytest.mark.parametrize("name", [name if name in QUICK else pytest.param(name, marks=SLOW) for name in CATALOG])
 def test_every_public_function_is_one_program_of_scalars(name, monkeypatch):
     """Traced, and not compiled: what cannot be part of one function is told of, and is an error here."""
     entry, programs = CATALOG[name], []
