@@ -89,6 +89,7 @@ def test_what_is_not_installed_is_named(monkeypatch):
     assert {"Pinocchio", "SymPy + C", "PyDy's Cython"} <= set(_peers.missing())
 
 
+@pytest.mark.slow
 def test_a_part_runs_without_its_peers(tmp_path):
     blocked = "import sys; sys.modules.update(dict.fromkeys(['mujoco', 'pinocchio', 'jaxsim', 'rod']))\n"
     (tmp_path / "sitecustomize.py").write_text(blocked)

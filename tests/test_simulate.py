@@ -11,6 +11,7 @@ from scipy.linalg import expm
 from slopes import differences, slopes
 
 import jaxkane as jk
+from jaxkane._simulation.ride import solve
 from jaxkane.catalog import DoublePendulum, WhippleBicycle
 
 BIKE = WhippleBicycle.benchmark()
@@ -45,8 +46,8 @@ def test_energy_and_front_contact_over_five_seconds():
 
 
 def test_steps_of_any_solver_agree():
-    fine = jk.simulate(PENDULUM, START, TS, solver=diffrax.Dopri8(), rtol=1e-11, atol=1e-11, adjoint="forward")
-    steps = jk.simulate(PENDULUM, START, TS, step=1e-3, adjoint="forward")
+    fine = jk.simulate(PENDULUM, START, TS, solver=diffrax.Dopri8(), rtol=1e-11, atol=1e-11)
+    steps = jk.simulate(PENDULUM, START, TS, step=1e-3)
     np.testing.assert_allclose(steps.q, fine.q, atol=1e-9)
     assert steps.stats["steps"] == 1000
 
@@ -307,6 +308,17 @@ def test_float32_and_what_follows_from_it():
     np.testing.assert_allclose(np.asarray(ride.q), np.asarray(reference.q), atol=1e-3)
 
 
+def test_another_accuracy_compiles_nothing():
+    coarse, fine = (jk.simulate(PENDULUM, START, TS, step=x) for x in (0.1, 0.05))
+    programs = solve.compiled._cached._cache_size()
+    finer = jk.simulate(PENDULUM, START, TS, step=0.025)
+    assert [int(ride.stats["steps"]) for ride in (coarse, fine, finer)] == [10, 20, 40]
+    jk.simulate(PENDULUM, START, TS)
+    tolerant, strict = (jk.simulate(PENDULUM, START, TS, rtol=x, atol=x) for x in (1e-3, 1e-10))
+    assert int(tolerant.stats["steps"]) < int(strict.stats["steps"])
+    assert solve.compiled._cached._cache_size() <= programs + 1
+
+
 def test_under_jit_and_vmap():
     run = lambda u: jk.simulate(PENDULUM, jk.State(START.q, u), TS)  # noqa: E731
     us = jnp.array([[0.0, 0.3], [1.0, -1.0]])
@@ -318,10 +330,10 @@ def test_under_jit_and_vmap():
 
 
 def test_going_on_from_where_a_ride_ended():
-    whole = jk.simulate(PENDULUM, START, TS)
-    first = jk.simulate(PENDULUM, START, TS[:6])
-    second = jk.simulate(PENDULUM, first.state(), TS[5:])
-    np.testing.assert_allclose(second.q[-1], whole.q[-1], atol=1e-7)
+    whole = jk.simulate(PENDULUM, START, TS, rtol=1e-11, atol=1e-11)
+    first = jk.simulate(PENDULUM, START, TS[:6], rtol=1e-11, atol=1e-11)
+    second = jk.simulate(PENDULUM, first.state(), TS[5:], rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(second.q[-1], whole.q[-1], atol=1e-9)
 
 
 def test_progress_is_shown_on_request_only(capfd):

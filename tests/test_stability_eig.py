@@ -141,6 +141,7 @@ def test_a_batch_of_bicycles_against_the_literature(bicycles, kernels):
         np.testing.assert_allclose((pair[1] - pair[0]) ** 2, (other[1] - other[0]) ** 2, atol=1e-13)
 
 
+@pytest.mark.parametrize("kernels", ["native", pytest.param("XLA", marks=pytest.mark.slow)], indirect=True)
 def test_derivatives_of_values_alone_are_those_of_both(kernels):
     rtol = 1e-12
     A = np.random.default_rng(0).standard_normal((CHUNK, 3, 3))

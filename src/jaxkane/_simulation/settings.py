@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -26,12 +27,15 @@ ADJOINTS = {
 
 
 class Settings(eqx.Module):
-    """How to integrate: what `simulate` was given, with its defaults filled in."""
+    """How to integrate: what `simulate` was given, with its defaults filled in.
 
-    rtol: float = eqx.field(static=True)
-    atol: float = eqx.field(static=True)
+    Tolerances and the step are numbers, or arrays where they may change without another compilation.
+    """
+
+    rtol: Any
+    atol: Any
     solver: diffrax.AbstractSolver
-    step: Any  # a number, or an array where it may change without another compilation
+    step: Any
     adjoint: diffrax.AbstractAdjoint
     max_steps: int | None = eqx.field(static=True)  # None: as many as it takes
     progress: bool = eqx.field(static=True)
@@ -91,6 +95,13 @@ def refuse_held(solver: Any, signals: Any) -> None:
             "step, where the next sample begins. Use solver=diffrax.Bosh3(); or leave out `step`, and the steps end "
             "where the input jumps."
         )
+
+
+def of_any_accuracy(settings: Settings, dtype: Any) -> Settings:
+    """The same, whose tolerances and step are arguments of a program, and no part of it."""
+    numbers = {name: getattr(settings, name) for name in ("rtol", "atol", "step")}
+    arrays = {name: x if x is None else jnp.asarray(x, dtype) for name, x in numbers.items()}
+    return dataclasses.replace(settings, **arrays)
 
 
 def _check_number(label: str, value: Any, fits: Callable[[float], bool], what: str) -> None:

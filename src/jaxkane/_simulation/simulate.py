@@ -16,7 +16,7 @@ from .._method.now import values_of
 from .._scalars.types import Inputs
 from .modes import for_reverse_mode, goes_forward
 from .ride import inputs_at, solve
-from .settings import ADJOINTS, checked_state, checked_times, settings_for
+from .settings import ADJOINTS, checked_state, checked_times, of_any_accuracy, settings_for
 from .signals import as_signals, with_one_times
 from .trajectory import Status, Trajectory
 
@@ -90,7 +90,7 @@ def simulate(
         settings = dataclasses.replace(settings, adjoint=ADJOINTS["forward"]())
     if isinstance(settings.adjoint, ADJOINTS["reverse"]):
         given = for_reverse_mode(given)
-    ride = solve(*given, settings)
+    ride = solve(*given, of_any_accuracy(settings, ts.dtype))
     if is_concrete(ride.status) and int(ride.status) == Status.NO_SOLUTION:
         inputs_now = values_of(system, state.x, inputs_at(system, signals, ts[0], state))
         raise ValueError(
