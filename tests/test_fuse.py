@@ -211,7 +211,7 @@ class Ball(eqx.Module):
 SLOW = {
     "cond": lambda b, x: jax.lax.cond(x > 0.0, lambda: b.a * x, lambda: x),
     "while": lambda b, x: jax.lax.while_loop(lambda c: c < b.a, lambda c: c + x * x + 1.0, x),
-    "dot_general": lambda b, x: jnp.stack([x, b.a]) @ jnp.stack([b.a, x]),
+    "dot_general": lambda b, x: jnp.stack([x, *[b.a] * 64]) @ jnp.stack([*[b.a] * 64, x]),
     "gather": lambda b, x: jnp.take(jnp.array([1.0, 2.0, 3.0]) * b.a, (x > 0.0).astype(int)),
     "lu": lambda b, x: jnp.linalg.solve(jnp.full((2, 2), x).at[0, 0].add(b.a), jnp.ones(2))[0],
 }
@@ -226,6 +226,16 @@ def test_what_cannot_be_one_function_is_told_once_by_name(name, monkeypatch):
         found = f(ball, x), jax.jit(f)(ball, x), jax.grad(lambda x: f(ball, x) if name != "while" else x)(x)
     assert len(told) == 1
     np.testing.assert_allclose(found[:2], np.full(2, SLOW[name](ball, x)), rtol=1e-14)
+
+
+@pytest.mark.filterwarnings("error")
+def test_products_of_small_matrices_are_written_out():
+    A, B = (np.random.default_rng(i).normal(size=s) for i, s in ((0, (2, 3, 4)), (1, (4, 2, 5))))
+    f = lambda b, x: jnp.einsum("bij,jbk->bik", b.a * A, x * jnp.asarray(B))  # noqa: E731
+    ball, x = Ball(jnp.array(1.5)), jnp.array(0.4)
+    exact = np.einsum("bij,jbk->bik", 1.5 * A, 0.4 * B)
+    np.testing.assert_allclose(fused(f)(ball, x), exact, rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(jax.jacfwd(lambda x: fused(f)(ball, x))(x), exact / 0.4, rtol=1e-13, atol=1e-14)
 
 
 @pytest.mark.filterwarnings("error")

@@ -11,6 +11,7 @@ from ._description.bodies import Force as Force
 from ._description.bodies import Motion as Motion
 from ._description.bodies import Torque as Torque
 from ._description.bodies import weight as weight
+from ._description.parameters import learned as learned
 from ._description.parameters import parameter as parameter
 from ._description.system import State as State
 from ._description.system import System as System

@@ -45,6 +45,55 @@ def parameter(
     return eqx.field(converter=to_float, metadata=metadata, default_factory=lambda: default)
 
 
+def learned(default: Any = dataclasses.MISSING) -> Any:
+    """A function of numbers with parameters of its own, a small neural network, as a part of a `System`.
+
+        friction: Any = jk.learned(eqx.nn.MLP("scalar", "scalar", 8, 1, jnp.tanh, key=jax.random.key(0)))
+
+    Its arrays are parameters of the system, which a fit frees by the field's name: `Free("friction", prior=(0, 0.3))`
+    with a prior that keeps it small. What is no array in it, such as its activation, belongs to the description.
+
+    **Arguments:** `default`: a module of equinox, or any other pytree that can be called; without one it must be given.
+    """
+    if default is dataclasses.MISSING:
+        return eqx.field(converter=Learned)
+    return eqx.field(converter=Learned, default_factory=lambda: default)
+
+
+def _in_default_precision(x: Any) -> Any:
+    x = to_float(x)
+    return x.astype(jnp.result_type(float)) if jnp.issubdtype(x.dtype, jnp.floating) else x
+
+
+class Learned(eqx.Module):
+    """A callable pytree: its arrays as leaves, all else static. It is called as what it holds."""
+
+    arrays: Any
+    rest: Any = eqx.field(static=True)
+
+    def __init__(self, function: Any):
+        if isinstance(function, Learned):
+            self.arrays, self.rest = function.arrays, function.rest
+            return
+        if not callable(function):
+            raise TypeError(
+                f"jk.learned() holds a function with parameters, such as an equinox module; got {function!r}."
+            )
+        arrays, rest = eqx.partition(function, eqx.is_array_like)
+        leaves, structure = jax.tree.flatten(rest)
+        self.arrays = jax.tree.map(_in_default_precision, arrays)  # it may have been made before `jk.configure()`
+        self.rest = (tuple(leaves), structure)
+
+    @property
+    def function(self) -> Any:
+        """What was given, with the arrays of now."""
+        leaves, structure = self.rest
+        return eqx.combine(self.arrays, jax.tree.unflatten(structure, leaves))
+
+    def __call__(self, *args: Any, **more: Any) -> Any:
+        return self.function(*args, **more)
+
+
 @dataclasses.dataclass(frozen=True)
 class ParameterInfo:
     """What `parameter` was given: whether the value must be positive, the shape of one value, and its unit."""
@@ -86,6 +135,12 @@ def check_fields(system: System) -> None:
     """Refuse numbers that a description counts with, names and switches as fields that JAX would trace."""
     for path, value in jax.tree_util.tree_leaves_with_path(system):
         name = path[0].name
+        if callable(value):
+            raise TypeError(
+                f"{type(system).__name__}.{name} holds a function, {value!r}, which JAX cannot trace. A function with "
+                f"parameters, as a neural network, is declared by `{name}: Any = jk.learned()`; one without, by "
+                f"`{name}: Any = equinox.field(static=True)`."
+            )
         if isinstance(value, (bool, int, str)) and name not in parameter_info(system):
             whole = getattr(system, name)
             kind = type(whole).__name__
@@ -119,6 +174,20 @@ def check_parameter(label: str, value: Any, info: ParameterInfo) -> None:
 def leaf_name(path: tuple[Any, ...]) -> str:
     """A leaf's name as it is written in Python: "mass", "frame.mass", "links[2].mass"."""
     return jax.tree_util.keystr(path).lstrip(".")
+
+
+def learned_part(system: Any, path: tuple[Any, ...]) -> str:
+    """The name of the learned function that holds this leaf, or ""."""
+    for i, key in enumerate(path):
+        if isinstance(key, jax.tree_util.GetAttrKey):
+            system = getattr(system, key.name)
+        elif isinstance(key, jax.tree_util.SequenceKey):
+            system = system[key.idx]
+        else:
+            system = system[key.key] if isinstance(key, jax.tree_util.DictKey) else None
+        if isinstance(system, Learned):
+            return leaf_name(path[: i + 1])
+    return ""
 
 
 def declared(system: Any, path: tuple[Any, ...]) -> ParameterInfo:

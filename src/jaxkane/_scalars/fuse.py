@@ -42,6 +42,7 @@ from .jax_internals import (
     settings,
 )
 from .native import Scalars
+from .products import is_small, sum_of_products
 from .reads import on_forget, settling, version_of
 
 # What one compiled function may hold: elementwise work and the moving of scalars. Calls into libraries (LAPACK) may not
@@ -391,7 +392,8 @@ if FUSES is None:
 
 
 def without_repetition(program: ClosedJaxpr) -> ClosedJaxpr:
-    """The same program with every common subexpression once, and without what no output needs.
+    """The same program with every common subexpression once, and without what no output needs; products of small
+    matrices, which XLA would hand to a library, are sums of products.
 
     A description is read once for every speed, and much of it comes out the same. XLA would find that too, but only
     after JAX has differentiated every copy.
@@ -416,7 +418,8 @@ def _evaluate_once(program: Jaxpr, consts: Sequence[Any], args: Sequence[Any], k
             names = [_bits(v) if isinstance(v, Literal) else id(read(v)) for v in equation.invars]
             key = (equation.primitive, *names, _name_of(equation))
             if key not in known:
-                outputs = bound(equation, inputs)
+                is_product = equation.primitive.name == "dot_general" and is_small(equation)
+                outputs = sum_of_products(equation, *inputs) if is_product else bound(equation, inputs)
                 known[key] = outputs if equation.primitive.multiple_results else [outputs], inputs
             outputs = known[key][0]
         values.update(zip(equation.outvars, outputs, strict=True))
@@ -457,6 +460,8 @@ def _foreign(program: Jaxpr, is_ours: bool = False) -> Iterator[tuple[str, bool]
         name, inner = equation.primitive.name, _called(equation)
         if inner is not None:
             yield from _foreign(inner.jaxpr, is_ours or BY_LAPACK in equation.params.get("name", ""))
+        elif name == "dot_general" and is_small(equation):
+            continue  # see `without_repetition`
         elif name not in _PLAIN:
             yield name, not is_ours
         elif name.startswith("reduce_") and getattr(equation.invars[0].aval, "size", 0) > _LARGEST_SUM:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..._common.lookup import hint
-from ..._description.parameters import declared, leaf_name
+from ..._description.parameters import declared, leaf_name, learned_part
 from ..._description.system import System
 from ..._description.units import unit_of, units_of
 from .bijections import Interval, PossibleBody
@@ -156,6 +156,7 @@ class _Entry:
     unit: str
     targets: tuple[tuple[int, int, float], ...] = ()
     role: tuple[str, str] | None = None  # ("gain" or "delay", input), ("intensity", disturbed), ("sigma", channel)
+    part: str = ""  # the learned function that it belongs to
 
 
 class Parameters(eqx.Module):
@@ -179,6 +180,11 @@ class Parameters(eqx.Module):
     @property
     def units(self) -> tuple[str, ...]:
         return tuple(e.unit for e in self.entries)
+
+    @property
+    def learned(self) -> tuple[str, ...]:
+        """Of every value the learned function that it belongs to, or "": such a number means nothing by itself."""
+        return tuple(e.part for e in self.entries)
 
     def values(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
         """Parameters in their own units."""
@@ -339,7 +345,8 @@ def _of_leaves(system: System, item: Free):
             label += str(list(index)) if leaf.ndim else ""
             start = float(leaf[index]) if item.start is None else float(item.start)
             info = declared(system, path)
-            entry = _Entry(label, item.unit or info.unit, ((i, place, 1.0), *followers))
+            targets = ((i, place, 1.0), *followers)
+            entry = _Entry(label, item.unit or info.unit, targets, part=learned_part(system, path))
             parts.append(_scalar(entry, item, start, info.positive))
     return parts
 

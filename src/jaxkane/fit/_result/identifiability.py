@@ -126,7 +126,9 @@ def identifiability_at(problem: Problem, point: Unknowns, at: Linearization, fla
         covariance=covariance,
         covariance_of_x=to_x @ scaled @ to_x.T,
     )
-    weak = [i for i in reversed(range(p)) if not deviations[i] <= flat]
+    # That the numbers of a learned function are not determined one by one is as it should be.
+    physical = np.array([not part for part in parameters.learned])
+    weak = [i for i in reversed(range(p)) if not deviations[i] <= flat and np.any(np.abs(V[i, physical]) > 0.1)]
     return dataclasses.replace(found, undetermined=tuple(_direction(found, i) for i in weak))
 
 

@@ -177,9 +177,10 @@ def bodies_at_the_edge(fit: Fit) -> list[str]:
 def trade_offs(fit: Fit) -> list[str]:
     """Pairs of parameters of which the data determine little more than a combination."""
     notes, correlation = [], fit.correlation
+    learned = fit.parameters.learned
     for i, name in enumerate(fit.names):
         for j in range(i):
-            if abs(correlation[i, j]) > 0.95:
+            if abs(correlation[i, j]) > 0.95 and not (learned[i] and learned[j]):
                 notes.append(f"{fit.names[j]} and {name} trade off: their correlation is {correlation[i, j]:.3f}.")
     return notes
 
@@ -189,7 +190,7 @@ def only_priors(fit: Fit) -> list[str]:
     notes, deviations = [], np.asarray(fit.parameters.prior_deviation)
     for i, name in enumerate(fit.names):
         error = np.sqrt(fit.identifiability.covariance[i, i] / fit.variance)
-        if np.isfinite(deviations[i]) and error > 0.95 * deviations[i]:
+        if not fit.parameters.learned[i] and np.isfinite(deviations[i]) and error > 0.95 * deviations[i]:
             notes.append(f"{name} is known by its prior alone: the data add nothing.")
     return notes
 
@@ -197,10 +198,12 @@ def only_priors(fit: Fit) -> list[str]:
 def far_from_start(fit: Fit) -> list[str]:
     """Estimates that left what the user thought plausible by far, and are still called precise."""
     notes = []
-    of_noise = {e.name for e in fit.parameters.entries if e.role and e.role[0] in ("intensity", "sigma")}
+    means_nothing = {  # of noise nobody knows the size beforehand
+        e.name for e in fit.parameters.entries if e.part or (e.role and e.role[0] in ("intensity", "sigma"))
+    }
     for name, value in fit.estimates.items():
         start, error = fit.start[name], fit.standard_errors[name]
-        if name in of_noise:  # nobody knows the size of noise beforehand
+        if name in means_nothing:
             continue
         if start != 0 and not 0.4 <= value / start <= 2.5 and error < 0.2 * abs(value):
             notes.append(

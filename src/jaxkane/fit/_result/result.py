@@ -284,12 +284,20 @@ class Fit:
         head = f"{'parameter':<22}{'start':>12}{'estimate':>12}{'std. error':>12}"
         lines = [head + (f"{'truth':>12}{'error':>9}" if known else "")]
         errors, start = self.standard_errors, self.start
-        for name, unit, value in zip(self.names, self.parameters.units, self.estimates.values(), strict=True):
+        parameters = self.parameters
+        for name, unit, part in zip(self.names, parameters.units, parameters.learned, strict=True):
+            if part:
+                continue
+            value = self.estimates[name]
             line = f"{name:<22}{start[name]:>12.5g}{value:>12.5g}{errors[name]:>12.2g}"
             if name in known:
                 right = known[name]
                 line += f"{right:>12.5g}{(value / right - 1 if right else value):>9.2{'%' if right else 'g'}}"
             lines.append(f"{line}  {unit}".rstrip())
+        for part in dict.fromkeys(filter(None, parameters.learned)):
+            own = [name for name, p in zip(self.names, parameters.learned, strict=True) if p == part]
+            size = [float(np.sqrt(np.mean([at[name] ** 2 for name in own]))) for at in (start, self.estimates)]
+            lines.append(f"{part:<22}{size[0]:>12.5g}{size[1]:>12.5g}  rms of {len(own)} learned numbers")
         return "\n".join(lines)
 
     def __str__(self) -> str:
