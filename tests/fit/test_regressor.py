@@ -73,6 +73,26 @@ class SwingElsewhere(Swing):
         return jk.Force(self.m1 * down, motion["link1"]), jk.Force(self.m2 * down, G)
 
 
+class SwingInAField(Swing):
+    """The weight grows with the height of the mass centre."""
+
+    def weights(self, motion):
+        height = motion["link2"].center.position.dot(motion.N.y)
+        return jk.weight(motion, -(9.8 + height) * motion.N.y)
+
+
+class Sprung(Swing):
+    """A spring of an unknown stiffness, at rest at an unknown angle, and a law that is not linear in a number."""
+
+    stiffness: jax.Array = jk.parameter([0.3, 0.0])
+    rest: jk.Scalar = jk.parameter(0.2)
+    power: jk.Scalar = jk.parameter(0.0)
+
+    def loads(self, t, q, u, motion, inputs):
+        T = -self.stiffness[0] * (q[0] - self.rest) - self.stiffness[1] * q[0] ** 3 - self.power**2 * q[0]
+        return self.weights(motion), jk.Torque(T * motion.N.z, motion["link1"])
+
+
 class Sledge(jk.System):
     """On a knife edge, which does not move sideways: a dependent speed."""
 
@@ -202,6 +222,15 @@ def test_what_is_not_linear_is_refused():
     ):
         with pytest.raises(ValueError, match=said):
             regressor(Swing(), *i, **kwargs)
+    with pytest.raises(ValueError, match="a gravity that is not uniform"):
+        regressor(SwingInAField(), *i)
+    with pytest.raises(ValueError, match="not linear in stiffness"):
+        regressor(Sprung(), *i, parameters=("stiffness", "rest"))
+    with pytest.raises(ValueError, match="not linear in power"):
+        regressor(Sprung(), *i, parameters="power")
+    spring = regressor(Sprung(), *i, parameters="stiffness")
+    assert spring.names[-2:] == ("stiffness[0]", "stiffness[1]")
+    np.testing.assert_allclose(spring.matrix[0, -2:], [at.q[3, 0] - 0.2, at.q[3, 0] ** 3], rtol=1e-12)
     with pytest.raises(ValueError, match="u_dot must have the shape"):
         regressor(Swing(), *i[:3], np.zeros(3))
     with pytest.raises(TypeError, match="instance of a System"):
@@ -383,6 +412,9 @@ def test_bad_data_are_refused_by_name():
         base_parameters(truth, Instants(at.t, at.q, at.u, at.u_dot, {"torque3": 0.0}))
     with pytest.raises(ValueError, match="look at rate2"):
         base_parameters(truth, at, sigma={"rate1": 0.1})
+    nothing = np.zeros((60, 2))
+    with pytest.raises(ValueError, match="Nothing moves and nothing acts"):
+        base_parameters(truth, Instants(at.t, nothing, nothing, nothing), bodies=ARMS)
     t = np.linspace(0.0, 1.0, 101)
     with pytest.raises(ValueError, match="angle2 was not measured"):
         instants_of(truth, Trial(t, {"angle1": t}, sigma=0.1))
@@ -463,6 +495,8 @@ def test_bodies_that_can_be():
     assert not guess.ok
     assert guess.strain > 3
     assert not guess.impossible
+    assert "kg, centre at (" in guess.bodies[0]
+    assert f"principal moments {moments[0]:.5g}, {moments[1]:.5g}, {moments[2]:.5g} kg m^2, along (" in str(guess)
     jk.accelerations(guess.system, 0.0, exact.q[0], exact.u[0])  # which refuses bodies that cannot be
 
 

@@ -60,7 +60,9 @@ class _Equations:
         b = self.W.shape[2]
         moving = [j for j in range(b) if j != self.held]
         A: Any = self.W[:, :, moving] * self.scale[moving]  # (N,n,m)
-        least = _EXACT * self.size + 1e-300
+        if not self.size.any():
+            raise ValueError("Nothing moves and nothing acts at these instants: every term of the equations is zero.")
+        least = _EXACT * np.where(self.size > 0, self.size, self.size.max())
         deviation: Any = np.ones(len(self.speeds))
         if sigma:
             deviation = np.array([sigma[name] for name in self.speeds])
@@ -115,6 +117,7 @@ class _Equations:
         R: Any = np.linalg.qr(rows, mode="r") if len(rows) > m else rows
         _, s, V = np.linalg.svd(R[:, :m], full_matrices=True)
         s = np.pad(s, (0, m - len(s)))
+        V = V * np.sign(V[np.arange(m), np.abs(V).argmax(axis=1)])[:, None] if m else V
         fine = s > _ROUNDING * s.max(initial=0.0)
         if not fine.any():
             return s, V, np.zeros(m)

@@ -18,6 +18,7 @@ from ..._scalars.reads import compiled
 from .._data.trial import Trial
 from .._problem.parameters import Parameters, parameters_of
 from .._result.base_parameters import BaseParameters
+from .._result.bodies import bodies_in_words
 from .base_parameters import states_for, structure_of_states
 from .base_structure import equations_at
 from .equation_error import estimated
@@ -39,6 +40,7 @@ class FirstGuess:
     - `strain`: how far the second are from the first, in standard deviations; where it is above 3 (`ok`), no body has
         what the equations ask for: the model lacks something, or the accelerations are too noisy.
     - `spacing` [s]: of the knots from which accelerations were taken; NaN where nothing had to be smoothed.
+    - `bodies`: those that were freed as `Inertia(...)`, each as a whole, in words.
     - `impossible`: why bodies are refused that were not freed as `Inertia(...)`; empty where all can be.
     """
 
@@ -50,6 +52,7 @@ class FirstGuess:
     strain: float
     spacing: float
     impossible: str
+    bodies: tuple[str, ...]
 
     @property
     def ok(self) -> bool:
@@ -59,7 +62,12 @@ class FirstGuess:
         width = max(map(len, self.values))
         lines = [f"{'':<{width}}         start         found"]
         lines += [f"{name:<{width}}  {self.starts[name]:12.5g}  {x:12.5g}" for name, x in self.values.items()]
-        lines += ["", str(self.base), f"bodies that can be are {self.strain:.2g} standard deviations from these"]
+        lines += [
+            *self.bodies,
+            "",
+            str(self.base),
+            f"bodies that can be are {self.strain:.2g} standard deviations from these",
+        ]
         return "\n".join([*lines, *[self.impossible] * bool(self.impossible)])
 
     __repr__ = __str__
@@ -107,8 +115,8 @@ def first_guess(
     structure = structure_of_states(chosen)
     base, spacing = _best(system, chosen, structure, motions, sigma, spacing)
     x, strain = _nearest(chosen, parameters, base)
-    found, _ = parameters.apply(system, jnp.asarray(x, parameters.start.dtype))
-    values = np.asarray(parameters.values(jnp.asarray(x, parameters.start.dtype)))
+    at = jnp.asarray(x, parameters.start.dtype)
+    found, values = parameters.apply(system, at)[0], np.asarray(parameters.values(at))
     return FirstGuess(
         found,
         dict(zip(parameters.names, values.tolist(), strict=True)),
@@ -118,6 +126,7 @@ def first_guess(
         strain,
         spacing,
         _why_impossible(found),
+        tuple(bodies_in_words(parameters, at)),
     )
 
 

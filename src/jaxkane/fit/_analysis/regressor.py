@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -249,6 +249,8 @@ class _Linearity:
             "pi": values[self.of_bodies],
             "told": values[self.told & self.of_bodies],
             "right": found.forces - Y[:, known] @ values[known],
+            "of bodies": Y[:, self.of_bodies],
+            "moving": np.concatenate([x.ravel() for x in (now.V, now.W, now.a, now.alpha, now.omega)]),
         }
         return pieces, now.g
 
@@ -258,29 +260,36 @@ class _Linearity:
         if not all(np.all(np.isfinite(x)) for x in now.values()):
             return False
         self._check_weights(g)
-        own = {leaf for leaf, _ in self.chosen.places}
+        for path, is_own, changes in self._changes(now):
+            if is_own:
+                self._judge_own(leaf_name(path), changes)
+            elif "pi" in changes and "moving" not in changes:
+                self._judge_of_body(leaf_name(path), changes)
+        return True
+
+    def _changes(self, now: Mapping[str, np.ndarray]) -> Iterator[tuple[Any, bool, set[str]]]:
+        """What changes with each number of the system; those of the other parameters first."""
         with_path, structure = jax.tree_util.tree_flatten_with_path(self.system)
         leaves = [leaf for _, leaf in with_path]
         size = np.abs(now["Y"]).max() + np.abs(now["tau"]).max()
-        for i, (path, leaf) in enumerate(with_path):
-            # Leaves that move no mass may be lengths, on which the right side depends as it may.
-            if i not in own and i not in self.chosen.described.leaves:
-                continue
-            for place in range(np.size(leaf)):
-                moved = np.array(leaf)
-                moved.flat[place] = 1.3 * moved.flat[place] + (0.1 if moved.flat[place] >= 0 else -0.1)
-                other = [*leaves[:i], jnp.asarray(moved), *leaves[i + 1 :]]
-                then, _ = self.read(jax.tree.unflatten(structure, other))
-                changes = {k for k in now if self._differs(then[k], now[k], size if k in ("tau", "right") else 0.0)}
-                if (i, place) in self.chosen.places:
-                    self._judge_own(leaf_name(path), changes)
-                elif i not in own and "pi" in changes and "Y" not in changes and "tau" in changes:
-                    self._refuse_leaf(leaf_name(path))
-        return True
+        own = list(self.chosen.places)
+        others = [(i, place) for i, leaf in enumerate(leaves) for place in range(np.size(leaf))]
+        for i, place in [*own, *(each for each in others if each not in own)]:
+            path, leaf = with_path[i]
+            moved = np.array(leaf)
+            moved.flat[place] = 1.3 * moved.flat[place] + (0.1 if moved.flat[place] >= 0 else -0.1)
+            other = [*leaves[:i], jnp.asarray(moved), *leaves[i + 1 :]]
+            then, _ = self.read(jax.tree.unflatten(structure, other))
+            changes = {k for k in now if self._differs(then[k], now[k], size if k in ("tau", "right") else 0.0)}
+            yield path, (i, place) in own, changes | ({"mass"} if i in self.chosen.described.leaves else set())
 
     def _differs(self, x: np.ndarray, y: np.ndarray, size: float) -> bool:
-        size = max(size, float(np.max(np.abs(y), initial=0.0)))
-        return not float(np.max(np.abs(x - y), initial=0.0)) <= self.tolerance * size
+        """Whether a number, or a column of a matrix, has changed by more than rounding."""
+        if not x.size:
+            return False
+        own = np.abs(y).max(axis=0) if y.ndim == 2 else np.abs(y)
+        size = np.maximum(size, own + 1e-6 * np.abs(y).max())
+        return not bool(np.all(np.abs(x - y) <= self.tolerance * size))
 
     def _judge_own(self, parameter: str, changes: set[str]) -> None:
         if "told" in changes:
@@ -295,7 +304,16 @@ class _Linearity:
                 "of a stiffness and the angle at rest, is linear in one of them alone."
             )
 
-    def _refuse_leaf(self, parameter: str) -> None:
+    def _judge_of_body(self, parameter: str, changes: set[str]) -> None:
+        if "of bodies" in changes:
+            raise ValueError(
+                f"{self.name}: with another {parameter}, which moves no point but a mass centre, the weight by mass "
+                "changes: a gravity that is not uniform is not linear in a body's first moment. Leave the body out of "
+                "`bodies`."
+            )
+        # The right side may depend on lengths as it may, but on no mass.
+        if "mass" not in changes or not changes & {"Y", "tau"}:
+            return
         raise ValueError(
             f"{self.name}: {parameter} changes the parameters of a body, and loads beside them that are no weight at "
             "the body's mass centre: the right side would depend on what is to be found. Write weights as "

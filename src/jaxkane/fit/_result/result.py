@@ -21,6 +21,7 @@ from .._problem.parameters import Parameters, leaf_names
 from .._problem.problem import STEP_TOLERANCE, Linearization, Problem, all_of
 from .._problem.state_file import described, write_state
 from . import covariance, notes, residuals
+from .bodies import bodies_in_words
 from .identifiability import Identifiability, identifiability_at, residual_variance
 from .residuals import ByTrial, ResidualTest, residual_test
 
@@ -303,7 +304,8 @@ class Fit:
     def __str__(self) -> str:
         name = self.problem.cost_name
         end = f"{name} {self.history[0]:.6g} -> {self.cost:.6g} by {self.method}: {STATUS[self.status]}"
-        return "\n".join([self.title, self.table(), end, *self.notes])
+        bodies = bodies_in_words(self.parameters, self.point.x)
+        return "\n".join([self.title, self.table(), *bodies, end, *self.notes])
 
     @property
     def title(self) -> str:
