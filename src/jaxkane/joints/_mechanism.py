@@ -111,6 +111,29 @@ class Mechanism(System):
             raise ValueError(f"{type(self).__name__} has no parameter {wrong[0]!r}; {hint(wrong, names, 'it has')}")
         return dataclasses.replace(self, **values)
 
+    def with_outputs(self, outputs: Callable[..., Any], parameters: Mapping[str, Any] | None = None) -> Mechanism:
+        """A copy that carries sensors: `outputs(self, t, q, u, motion, now)`, as that of a `System`.
+
+            def outputs(self, t, q, u, motion, now):
+                frame, point = motion.sites["imu"]
+                box = frame.rotate_fixed((self.tilt, 0.0, 0.0))
+                return {"imu": jk.sensors.imu(now, point, box, -9.81 * motion.N.z)}
+
+            arm = arm.with_outputs(outputs, {"tilt": 0.0})
+
+        **Arguments:** `parameters`: numbers by name that it reads of itself, parameters as all others. `motion.sites`
+        are pairs of the frame and the point of every site.
+
+        **Raises:** `ValueError` for a parameter that it has already, or that is no name of Python.
+        """
+        given = dict(parameters or {})
+        twice = [name for name in given if hasattr(self, name) or not name.isidentifier()]
+        if twice:
+            raise ValueError(f"{type(self).__name__}: {twice[0]!r} cannot be the name of another parameter.")
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        kind: Any = type(self)
+        return _equipped(kind, outputs, tuple(given))(**values, **given)
+
     def _read(self, name: str) -> Component:
         return getattr(self, name, 0.0)
 
@@ -342,6 +365,33 @@ def class_of(structure: Structure, fields: tuple[Field, ...]) -> type[Mechanism]
     }
     made: Any = type(Mechanism)(structure.name, (Mechanism,), members | of_parameters)  # pyright: ignore
     return made
+
+
+@functools.lru_cache(maxsize=1000)
+def _equipped(kind: type[Mechanism], outputs: Callable[..., Any], names: tuple[str, ...]) -> type[Mechanism]:
+    """A class of mechanisms with outputs, and parameters that these read."""
+    members: dict[str, Any] = {
+        "__module__": __name__,
+        "__doc__": kind.__doc__,
+        "__annotations__": dict.fromkeys(names, Scalar),
+        "__init__": Mechanism.__init__,
+        "__reduce__": _reduced_with_outputs,
+        "outputs": outputs,
+        "equipment": (kind, outputs, names),
+        **{name: parameter() for name in names},
+    }
+    return type(Mechanism)(kind.__name__, (kind,), members)  # pyright: ignore
+
+
+def _reduced_with_outputs(self: Any) -> Any:
+    kind, outputs, names = type(self).equipment
+    own = {name: getattr(self, name) for name in names}
+    rest = {f.name: getattr(self, f.name) for f in dataclasses.fields(self) if f.name not in own}
+    return _restored_with_outputs, (kind(**rest), outputs, own)
+
+
+def _restored_with_outputs(mechanism: Mechanism, outputs: Callable[..., Any], own: dict[str, Any]) -> Mechanism:
+    return mechanism.with_outputs(outputs, own)
 
 
 def _restored(structure: Structure, fields: tuple[Field, ...], values: dict[str, Any]) -> Mechanism:
