@@ -11,6 +11,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from systems import POSED, TRIAL, Track
 
 import jaxkane as jk
 from jaxkane._description.parameters import parameter_info
@@ -241,11 +242,7 @@ def test_fits(style):
 
 @pytest.fixture(scope="module")
 def real():
-    system, t = jk.catalog.BarWithPiston(), np.linspace(0.0, 0.3, 31)
-    ride = jk.simulate(system, jk.State(jnp.array([0.6]), jnp.array([-0.9])), jnp.asarray(t))
-    (name,), (speed,) = system.coordinates, system.speeds
-    trial = jk.fit.Trial(t, {name: np.asarray(ride[name])}, sigma=0.01, initial={name: 0.6, speed: -0.9})
-    return jk.fit.fit(system, [trial], ("damping",), optimizer=jk.fit.LeastSquares(), steps=1)
+    return jk.fit.fit(Track(), [TRIAL], ["gain", "drift"], optimizer=jk.fit.LeastSquares(), steps=1, **POSED)
 
 
 def test_a_real_fit_is_drawn(real):

@@ -1,6 +1,9 @@
-"""A mechanism for tests: a mass between a spring and a damper, pushed."""
+"""Mechanisms for tests of fits, and a small problem whose programs all share that ask for no other."""
+
+import numpy as np
 
 import jaxkane as jk
+from jaxkane.fit import Simulation, Trial
 
 
 class Cart(jk.System):
@@ -41,3 +44,9 @@ class Track(jk.System):
 
     def loads(self, t, q, u, motion, inputs):
         return (jk.Force((self.gain * inputs["push"] + self.drift) * motion.N.x, motion["cart"]),)
+
+
+T = np.linspace(0.0, 1.0, 11)
+PUSH, SEEN = np.sin(3.0 * T), 0.4 * T**2 + 0.02 * np.cos(40.0 * T)
+TRIAL = Trial(T, {"x": SEEN}, {"push": PUSH}, sigma=0.1)
+POSED = {"unknown": ("x",), "simulation": Simulation(step=0.1)}  # of ["gain", "drift"] of a `Track`

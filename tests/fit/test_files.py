@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from systems import Track
+from systems import POSED, PUSH, SEEN, TRIAL, Track
+from systems import T as t
 
 import jaxkane.fit._problem.problem as posing
 from jaxkane.fit import (
@@ -23,19 +24,14 @@ from jaxkane.fit import (
 from jaxkane.fit._problem.problem import cost, linearize
 from jaxkane.sweep import grid
 
-t = np.linspace(0.0, 1.0, 11)
-PUSH = np.sin(3.0 * t)
-SEEN = 0.4 * t**2 + 0.02 * np.cos(40.0 * t)
-
 
 def pose(**options):
-    trial = Trial(t, {"x": SEEN}, {"push": PUSH}, sigma=0.1, initial={"x": 0.0, "x_dot": 0.0})
-    return Problem.of(Track(), trial, ["gain", "drift"], **options)
+    return Problem.of(Track(), TRIAL, ["gain", "drift"], **{"unknown": ("x",)} | options)
 
 
 @pytest.fixture(scope="module")
 def problem():
-    return pose(simulation=Simulation(step=0.1))
+    return pose(**POSED)
 
 
 def after(n):
@@ -91,8 +87,8 @@ def test_a_checkpoint_says_in_what_another_fit_differs(problem, tmp_path):
         r"initial guesses, priors \(": lambda: minimize(
             problem.with_priors({"gain": (1.0, 0.1)}), GradientDescent(), checkpoint=path
         ),
-        r"unknown starts \(none there, x here\)": lambda: minimize(
-            pose(unknown=["x"], simulation=Simulation(step=0.1)), GradientDescent(), checkpoint=path
+        r"unknown starts \(x there, none here\)": lambda: minimize(
+            pose(**POSED | {"unknown": ()}), GradientDescent(), checkpoint=path
         ),
     }
     before = path.read_bytes()

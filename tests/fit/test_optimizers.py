@@ -6,7 +6,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from systems import Track
+from systems import POSED, TRIAL, Track
 
 from jaxkane.fit import (
     BFGS,
@@ -15,8 +15,6 @@ from jaxkane.fit import (
     LeastSquares,
     Optimizer,
     Problem,
-    Simulation,
-    Trial,
     fit,
     minimize,
     multi_start,
@@ -25,10 +23,6 @@ from jaxkane.fit import (
 from jaxkane.fit._optimize.steps import moved
 from jaxkane.fit._problem.blocks import eliminate
 from jaxkane.fit._problem.problem import linearize
-
-t = np.linspace(0.0, 1.0, 11)
-TRIAL = Trial(t, {"x": 0.4 * t**2 + 0.02 * np.cos(40.0 * t)}, {"push": np.sin(3.0 * t)}, sigma=0.1)
-POSED = {"unknown": ("x",), "simulation": Simulation(step=0.1)}
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from systems import Cart, Track
+from systems import PUSH, SEEN, Cart, Track
+from systems import T as t
 
 import jaxkane as jk
 from jaxkane._common.digest import differences
@@ -26,9 +27,6 @@ from jaxkane.fit import (
 )
 from jaxkane.fit._problem.state_file import described
 
-t = np.linspace(0.0, 1.0, 11)
-PUSH = np.sin(3.0 * t)
-SEEN = 0.4 * t**2 + 0.02 * np.cos(40.0 * t)
 TRIALS = [Trial(t, {"x": SEEN + 0.01 * k}, {"push": PUSH}, sigma=0.1, initial={"x_dot": 0.0}) for k in (0, 1)]
 FREE = ["gain", "drift"]
 
