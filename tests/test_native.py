@@ -67,6 +67,7 @@ def every_operation(x):
 
 # Whoever is told that something cannot be part of one function, or of a kernel, compares XLA with itself.
 @pytest.mark.filterwarnings("error:.*its description uses")
+@pytest.mark.parametrize("kernels", ["native", pytest.param("XLA", marks=pytest.mark.slow)], indirect=True)
 def test_every_operation(plainly, kernels):
     x, expected = plainly
     program = fused(every_operation)

@@ -49,16 +49,17 @@ def trajectory(status=0, t_end=2.0, batch=()):
     q = np.stack([0.1 * np.sin(3 * t), 4.0 * t], axis=-1)
     q[..., 21:, :] = np.where(np.broadcast_to(np.asarray(status), batch)[..., None, None] == 0, q[..., 21:, :], np.nan)
     stats = {name: jnp.asarray(41) for name in ("steps", "accepted", "rejected")}
-    arrays = (t, q, np.cos(t)[..., None], np.zeros((*t.shape, 0)))
+    none = np.zeros((*t.shape, 0))
     return jk.Trajectory(
-        *map(jnp.asarray, arrays),
-        {"steer_torque": jnp.ones_like(jnp.asarray(t))},
-        jnp.asarray(status),
-        jnp.asarray(t_end),
-        stats,
-        (("roll", "x"), ("yaw_rate",), ()),
-        ("fell_over",),
-        "none",
+        **{name: jnp.asarray(x) for name, x in dict(t=t, q=q, u=np.cos(t)[..., None], u_dep=none, x=none).items()},
+        inputs={"steer_torque": jnp.ones_like(jnp.asarray(t))},
+        outputs={},
+        status=jnp.asarray(status),
+        t_end=jnp.asarray(t_end),
+        stats=stats,
+        names=(("roll", "x"), ("yaw_rate",), (), ()),
+        events=("fell_over",),
+        adjoint="none",
         units=(("roll", "rad"), ("yaw_rate", "rad/s"), ("x", "m"), ("steer_torque", "N m")),
     )
 

@@ -302,9 +302,9 @@ def test_gradients_of_the_bicycle():
 def test_float32_and_what_follows_from_it():
     pendulum = jax.tree.map(lambda x: x.astype(jnp.float32), PENDULUM)
     start = jax.tree.map(lambda x: x.astype(jnp.float32), START)
-    ride = jk.simulate(pendulum, start, np.linspace(0.0, 1.0, 11), {"elbow_torque": 0.5})
+    ride = jk.simulate(pendulum, start, np.linspace(0.0, 1.0, 11), {"elbow_torque": 0.0})
     assert ride.q.dtype == ride["elbow_torque"].dtype == jnp.float32
-    reference = jk.simulate(PENDULUM, START, TS, {"elbow_torque": 0.5})
+    reference = jk.simulate(PENDULUM, START, TS)
     np.testing.assert_allclose(np.asarray(ride.q), np.asarray(reference.q), atol=1e-3)
 
 
