@@ -19,6 +19,7 @@ import jaxkane as jk
 from jaxkane.fit import (
     BFGS,
     Fit,
+    Free,
     GradientDescent,
     Intensity,
     LeastSquares,
@@ -26,9 +27,11 @@ from jaxkane.fit import (
     Sigma,
     Simulation,
     Trial,
+    find_continuity,
     fit,
     load,
     log_density,
+    marginal_likelihood,
     minimize,
     report,
     smoothed,
@@ -325,6 +328,56 @@ def test_biases_inputs_and_several_trials():
         assert held.nuisance[name]["bias of x"] == pytest.approx(estimates[k], rel=1e-6)
 
 
+def linked(y, t, values, jump, factor=1.0):
+    """-2 log likelihood of steps between samples, each disturbed by jumps of these deviations, and state (n_t, 2)."""
+    mean, P, total = START, np.diag(DEVIATION**2), 0.0
+    for i in range(len(t)):
+        if i:
+            Phi, _ = transition(t[i] - t[i - 1], *values, 0.0)
+            disturbed = i < len(t) - 1  # the last sample belongs to the window before it
+            mean, P = Phi @ mean, Phi @ P @ Phi.T + disturbed * np.diag(np.square(jump))
+        for j, (name, sigma) in enumerate(SIGMA.items()):
+            if np.isfinite(y[name][i]):
+                s, e = P[j, j] + (sigma * (factor if name == "x" else 1.0)) ** 2, y[name][i] - mean[j]
+                total += e**2 / s + np.log(2 * np.pi * s)
+                mean, P = mean + P[:, j] * e / s, P - np.outer(P[:, j], P[j]) / s
+    return total
+
+
+@pytest.mark.slow
+def test_windows_with_their_log_determinant_are_a_filter():
+    """As short as the samples, linked by what disturbs them; their deviations are found with that of the sensor."""
+    t, jump = np.arange(0.0, 3.0, 0.1), np.array([0.01, 0.15])
+    rng, state, rows = np.random.default_rng(8), START + DEVIATION * np.random.default_rng(7).normal(size=2), []
+    Phi, _ = transition(0.1, STIFFNESS, DAMPING, 0.0)
+    for _ in t:
+        rows.append(state)
+        state = Phi @ state + jump * rng.normal(size=2)
+    noise = np.array(list(SIGMA.values())) * rng.normal(size=(t.size, 2))
+    y = dict(zip(SIGMA, (np.array(rows) + noise).T, strict=True))
+    options = {"unknown": OPTIONS["unknown"], "window": 0.05, "simulation": TIGHT}
+    begun = {"x": 0.02, "x_dot": 0.1}
+    # The parameters are held by their priors, so that both are functions of the deviations alone.
+    free = [Free(name, prior=(x, 1e-7)) for name, x in (("stiffness", STIFFNESS), ("damping", DAMPING))]
+    first = fit(Cart(), trial_of(y, t), free, continuity=begun, optimizer=LeastSquares(rtol=1e-12), **options)
+    values = (STIFFNESS, DAMPING)
+    exact = linked(y, t, values, list(begun.values()))
+    assert -2 * marginal_likelihood(first) == pytest.approx(exact, rel=1e-7)
+    # So they are of a filter.
+    quiet = fit(Cart(), trial_of(y, t), free, noise={"x_dot": 0.1}, simulation=TIGHT, unknown=OPTIONS["unknown"])
+    assert -2 * marginal_likelihood(quiet) == pytest.approx(minus_twice_log_likelihood(y, q=0.1, t=t), rel=1e-7)
+    found = find_continuity(first, sigma=("x",))
+    by_logarithms = lambda p: linked(y, t, values, np.exp(p[:2]), np.exp(p[2]))  # noqa: E731
+    least = scipy.optimize.minimize(by_logarithms, np.log([*begun.values(), 1.0]), method="Nelder-Mead")
+    assert -2 * marginal_likelihood(found) == pytest.approx(least.fun, abs=1e-3)
+    assert found.problem.posed["continuity"]["x_dot"] == pytest.approx(np.exp(least.x[1]), rel=0.05)
+    assert found.problem.trials[0].sigma["x"][0] == pytest.approx(SIGMA["x"] * np.exp(least.x[2]), rel=0.05)
+    with pytest.raises(ValueError, match="no windows are linked"):
+        find_continuity(quiet)
+    with pytest.raises(ValueError, match="roll"):
+        find_continuity(first, sigma=("roll",))
+
+
 class Swing(jk.System):
     """A pendulum by its angle."""
 
@@ -402,12 +455,12 @@ def test_coordinates_that_constraints_bind():
 @pytest.fixture(scope="module")
 def many():
     """A hundred sets of three runs of 8 s, disturbed, fitted with first guesses that are wrong: estimates, and whether
-    the intervals of 95 % hold the truth, (100, 4)."""
+    the intervals of 95 % hold the truth, (100, 4). Of 600 sets they held it in 94.3, 95.2, 95.5 and 96.2 %."""
     t = np.arange(0.0, 8.0, 0.1)
     truth = np.array([STIFFNESS, DAMPING, Q, 1.5])
     mean, P = joint(t)
     L = np.linalg.cholesky(P + 1e-14 * np.eye(len(P)))
-    rng, problem, estimates, held = np.random.default_rng(12), None, [], []
+    rng, problem, estimates, held = np.random.default_rng(99), None, [], []
     for _ in range(100):
         runs = (mean[:, None] + L @ rng.normal(size=(mean.size, 3))).T.reshape(3, -1, 2)
         noisy = runs + np.array([1.5 * SIGMA["x"], SIGMA["x_dot"]]) * rng.normal(size=runs.shape)

@@ -13,6 +13,8 @@ from ._analysis.instants import Instants as Instants
 from ._analysis.instants import instants_of as instants_of
 from ._analysis.laplace import Laplace as Laplace
 from ._analysis.laplace import laplace as laplace
+from ._analysis.marginal import find_continuity as find_continuity
+from ._analysis.marginal import marginal_likelihood as marginal_likelihood
 from ._analysis.motions import trajectories as trajectories
 from ._analysis.multistart import MultiStart as MultiStart
 from ._analysis.multistart import multi_start as multi_start

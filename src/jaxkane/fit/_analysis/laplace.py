@@ -87,24 +87,29 @@ def log_likelihood(problem: Problem, cost: float) -> float:
 
 def _log_priors(fit: Fit) -> tuple[float, str]:
     """The logarithm of all priors' densities, but for the squares in the cost; and what is improper, in words."""
-    problem, n = fit.problem, fit.problem.model.nuisance
     constants = fit.parameters.log_prior_constants
     improper = [name for name, constant in zip(fit.names, constants, strict=True) if np.isnan(constant)]
+    total = float(constants.sum()) + log_nuisance_priors(fit.problem)
+    if not improper:
+        return total, ""
+    return total, (
+        f"No evidence: without a prior, or both bounds, any value of {', '.join(improper)} is as likely as any other, "
+        "and no data are expected more than others. Give `prior` or `bounds`."
+    )
+
+
+def log_nuisance_priors(problem: Problem) -> float:
+    """Of starts, links of windows and trials' unknowns, the logarithm of their densities, but for the squares."""
+    n, total = problem.model.nuisance, 0.0
     counts = (  # how many densities of each nuisance value there are, whose squares are in the cost
         (n.start_deviation, np.asarray(problem.windows.first).sum() if n.chained else len(problem.places)),
         (n.trial_deviation, np.asarray(problem.windows.first).sum()),
         (n.jump, np.asarray(problem.windows.linked).sum()),
     )
-    total = constants.sum()
     for deviations, count in counts:
         known = np.asarray(deviations, float)[np.isfinite(deviations)]
-        total -= float(count) * np.sum(np.log(known) + 0.5 * LOG_2PI)
-    if not improper:
-        return float(total), ""
-    return float(total), (
-        f"No evidence: without a prior, or both bounds, any value of {', '.join(improper)} is as likely as any other, "
-        "and no data are expected more than others. Give `prior` or `bounds`."
-    )
+        total -= float(count) * float(np.sum(np.log(known) + 0.5 * LOG_2PI))
+    return total
 
 
 def _log_volume(fit: Fit, eliminated: Eliminated, s: np.ndarray) -> float:
