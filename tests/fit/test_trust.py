@@ -29,7 +29,8 @@ from jaxkane.fit import (
     save_report,
 )
 from jaxkane.fit._optimize.steps import solve_nuisance
-from jaxkane.fit._result.notes import contrary_rates, doubled_trials, empty_columns
+from jaxkane.fit._result.notes import doubled_trials, empty_columns
+from jaxkane.fit._result.records import suspicious_records
 from jaxkane.fit._result.residuals import residual_test
 
 NAMES = ("mass", "stiffness", "damping")
@@ -248,7 +249,7 @@ def test_a_rate_against_its_coordinate_and_a_column_of_zeros(trials):
     ]
     rated[1].measured["x_dot"] = np.zeros(T.shape)
     posed = Problem.of(GUESS, [*rated, rated[1]], NAMES, simulation=Simulation(step=0.1), **UNKNOWN)
-    (note,) = contrary_rates(posed)
+    (note,) = suspicious_records(posed)
     assert "run 0: x_dot runs against the change of x" in note
     assert "run 1: x_dot is 0 throughout" in empty_columns(posed)[0]
     assert doubled_trials(posed) == ["run 1 has the samples of run 1: what is measured once counts twice."]

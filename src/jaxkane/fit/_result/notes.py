@@ -11,6 +11,7 @@ import numpy as np
 from ..._method.checks import check_system
 from .._problem.bijections import PossibleBody
 from .._problem.problem import Problem
+from .records import DEGREE, suspicious_records
 
 if TYPE_CHECKING:
     from .result import Fit
@@ -31,8 +32,9 @@ def notes_of(fit: Fit) -> tuple[str, ...]:
         *far_from_start(fit),
         *only_priors(fit),
         *empty_columns(problem),
-        *contrary_rates(problem),
+        *suspicious_records(problem),
         *doubled_trials(problem),
+        *other_units(fit),
         *bad_channels(fit),
     )
 
@@ -52,21 +54,25 @@ def empty_columns(problem: Problem) -> list[str]:
     return notes
 
 
-def contrary_rates(problem: Problem) -> list[str]:
-    """A measured rate that runs against the measured coordinate: one of the two has the wrong sign."""
+def other_units(fit: Fit) -> list[str]:
+    """Channels that go as the simulation does, but many times as far or the other way."""
     notes = []
-    system = problem.system
-    for trial in problem.trials:
-        for coordinate in system.coordinates:
-            rates = [c for c in (f"{coordinate}_rate", f"{coordinate}_dot") if c in trial.measured]
-            if coordinate not in trial.measured or not rates:
-                continue
-            agreement = _correlation(np.gradient(trial.measured[coordinate], trial.t), trial.measured[rates[0]])
-            if agreement < -0.5:
-                notes.append(
-                    f"{trial.name}: {rates[0]} runs against the change of {coordinate} (correlation {agreement:.2f}): "
-                    "one of the two has the wrong sign."
-                )
+    for channel in fit.problem.channels:
+        pairs = [
+            (trial.measured[channel], fit.fitted[name][channel])
+            for name, trial in zip(fit.trial_names, fit.problem.trials, strict=True)
+            if channel in trial.measured
+        ]
+        measured, simulated = (np.concatenate(part) for part in zip(*pairs, strict=True))
+        agreement = _correlation(measured, simulated)
+        seen = np.isfinite(measured) & np.isfinite(simulated)
+        if abs(agreement) < 0.8:
+            continue
+        ratio = np.std(measured[seen]) / np.std(simulated[seen])
+        if 0.7 < ratio / DEGREE < 1.4:
+            notes.append(f"{channel} is about 57 times as large as simulated: it seems to be recorded in degrees.")
+        elif agreement < 0:
+            notes.append(f"{channel} goes the other way (correlation {agreement:.2f}): turned round, or upside down?")
     return notes
 
 

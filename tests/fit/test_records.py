@@ -1,0 +1,80 @@
+"""Suspicious records are named, each kind once for all trials; good ones, coarse ones and switched ones are not."""
+
+import types
+
+import numpy as np
+import pytest
+from systems import Cart
+
+import jaxkane as jk
+from jaxkane.fit import Free, LeastSquares, Simulation, Trial, fit
+from jaxkane.fit._result.records import suspicious_records
+
+t = np.linspace(0.0, 4.0, 201)
+x = 0.3 * np.sin(2.0 * t) + 0.05 * np.sin(7.3 * t)
+v = 0.6 * np.cos(2.0 * t) + 0.365 * np.cos(7.3 * t)
+noise = np.random.default_rng(0).normal(0.0, 1e-4, t.size)
+
+
+def told(*trials, coordinates=("x",)):
+    return suspicious_records(
+        types.SimpleNamespace(trials=trials, system=types.SimpleNamespace(coordinates=coordinates))
+    )
+
+
+def trial(measured, inputs=None, t=t, name="run"):
+    return Trial(t, measured, inputs, sigma=1.0, name=name)
+
+
+def test_good_records_are_not_suspected():
+    coarse = np.round(x / 0.02) * 0.02
+    slow = np.round(0.01 * x / 0.001) * 0.001
+    switched = np.sign(np.sin(9.0 * t))
+    rest = np.where(t < 2.0, 0.0, x)
+    pulse = np.where((t > 1.0) & (t < 1.5), 2.0, 0.0)
+    for y in (coarse, slow, rest, x + noise):
+        assert told(trial({"x": y, "x_dot": v + noise}, {"push": switched, "pull": pulse})) == []
+
+
+@pytest.mark.parametrize(
+    ("record", "words"),
+    [
+        (trial({"x": np.repeat(x[::4], 4)[:201]}), "x repeats its last value again and again"),
+        (
+            trial({"x": x}, {"push": np.clip(2.0 * np.sin(5.0 * t) + noise, -1.2, 1.2)}),
+            "push rests at its largest value",
+        ),
+        (trial({"x": np.maximum(0.3 * np.sin(6.0 * t), -0.2)}), "x rests at its smallest value"),
+        (trial({"x": x, "x_dot": np.degrees(v) + noise}), "x_dot seems to be in degrees"),
+        (trial({"x": np.degrees(x), "x_dot": v + noise}), "x seems to be in degrees"),
+        (trial({"x": x, "x_dot": -v + noise}), "x_dot runs against the change of x"),
+        (trial({"x": x + noise, "w": np.gradient(x + noise, t)}), "w is the difference quotient of x"),
+        (trial({"x": x, "w": np.append(np.diff(x) / np.diff(t), np.nan)}), "w is the difference quotient of x"),
+        (trial({"x": x[::2]}, {"push": x[::2]}, np.where(t < 2, t, t + 1)[::2]), "the times leave out a stretch"),
+    ],
+)
+def test_each_suspicion_is_named(record, words):
+    (note,) = told(record)
+    assert note.startswith("run: ")
+    assert words in note
+
+
+def test_one_line_for_all_trials():
+    stale = np.repeat(x[::4], 4)[:201]
+    (note,) = told(*(trial({"x": stale}, name=f"run {i}") for i in range(5)))
+    assert note.startswith("run 0, run 1, run 2 and 2 more: x repeats")
+
+
+class Sensed(Cart):
+    def outputs(self, t, q, u, motion, now):
+        return {"gyro": u["x_dot"]}
+
+
+@pytest.mark.parametrize(("factor", "words"), [(57.3, "seems to be recorded in degrees"), (-1.0, "goes the other way")])
+def test_a_sensor_in_degrees_or_upside_down(factor, words):
+    system = Sensed(mass=1.0, stiffness=4.0, damping=0.2)
+    ride = jk.simulate(system, jk.assemble(system, {"x": 0.5}), t[::4])
+    gyro = factor * np.asarray(ride["gyro"])
+    record = Trial(t[::4], {"x": ride["x"], "gyro": gyro}, sigma={"x": 1e-4, "gyro": 1e-1}, initial={"x": 0.5})
+    found = fit(system, record, Free("stiffness"), optimizer=LeastSquares(), simulation=Simulation(step=0.08))
+    assert any(note.startswith("gyro ") and words in note for note in found.notes)
