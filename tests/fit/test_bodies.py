@@ -104,6 +104,7 @@ def test_a_free_rotation_is_identified_by_possible_bodies_only():
     assert all(is_possible([1.0, 0, 0, 0, s.I11, s.I22, s.I33, 0, 0, 0]) for s in seen)
     for name in MOMENTS:
         assert abs(result.estimates[name] - float(getattr(truth, name))) < 4.0 * result.standard_errors[name] + 0.02
+    assert "body of I11, I22, I33: principal moments" in str(result)
     # Each moment by itself, positive as it is, leads to what no body can be.
     seen.clear()
     problem = Problem.of(guess, trials, MOMENTS, **options)

@@ -32,9 +32,12 @@ _ORDER = ("Ixx", "Ixy", "Ixz", "Iyz", "Izz", "mx", "my", "mz", "Iacross", "Iyy",
 def equations_at(chosen: Chosen, at: Instants) -> tuple[tuple[str, ...], np.ndarray, np.ndarray, np.ndarray]:
     """The names of the speeds, and Y (N, n, p), tau (N, n) and the trials (N,) of all instants at which they exist."""
     dtype = jnp.result_type(float)
-    row = [jnp.asarray(x, dtype) for x in (at.t, at.q, at.u, at.u_dot)]
-    inputs = {name: jnp.asarray(x, dtype) for name, x in at.inputs.items()}
-    Y, tau = jax.device_get(_at_all(chosen, *row[:3], inputs, row[3]))
+    # Filled up to a power of two with the last instant, so that few numbers of instants are programs of their own.
+    n = len(at)
+    places = np.minimum(np.arange(1 << (n - 1).bit_length()), n - 1)
+    row = [jnp.asarray(x[places], dtype) for x in (at.t, at.q, at.u, at.u_dot)]
+    inputs = {name: jnp.asarray(x[places], dtype) for name, x in at.inputs.items()}
+    Y, tau = (x[:n] for x in jax.device_get(_at_all(chosen, *row[:3], inputs, row[3])))
     fine = np.all(np.isfinite(Y), axis=(1, 2)) & np.all(np.isfinite(tau), axis=1)
     if not fine.any():
         raise ValueError(
@@ -57,14 +60,16 @@ def random_states(system: System, n: int) -> Instants:
     t = rng.uniform(0.0, 1.0, n)
     q = rng.uniform(-2.5, 2.5, (n, n_q))
     if has_configuration_constraints(system, jnp.zeros((), dtype), jnp.zeros(n_q, dtype)):
-        t = rng.uniform(0.0, 1.0, 8 * n)
-        q = np.outer(np.geomspace(0.05, 2.5, 8 * n), np.ones(n_q)) * rng.uniform(-1.0, 1.0, (8 * n, n_q))
+        t = rng.uniform(0.0, 1.0, 12 * n)
+        # Half of them anywhere; half at all distances from zero, where a closed loop is often drawn.
+        sizes = np.concatenate([np.full(6 * n, np.pi), np.geomspace(0.05, 2.5, 6 * n)])
+        q = sizes[:, None] * rng.uniform(-1.0, 1.0, (12 * n, n_q))
         q = np.array(_assembled(system, jnp.asarray(t, dtype), jnp.asarray(q, dtype)))
         fine = np.flatnonzero(np.all(np.isfinite(q), axis=1))
         if len(fine) < n:
             raise ValueError(
-                f"{type(system).__name__}: too few of the random coordinates could be assembled to say what motions "
-                "can tell: give a Regressor of states of your own, base_parameters(jax.vmap(...)(...))."
+                f"{type(system).__name__}: {len(fine)} of {len(q)} random coordinates could be assembled, and {n} are "
+                "needed to say what motions can tell: give a Regressor of states of your own, by jax.vmap."
             )
         fine = fine[np.linspace(0, len(fine) - 1, n).astype(int)]
         t, q = t[fine], q[fine]
@@ -74,13 +79,7 @@ def random_states(system: System, n: int) -> Instants:
 
 @compiled
 def _assembled(system, t, q):
-    def one(t, q):
-        if not system.dependent_coordinates:
-            return assemble(system, q, t=t).q
-        known = {c: q[i] for i, c in enumerate(system.coordinates) if c not in system.dependent_coordinates}
-        return assemble(system, known, t=t).q
-
-    return jax.vmap(one)(t, q)
+    return jax.vmap(lambda t, q: assemble(system, q, t=t).q)(t, q)
 
 
 def structure_of(
