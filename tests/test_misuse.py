@@ -1,6 +1,7 @@
 """What is easily done wrong, and used to be computed in silence or refused in words of Python and JAX."""
 
 import functools
+import pickle
 
 import jax
 import jax.numpy as jnp
@@ -129,13 +130,21 @@ def keeping(part):
         made = Pendulum.motion(self, t, q, u)
         if part == "motion":
             return KEPT.setdefault("motion", made)
-        center = KEPT.setdefault("center", made.bodies[0].center)
-        return jk.Motion([jk.Body(self.mass, 0.0, center, name="bob")], frames=made.frames)
+        center = KEPT.setdefault("center", made.bodies[0].center) if part == "center" else made.bodies[0].center
+        offset = 0.0 * KEPT.setdefault("number", 2.0 * q["angle"]) if part == "number" else 0.0
+        return jk.Motion([jk.Body(self.mass + offset, 0.0, center, name="bob")], frames=made.frames)
 
-    return type("Keeping", (Pendulum,), {"motion": motion})
+    def loads(self, t, q, u, motion, inputs):
+        made = Pendulum.loads(self, t, q, u, motion, inputs)
+        return KEPT.setdefault("loads", made) if part == "loads" else made
+
+    def q_dot(self, t, q, u):
+        return KEPT.setdefault("rates", [1.0 * u["rate"]]) if part == "rates" else [u["rate"]]
+
+    return type("Keeping", (Pendulum,), {"motion": motion, "loads": loads, "q_dot": q_dot})
 
 
-@pytest.mark.parametrize("part", ["motion", "center"])
+@pytest.mark.parametrize("part", ["motion", "center", "number", "loads", "rates"])
 def test_what_is_kept_from_an_earlier_call_is_refused(part):
     KEPT.clear()
     pendulum = keeping(part)()
@@ -240,3 +249,43 @@ def test_the_time_of_an_assembly_is_a_number(t, error, match):
 def test_a_table_of_labels_alone_is_refused():
     with pytest.raises(ValueError, match=r"columns of `table` \(label\) are text, .* all members would be the same"):
         jk.sweep.sweep(Pendulum(), jk.State([0.1], [0.0]), TS, table={"label": ["a", "b"]})
+
+
+def test_parameters_by_name_are_a_tree_as_a_dict_is():
+    arm = mechanism([Link("a", joints=hinge("q", damping=0.1), **BAR)])
+    doubled = jax.tree.map(lambda x: 2.0 * x, arm.center)
+    assert doubled == {"a": {"x": 1.0}}
+    assert len(jax.tree.leaves(arm.inertia)) == 3
+    with pytest.raises(KeyError, match="it was written as 0"):
+        doubled["a"]["y"]
+    assert pickle.loads(pickle.dumps(arm.center)) == {"a": {"x": 0.5}}
+
+
+# Elements.
+
+
+@pytest.mark.parametrize(
+    ("element", "error", "match"),
+    [
+        (
+            lambda A, O: jk.loads.coulomb(0.1, 1.0, width=0.0),
+            ValueError,
+            "of the smoothing is 0.0: it is positive",
+        ),
+        (lambda A, O: jk.loads.drag(O, 1.0, speed=-1), ValueError, "of the smoothing is -1"),
+        (lambda A, O: jk.loads.dead_zone(0.1, 0.2, -0.2), ValueError, r"got 0.2 and -0.2. The first end is below"),
+        (lambda A, O: jk.loads.dead_zone(0.1, -np.inf, 0.2), ValueError, r"got -inf and 0.2.*None is no end"),
+        (lambda A, O: jk.loads.rotor(1.0, (1, 0, 0), 1.0, A, O), TypeError, r"the axis is a Vector such as A.x"),
+        (lambda A, O: jk.loads.rotor(1.0, A.x, 1.0, "A", O), TypeError, r"the carrier is a Frame or a Body, got 'A'"),
+        (lambda A, O: jk.loads.rotor(1.0, A.x, 1.0, A, "O"), TypeError, r"the mass centre of 'rotor' is a Point"),
+        (
+            lambda A, O: jk.loads.rotor(1.0, A.x, 1.0, jk.Body(1.0, 0.0, O, name="dot"), O),
+            ValueError,
+            "'dot' is a particle, which has no frame",
+        ),
+    ],
+)
+def test_elements_that_cannot_be(element, error, match):
+    N, O = jk.inertial()
+    with pytest.raises(error, match=match):
+        element(N.rotate(3, 0.1, 0.2), O)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import jax
 
+from .._scalars.reads import kept_from_a_trace
 from .._scalars.types import Component
 from .bodies import Motion, now
 from .values import Values
@@ -94,8 +95,6 @@ def _named(method: Callable[..., Any], name: str) -> Callable[..., Any]:
         began = now()
         try:
             found = method(self, t, q, *rest, **more)
-        except jax.errors.UnexpectedTracerError as error:
-            raise TypeError(kept_from_a_trace(type(self).__name__)) from error
         except _ASKED_FOR_A_VALUE as error:
             raise TypeError(
                 f"{type(self).__name__}.{name} asks for the value of a number that has none while the "
@@ -105,20 +104,11 @@ def _named(method: Callable[..., Any], name: str) -> Callable[..., Any]:
                 "links, is a static field: `links: int = equinox.field(static=True)`."
             ) from error
         if isinstance(found, Motion) and found.made < began:
-            raise TypeError(kept_from_a_trace(type(self).__name__))
+            raise kept_from_a_trace(type(self).__name__)
         return found
 
     vars(call)["reads_by_name"] = call
     return call
-
-
-def kept_from_a_trace(system: str) -> str:
-    """What is wrong where a description returns what it made at other coordinates, in another trace."""
-    return (
-        f"{system}: its description returns what it has kept from an earlier call (in a global, an attribute or a "
-        "cache): a motion, a frame, a point or a number that belongs to other coordinates. Make all that follows from "
-        "t, q, u and the parameters anew in every call."
-    )
 
 
 def _values(values: Any, names: Sequence[str], label: str, n_optional: int = 0) -> Values:

@@ -32,7 +32,6 @@ from jaxtyping import Array
 from .._common.lookup import not_there, refuse_unknown
 from .._description.bodies import Body, Load, Motion, flatten_loads, flatten_residuals
 from .._description.parameters import in_batches
-from .._description.prepared import kept_from_a_trace
 from .._description.system import System
 from .._scalars.components import add, add3, component, cross, dot, is_exact, is_zero, matvec, mul, scale3
 from .._scalars.linear import Rows, solve, solve_positive
@@ -113,10 +112,7 @@ class Reading:
 
     def read(self, part: str, t: Component, q: Row, u: Row) -> Any:
         """One of the parts of `Said`."""
-        try:
-            return _said(part, self.system, (dict(self.inputs), t, tuple(q), tuple(u)), self._memory)
-        except jax.errors.UnexpectedTracerError as error:
-            raise TypeError(kept_from_a_trace(self.name)) from error
+        return _said(part, self.system, (dict(self.inputs), t, tuple(q), tuple(u)), self._memory)
 
     def motion(self, t: Component, q: Row, u: Row) -> Motion:
         motion = self.system.motion(t, q, u)

@@ -43,7 +43,7 @@ from .jax_internals import (
 )
 from .native import Scalars
 from .products import is_small, sum_of_products
-from .reads import on_forget, settling, version_of
+from .reads import naming_what_is_kept, on_forget, settling, version_of
 
 # What one compiled function may hold: elementwise work and the moving of scalars. Calls into libraries (LAPACK) may not
 # be compiled so, and loops would gain nothing.
@@ -93,8 +93,10 @@ def fused(f: Callable[..., Any]) -> Callable[..., Any]:
     def find(leaves, treedef, args):
         if FUSES is not None:
             return None
+        label = _label(args[0])
         try:
-            return program_for(treedef, tuple(map(jax.typeof, leaves)), version_of(args), _label(args[0]), settings())
+            with naming_what_is_kept(label):
+                return program_for(treedef, tuple(map(jax.typeof, leaves)), version_of(args), label, settings())
         except _CapturedError:
             return None
 
@@ -103,7 +105,8 @@ def fused(f: Callable[..., Any]) -> Callable[..., Any]:
         leaves, treedef = jax.tree.flatten(args)
         found = find(leaves, treedef, args)
         if found is None:
-            return f(*args)
+            with naming_what_is_kept(_label(args[0])):
+                return f(*args)
         program, structure = found
         return jax.tree.unflatten(structure, program(*leaves))
 

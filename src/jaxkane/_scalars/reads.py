@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import collections
+import contextlib
 import dataclasses
 import dis
 import enum
@@ -25,7 +26,7 @@ import sysconfig
 import threading
 import types
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from operator import is_
 from typing import Any
 
@@ -414,6 +415,24 @@ def version_of(*values: Any) -> bytes:
     return b"".join([_forgotten, *[_reads_of(root).version for root in _roots(values, [])]])
 
 
+def kept_from_a_trace(label: str) -> TypeError:
+    """What is wrong where a function returns what it made in an earlier call, of other numbers."""
+    return TypeError(
+        f"{label}: its description returns what it has kept from an earlier call (in a global, an attribute or a "
+        "cache): a motion, a frame, a point or a number that belongs to other coordinates. Make all that follows from "
+        "t, q, u and the parameters anew in every call."
+    )
+
+
+@contextlib.contextmanager
+def naming_what_is_kept(label: str) -> Iterator[None]:
+    """Where JAX meets a number of another trace, the error says what that comes from."""
+    try:
+        yield
+    except jax.errors.UnexpectedTracerError as error:
+        raise kept_from_a_trace(label) from error
+
+
 def settling(f: Callable[..., Any]) -> Callable[..., Any]:
     """`f`, which is being traced: what it changes itself in what it reads (a counter, a memory) is no change."""
 
@@ -451,7 +470,8 @@ def compiled(f: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(f)
     def call(*args: Any, **kwargs: Any) -> Any:
-        return jitted(version_of(args, kwargs), args, kwargs)
+        with naming_what_is_kept(type(args[0]).__name__ if args else f.__name__):
+            return jitted(version_of(args, kwargs), args, kwargs)
 
     vars(call)["compiled"] = jitted
     return call

@@ -21,7 +21,7 @@ from .components import add, is_exact, mul, sub
 from .fuse import is_plain, without_repetition
 from .graph import OPERATORS
 from .jax_internals import FUSES, ClosedJaxpr, Literal, bound, settings
-from .reads import on_forget, settling, version_of
+from .reads import naming_what_is_kept, on_forget, settling, version_of
 
 
 def recorded(f: Callable[..., dict[str, Any]]) -> Callable[..., Any]:
@@ -50,9 +50,10 @@ def recorded(f: Callable[..., dict[str, Any]]) -> Callable[..., Any]:
         dtype = jnp.result_type(*([x for x in row if not is_exact(x)] or [float]))
         treedef = jax.tree.structure((arrays, components))
         avals, version = tuple(map(jax.typeof, given)), version_of(arrays, components)
-        record = record_for(treedef, avals, len(row), dtype, version, settings())
-        if record is None:
-            return f(arrays, components)[part]
+        with naming_what_is_kept(type(arrays).__name__):
+            record = record_for(treedef, avals, len(row), dtype, version, settings())
+            if record is None:
+                return f(arrays, components)[part]
         row = [x if is_exact(x) or x.dtype == dtype else x.astype(dtype) for x in row]
         return record(part, [*given, *row], memory)
 

@@ -11,6 +11,8 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple
 
+import jax
+
 from .._common.lookup import hint, not_there
 from .._description.bodies import Body, Force, Motion
 from .._description.parameters import parameter, parameter_info
@@ -294,16 +296,31 @@ class Named(dict[str, Any]):
 
     def __init__(self, of: str, structure: Structure):
         super().__init__()
-        self._of, self._structure = of, structure
+        self.of, self.structure = of, structure
 
     def __missing__(self, name: str) -> Any:
-        kind, *parts = self._of.split(".")
-        if name not in (_PARTS_OF[kind](self._structure) if not parts else (*"xyz", *MOMENTS)):
-            raise not_there(name, self, f"`{self._of}`")
+        kind, *parts = self.of.split(".")
+        if name not in (_PARTS_OF[kind](self.structure) if not parts else (*"xyz", *MOMENTS)):
+            raise not_there(name, self, f"`{self.of}`")
         raise KeyError(
-            f"{self._structure.name} has no parameter {self._of}.{name}: it was written as 0 where the mechanism was "
+            f"{self.structure.name} has no parameter {self.of}.{name}: it was written as 0 where the mechanism was "
             "made, and is part of its structure, which cannot be changed. Give jax.numpy.zeros(()) there."
         )
+
+
+def _flat(named: Named) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
+    names = sorted(named)
+    return [(jax.tree_util.DictKey(name), named[name]) for name in names], (named.of, named.structure, *names)
+
+
+def _from_flat(static: tuple[Any, ...], values: Any) -> Named:
+    of, structure, *names = static
+    named = Named(of, structure)
+    named.update(zip(names, values, strict=True))
+    return named
+
+
+jax.tree_util.register_pytree_with_keys(Named, _flat, _from_flat)
 
 
 def _view(kind: str) -> property:

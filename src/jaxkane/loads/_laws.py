@@ -10,16 +10,20 @@ order of `width`. What sticks is `lugre`, which has a state.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import jax.numpy as jnp
 
 from .._description.vectors import Vector
+from .._scalars.components import component, is_exact
 from .._scalars.types import Component
 
 
 def smooth_abs(x: Component | Vector, width: Component) -> Component:
     """sqrt(x^2 + width^2), of a number or a Vector's length: |x| without its corner, too large by `width` at most."""
+    if is_exact(component(width)) and not width > 0:
+        raise ValueError(f"The width of the smoothing is {width}: it is positive, or there is no slope at rest.")
     square = x.dot(x) if isinstance(x, Vector) else x * x
     return jnp.sqrt(square + width * width)
 
@@ -87,6 +91,11 @@ def dead_zone(x: Component, lower: Component | None, upper: Component | None, *,
     """
     if lower is None and upper is None:
         raise ValueError("dead_zone(x, lower, upper): give one end at least.")
+    ends = [float(x) for x in (lower, upper) if isinstance(x, (int, float))]
+    if not all(map(math.isfinite, ends)) or (len(ends) == 2 and ends[0] > ends[1]):
+        raise ValueError(
+            f"dead_zone(x, lower, upper): got {lower} and {upper}. The first end is below the second; None is no end."
+        )
     if lower is None:
         return 0.5 * (x - upper + smooth_abs(x - upper, width))
     if upper is None:

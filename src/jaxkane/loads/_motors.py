@@ -33,7 +33,18 @@ def rotor(
     - `axis`: a Vector that is fixed in the carrier, of any length. `rate` [rad/s] about it, relative to the carrier.
     - `carrier`: the frame or the body that it spins in. `at`: where it is, a Point or a Body.
     - `mass` [kg], where the carrier is without it.
+
+    **Raises:** `TypeError` for an axis that is no Vector, and a carrier that is no Frame or Body; `ValueError` for a
+    particle, which has no frame that could turn.
     """
+    if not isinstance(axis, Vector):
+        raise TypeError(f"rotor(inertia, axis, ...): the axis is a Vector such as A.x, got {axis!r}.")
+    if not isinstance(carrier, (Frame, Body)):
+        raise TypeError(f"rotor(inertia, axis, rate, carrier, ...): the carrier is a Frame or a Body, got {carrier!r}.")
+    if isinstance(carrier, Body) and carrier.is_particle:
+        raise ValueError(
+            f"rotor: {carrier.name!r} is a particle, which has no frame: give the one that carries {name!r}."
+        )
     frame = carrier.frame if isinstance(carrier, Body) else carrier
     axis = axis.normalize()
     a = axis.components_in(frame)
