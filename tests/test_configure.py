@@ -116,12 +116,12 @@ def test_it_says_what_it_did(first, cache):
 
 def test_programs_of_simulations_are_kept_for_the_next_process(first, cache, python):
     assert {"jit_solve", "jit__solve"} <= {path.name.rsplit("-", 2)[0] for path in cache.iterdir()}
-    hits, misses, dtype, *bytes_of_first = first[-1].split()
-    assert int(misses) > 10
+    _, compiled, dtype, *bytes_of_first = first[-1].split()
+    assert int(compiled) > 5
     second = python(f"jk.configure(cache={str(cache)!r}, verbose=False)\n" + RIDE).stdout.splitlines()
     hits, misses, dtype, *bytes_of_second = second[-1].split()
     assert (int(misses), dtype) == (0, "float64")
-    assert int(hits) > 10
+    assert int(hits) >= int(compiled)
     assert bytes_of_second == bytes_of_first
     assert len(second) == 1  # and nothing else was printed
 
