@@ -76,6 +76,19 @@ class SwingElsewhere(Swing):
         return jk.Force(self.m1 * down, motion["link1"]), jk.Force(self.m2 * down, G)
 
 
+class SwingOfNumbers(Swing):
+    """The second mass is a number, and its weight another."""
+
+    def motion(self, t, q, u):
+        motion = super().motion(t, q, u)
+        motion["link2"].mass = 0.14
+        return motion
+
+    def weights(self, motion):
+        down = -9.8 * motion.N.y
+        return jk.Force(self.m1 * down, motion["link1"]), jk.Force(0.14 * down, motion["link2"])
+
+
 class SwingInAField(Swing):
     """The weight grows with the height of the mass centre."""
 
@@ -176,6 +189,8 @@ def test_weights_that_are_written_by_hand_are_found_or_refused():
     np.testing.assert_allclose(*same, atol=1e-14)
     with pytest.raises(ValueError, match=r"m2 changes the parameters of a body.*jk\.weight"):
         regressor(SwingElsewhere(), *i)
+    with pytest.raises(ValueError, match=r"for link2, whose mass is a number in the description, none is found"):
+        regressor(SwingOfNumbers(), *i)
     regressor(SwingElsewhere(), *i, bodies="link1")  # then the other's weight is known, as it is
 
 
@@ -421,6 +436,9 @@ def test_bad_data_are_refused_by_name():
     t = np.linspace(0.0, 1.0, 101)
     with pytest.raises(ValueError, match="angle2 was not measured"):
         instants_of(truth, Trial(t, {"angle1": t}, sigma=0.1))
+    turns = Trial(t, {"angle1": (30 * t + 1) % (2 * np.pi), "angle2": t}, sigma=0.1)
+    with pytest.raises(ValueError, match=r"angle1 jumps by a whole turn at t = 0\.\d+ s: make it one curve"):
+        instants_of(truth, turns)
     with pytest.raises(ValueError, match="has 10 samples"):
         instants_of(truth, Trial(t[:10], {"angle1": t[:10], "angle2": t[:10]}, sigma=0.1))
     with pytest.raises(ValueError, match="There is no motion"):
@@ -501,6 +519,15 @@ def test_bodies_that_can_be():
     assert "kg, centre at (" in guess.bodies[0]
     assert f"principal moments {moments[0]:.5g}, {moments[1]:.5g}, {moments[2]:.5g} kg m^2, along (" in str(guess)
     jk.accelerations(guess.system, 0.0, exact.q[0], exact.u[0])  # which refuses bodies that cannot be
+
+
+def test_a_first_guess_may_start_with_a_centre_at_the_joint():
+    """There the moment of inertia about the joint does not change with it, and elsewhere it does."""
+    truth, at = swings()
+    start = dataclasses.replace(truth, a2=0.0)
+    guess = first_guess(start, at, ("a2", "k2"))
+    assert guess.values["a2"] == pytest.approx(float(truth.a2), rel=1e-6)
+    assert guess.ok
 
 
 def test_what_a_first_guess_refuses():

@@ -142,8 +142,9 @@ def _refuse_roles(parameters: Parameters) -> None:
 def _chosen_by(system: System, parameters: Parameters) -> Chosen:
     """The bodies' parameters that the free ones move, and those of the free ones that move no body."""
     every = Chosen(described(system, None), (), (), ())
-    at_start = jnp.zeros_like(parameters.start)
-    slopes = np.abs(np.asarray(_with_slopes(every, parameters, at_start)[1][0]))  # (all ten of all bodies, p)
+    # At the start and beside it: the moment of inertia about a joint does not change with a centre that is there.
+    at = [jnp.full_like(parameters.start, x) for x in (0.0, 0.37)]
+    slopes = np.max([np.abs(_with_slopes(every, parameters, x)[1][0]) for x in at], axis=0)  # (all of all bodies, p)
     size = slopes.max(axis=1, initial=0.0, keepdims=True)
     moved: np.ndarray = slopes > 1e-9 * np.where(size > 0, size, 1.0)
     bodies: dict[str, tuple[str, ...]] = {}

@@ -226,6 +226,13 @@ def _spline(trial: Trial, name: str, y: np.ndarray, spacing: float) -> Any:
         raise ValueError(
             f"{trial.name}: {name} has {len(t)} samples; {3 * (_DEGREE + 1)} are the least to take accelerations from."
         )
+    steps = np.abs(np.diff(y))
+    usual = np.median(steps)
+    if usual < 0.8 and np.any(np.abs(steps - 2 * np.pi) < 0.2 + 2 * usual):
+        raise ValueError(
+            f"{trial.name}: {name} jumps by a whole turn at t = {t[steps.argmax()]:g} s: make it one curve by "
+            "np.unwrap."
+        )
     weights = None if name not in trial.sigma else 1.0 / trial.sigma[name][seen]
     n = max(1, round((t[-1] - t[0]) / spacing))
     inner, last = [], 0
