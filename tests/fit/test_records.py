@@ -78,3 +78,18 @@ def test_a_sensor_in_degrees_or_upside_down(factor, words):
     record = Trial(t[::4], {"x": ride["x"], "gyro": gyro}, sigma={"x": 1e-4, "gyro": 1e-1}, initial={"x": 0.5})
     found = fit(system, record, Free("stiffness"), optimizer=LeastSquares(), simulation=Simulation(step=0.08))
     assert any(note.startswith("gyro ") and words in note for note in found.notes)
+
+
+def test_a_trial_that_no_parameters_explain_is_named():
+    system = Cart(mass=1.0, stiffness=4.0, damping=0.2)
+    rng, trials = np.random.default_rng(0), []
+    for i in range(5):
+        ride = jk.simulate(system, jk.assemble(system, {"x": 0.3 + 0.1 * i}), t[::4])
+        bumped = 0.05 * np.sin(5.0 * t[::4]) if i == 3 else 0.0
+        y = ride["x"] + bumped + rng.normal(0.0, 2e-3, 51)
+        trials.append(Trial(t[::4], {"x": y}, sigma=2e-3, initial={"x": 0.3 + 0.1 * i}, name=f"run {i}"))
+    found = fit(system, trials, Free("stiffness"), optimizer=LeastSquares(), simulation=Simulation(step=0.08))
+    (note,) = [note for note in found.notes if "The residuals of run 3 (" in note]
+    assert "fit the others without it" in note
+    fine = fit(system, [x for x in trials if x.name != "run 3"], Free("stiffness"), optimizer=LeastSquares(), steps=4)
+    assert not any("The residuals of run" in note for note in fine.notes)

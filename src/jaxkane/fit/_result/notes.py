@@ -23,6 +23,7 @@ def notes_of(fit: Fit) -> tuple[str, ...]:
     return (
         *fit.identifiability.messages,
         *trade_offs(fit),
+        *odd_trials(fit),
         *coloured_residuals(fit),
         *wrong_noise(fit),
         *no_freedom(fit),
@@ -90,6 +91,26 @@ def bad_channels(fit: Fit) -> list[str]:
     return [
         f"{', '.join(bad)}: less than half of the variance is accounted for, in one trial at least. "
         "`jaxkane.fit.contrary_signs(fit)` tries whether a sign is wrong."
+    ]
+
+
+def odd_trials(fit: Fit) -> list[str]:
+    """Trials that the parameters of all explain far worse than the others."""
+    squares = {
+        name: np.concatenate([r[np.isfinite(r)] ** 2 for r in channels.values()])
+        for name, channels in fit.residuals.items()
+    }
+    sizes = {name: float(np.sqrt(np.mean(x))) for name, x in squares.items() if x.size}
+    if len(sizes) < 3:
+        return []
+    usual = float(np.median([*sizes.values()]))
+    odd = {name: size for name, size in sizes.items() if size > max(3 * usual, 2.0)}
+    if not odd or len(odd) > len(sizes) / 4:
+        return []
+    told = ", ".join(f"{name} ({size / usual:.1f} times)" for name, size in odd.items())
+    return [
+        f"The residuals of {told} are several times as large as those of the other trials: something happened there "
+        "that the model does not have, and all parameters pay for it. Look at it, and fit the others without it."
     ]
 
 
