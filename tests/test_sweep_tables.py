@@ -108,8 +108,9 @@ def test_sweeps_have_derivatives():
         return jk.sweep.sweep(DoublePendulum(1.0, length), state, TS, adjoint="forward", step=0.05).u[:, -1]
 
     length, step = jnp.array([1.0, 2.0]), 1e-5
-    exact = jax.jit(lambda x: jax.jvp(ends, (x,), (jnp.ones(2),))[1])(length)
-    np.testing.assert_allclose(exact, (ends(length + step) - ends(length - step)) / (2 * step), rtol=rtol)
+    both = jax.jit(lambda x: jax.jvp(ends, (x,), (jnp.ones(2),)))
+    numeric = (both(length + step)[0] - both(length - step)[0]) / (2 * step)
+    np.testing.assert_allclose(both(length)[1], numeric, rtol=rtol)
 
 
 @pytest.mark.parametrize(
