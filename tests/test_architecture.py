@@ -150,6 +150,8 @@ def test_importing_changes_nothing_and_prints_nothing():
         "late = {'scipy', 'optax', 'matplotlib', 'pandas', 'tqdm', 'jaxkane.fit', 'jaxkane.plot', 'jaxkane.sweep'}; "
         "assert not late & sys.modules.keys(), late & sys.modules.keys(); "
         "assert all(hasattr(jaxkane, name) for name in dir(jaxkane)) and late & sys.modules.keys(); "
+        "assert {'jaxkane.symbolic', 'jaxkane.export'} < sys.modules.keys(); "
+        "assert not {'sympy', 'casadi', 'mujoco'} & sys.modules.keys(); "
         "here = {}; exec('from jaxkane import *', here); assert {'fit', 'animate', 'simulate'} <= here.keys(); "
         "assert (dict(os.environ), jax.config.values) == before; assert not jax.config.jax_enable_x64; "
         "import jax._src.xla_bridge as bridge; assert not bridge.backends_are_initialized()"

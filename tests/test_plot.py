@@ -195,7 +195,7 @@ def test_mode_shapes_are_turned_to_their_largest_state():
 def audited():
     system = jk.catalog.DoublePendulum()
     state = jk.State(jnp.array([0.7, -0.4]), jnp.array([1.1, -0.8]))
-    return jk.audit(system, jk.simulate(system, state, jnp.linspace(0.0, 1.0, 51)))
+    return jk.audit(system, jk.simulate(system, state, jnp.linspace(0.0, 1.0, 11)))
 
 
 def test_audits(style, audited):
