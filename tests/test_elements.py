@@ -457,3 +457,31 @@ def test_slopes_of_states_at_rest(kernels):
     np.testing.assert_allclose(forward[0], np.diag([-40.4, -5.0]), rtol=RTOL)
     np.testing.assert_allclose(forward[1], np.diag([-1e3, -500.0]), rtol=RTOL)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=RTOL), forward, reverse)
+
+
+class Tilted(jk.System):
+    """A pendulum on a table that is not level, whose encoder does not begin at its zero."""
+
+    tilt: jk.Scalar = jk.parameter(0.02, unit="rad")
+    zero: jk.Scalar = jk.parameter(-0.3, unit="rad")
+    coordinates, speeds = ("angle",), ("rate",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        B = N.rotate(3, q["angle"], u["rate"])
+        return jk.Motion([jk.Body(1.0, 0.0, O.fixed(-0.5 * B.y), name="bob")])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.rotate(3, self.tilt, 0.0).y)
+
+    def outputs(self, t, q, u, motion, now):
+        return {"encoder": q["angle"] + self.zero}
+
+
+def test_zeros_that_nobody_knows_are_parameters():
+    """It hangs along the vertical, which is off by the tilt; the encoder reads that less its zero."""
+    f = jax.jit(lambda tilt, angle: jk.accelerations(Tilted(tilt=tilt), 0.0, angle[None], jnp.zeros(1))[0])
+    np.testing.assert_allclose(f(0.05, jnp.array(0.05)), 0.0, atol=1e-14)
+    np.testing.assert_allclose(jax.grad(f)(0.05, jnp.array(0.05)), 9.81 / 0.5, rtol=RTOL)
+    ride = jk.simulate(Tilted(), jk.State({"angle": 0.02}, {}), np.array([0.0, 0.1]))
+    np.testing.assert_allclose(ride["encoder"], -0.28, atol=1e-12)

@@ -1,6 +1,7 @@
 """Classes that inherit from the catalogue's add bodies, loads, coordinates and parameters in a few lines."""
 
 import dataclasses
+import pickle
 
 import jax
 import jax.numpy as jnp
@@ -228,6 +229,43 @@ def test_a_motion_is_extended_by_parts_of_other_names():
         motion.extended([one])
     with pytest.raises(ValueError, match="there is a point of the name 'P' already"):
         motion.extended(points={"P": O})
+
+
+ARM = jk.joints.mechanism(
+    [jk.joints.Link("a", joints=jk.joints.hinge("q"), mass=2.0, center=(0.5, 0, 0))], gravity=(0, -10, 0)
+)
+
+
+class Rubbed(type(ARM)):
+    """The arm with dry friction in its hinge, and a load at its end; a parameter of its own."""
+
+    dry: jk.Scalar = jk.parameter(0.7, positive=True)
+
+    def motion(self, t, q, u):
+        motion = super().motion(t, q, u)
+        arm = motion["a"]
+        return motion.extended([jk.Body(3.0, 0.0, arm.center.fixed(0.5 * arm.frame.x), name="load")])
+
+    def loads(self, t, q, u, motion, inputs):
+        joint = motion.placed["q"].moved
+        rubs = jk.loads.torsional_friction(joint, None, motion.N.z, self.dry, rate=1e-6)
+        return super().loads(t, q, u, motion, inputs), rubs
+
+
+@pytest.mark.parametrize(
+    "copied", [lambda x: x, lambda x: pickle.loads(pickle.dumps(x)), lambda x: x.replace({"dry": 0.7})]
+)
+def test_a_mechanism_of_joints_can_be_inherited_from(copied):
+    """About the hinge: 0.5 + 3 kg m^2; weights 2 * 0.5 + 3 kg m at 10 m/s^2, and 0.7 N m of friction."""
+    rubbed = copied(Rubbed(**{name: getattr(ARM, name) for name in vars(ARM)}))
+    assert type(rubbed) is Rubbed
+    found = jk.accelerations(rubbed, 0.0, jnp.zeros(1), jnp.array([2.0]))
+    assert float(found[0]) == pytest.approx(-(40.0 + 0.7) / 3.5, rel=1e-10)
+
+
+def test_a_parameter_of_a_mechanism_that_has_no_default_is_missing():
+    with pytest.raises(TypeError, match=r"Mechanism: the parameter gravity.y is missing, which has no default"):
+        type(ARM)()
 
 
 def test_a_mechanism_of_joints_keeps_its_own_when_it_is_extended():

@@ -97,11 +97,13 @@ class Mechanism(System):
 
     def __init__(self, **values: Any):
         for field in dataclasses.fields(self):  # names with a dot cannot be those of arguments
-            setattr(self, field.name, values.pop(field.name))
+            setattr(self, field.name, values.pop(field.name) if field.name in values else _default(self, field))
         if values:
             raise TypeError(f"{type(self).__name__} has no parameter {', '.join(values)}.")
 
     def __reduce__(self) -> Any:
+        if type(self) is not class_of(self.structure, _fields(type(self))):  # one that inherits from it
+            return super().__reduce__()
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return _restored, (self.structure, _fields(type(self)), values)
 
@@ -182,9 +184,9 @@ class Mechanism(System):
 
     def loads(self, t, q, u, motion: Any, inputs):
         gravity = motion.N.vector(*self._triple("gravity"))
-        links = motion.bodies[: sum(link.has_mass for link in self.structure.links)]
         falls = not all(is_zero(x) for x in gravity.components)
-        loads: list[Any] = [Force(body.mass * gravity, body.center) for body in links if falls]
+        weighed = [body for body in motion.bodies if falls and not is_zero(body.mass)]  # rotors have none
+        loads: list[Any] = [Force(body.mass * gravity, body.center) for body in weighed]
         for joint in self.structure.joints:
             forces = self._forces(joint, *self._of(joint, q, u), inputs)
             if not all(is_zero(x) for x in forces):
@@ -259,6 +261,15 @@ class Mechanism(System):
                 rate = mul(slope, u[f"{coupling.second}_rate"]) if coupling.second else 0.0
                 c.append(sub(u[f"{coupling.first}_rate"], rate))
         return h, c
+
+
+def _default(mechanism: Mechanism, field: dataclasses.Field[Any]) -> Any:
+    """Of a parameter that a class which inherits from a mechanism's has besides."""
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    if field.default is not dataclasses.MISSING:
+        return field.default
+    raise TypeError(f"{type(mechanism).__name__}: the parameter {field.name} is missing, which has no default.")
 
 
 class TreeMotion(Motion):
