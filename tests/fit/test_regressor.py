@@ -249,6 +249,10 @@ def test_what_is_not_linear_is_refused():
     spring = regressor(Sprung(), *i, parameters="stiffness")
     assert spring.names[-2:] == ("stiffness[0]", "stiffness[1]")
     np.testing.assert_allclose(spring.matrix[0, -2:], [at.q[3, 0] - 0.2, at.q[3, 0] ** 3], rtol=1e-12)
+    with pytest.raises(ValueError, match="m1 has more axes than it was declared with"):
+        base_parameters(dataclasses.replace(Swing(), m1=jnp.ones(2)))
+    with pytest.raises(ValueError, match="no input named tau"):
+        regressor(Swing(), *i, {"tau": 1.0})
     with pytest.raises(ValueError, match="u_dot must have the shape"):
         regressor(Swing(), *i[:3], np.zeros(3))
     with pytest.raises(TypeError, match="instance of a System"):
