@@ -149,6 +149,7 @@ def test_importing_changes_nothing_and_prints_nothing():
         "import os, sys, jax; before = dict(os.environ), jax.config.values.copy(); import jaxkane; "
         "late = {'scipy', 'optax', 'matplotlib', 'pandas', 'tqdm', 'jaxkane.fit', 'jaxkane.plot', 'jaxkane.sweep'}; "
         "assert not late & sys.modules.keys(), late & sys.modules.keys(); "
+        "import jaxkane.stability; assert not {'scipy.signal', 'scipy.stats'} & sys.modules.keys(); "
         "assert all(hasattr(jaxkane, name) for name in dir(jaxkane)) and late & sys.modules.keys(); "
         "assert {'jaxkane.symbolic', 'jaxkane.export'} < sys.modules.keys(); "
         "assert not {'sympy', 'casadi', 'mujoco'} & sys.modules.keys(); "

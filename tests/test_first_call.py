@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
+from jaxkane._scalars.jax_internals import nothing_is_traced
 from jaxkane._scalars.record import recorded
 from jaxkane._simulation import ride
 from jaxkane._simulation.settings import settings_for
@@ -77,6 +78,43 @@ def test_assembling_compiles_nothing():
     state = jk.assemble(system, {"x": 0.3, "y": -0.3}, {"x_rate": 0.1})
     assert not compiled
     np.testing.assert_allclose(state.q, [0.3, -np.sqrt(0.4**2 - 0.3**2)], rtol=1e-15)
+
+
+def test_a_first_trajectory_compiles_one_program_and_few_of_the_solver():
+    """diffrax compares its own result codes before it is compiled."""
+
+    class Another(Bead):
+        radius: jk.Scalar = jk.parameter(0.45)
+
+    system = Another()
+    compiled.clear()
+    assert first_trajectory(system).ok
+    assert 1 <= len(compiled) <= 4
+
+
+def test_a_motion_that_nobody_differentiates_has_the_same_numbers():
+    ride, other = first_trajectory(Bead()), jax.jit(lambda x: first_trajectory(Bead(radius=x)))(0.5)
+    for x, y in zip(jax.tree.leaves(ride), jax.tree.leaves(other), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-13, atol=1e-13)
+    assert ride.adjoint == other.adjoint == "RecursiveCheckpointAdjoint"
+
+
+def test_it_is_known_whether_anything_is_traced():
+    seen = []
+
+    def f(x):
+        seen.append(nothing_is_traced())
+        return x * 1.0
+
+    f(1.0)
+    for transform in (jax.jit, jax.grad, jax.checkpoint, lambda f: lambda x: jax.eval_shape(f, x)):
+        transform(f)(1.0)
+    jax.vmap(f)(jnp.ones(2)), jax.jvp(f, (1.0,), (1.0,)), jax.vjp(f, 1.0), jax.linearize(f, 1.0)
+    jax.lax.map(f, jnp.ones(2))
+    f(1.0)
+    assert seen[0] and seen[-1]  # noqa: PT018
+    assert len(seen) >= 8
+    assert not any(seen[1:-1])
 
 
 def equations(jaxpr):

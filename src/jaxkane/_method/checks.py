@@ -178,7 +178,8 @@ def configuration_is_met(system: System, t: Any, q: Any) -> Any:
     """Whether the configuration constraints are met, and what follows from them."""
     residuals = [_residual_of(configuration_residual, system, t, q), implied_residual(system, t, q)]
     xp = np if is_concrete(residuals) else jnp
-    return xp.all(xp.abs(xp.concatenate(residuals)) <= configuration_tolerance(residuals[0].dtype))
+    h = xp.concatenate(residuals)
+    return xp.all(xp.abs(h) <= configuration_tolerance(h.dtype)) if h.size else np.array(True)
 
 
 def check_state(system: System, t: Any, q: Any) -> None:

@@ -151,7 +151,7 @@ def _store_programs(folder: Path) -> None:
     settings = {
         "jax_compilation_cache_dir": str(folder),
         "jax_enable_compilation_cache": True,
-        # A motion needs some sixty small programs beside the large one: read, they take a fifth of their compilation.
+        # Small programs too: read, they take a fifth of their compilation.
         "jax_persistent_cache_min_compile_time_secs": 0.0,
         "jax_persistent_cache_min_entry_size_bytes": 0,
     }

@@ -7,6 +7,7 @@ Each has a way back, so that where a release takes it away, results stay right a
 | jaxprs and primitives (`jax.extend`, `jax.interpreters`) | `FUSES` says why; right-hand sides are plain JAX |
 | the frontend attribute that makes one function of a program | XLA cuts the program as it does any other |
 | tracers of a derivative in forward mode | such a derivative must be announced by `adjoint="forward"` |
+| the state of traces | motions are compiled for derivatives that nobody can take, a tenth slower at first |
 | `reset_cache`, equinox's switch of its checks | programs are kept only where the environment says so from the start |
 | `eval_context` | a sweep on a cluster may be refused, since programs that were first traced in a check differ |
 | `process_allgather` | none: a fit by several processes raises ImportError |
@@ -118,6 +119,18 @@ def concretely() -> contextlib.AbstractContextManager[Any]:
     except ImportError:
         return jax.ensure_compile_time_eval()
     return eval_context()
+
+
+def nothing_is_traced() -> bool:
+    """Whether no trace is under way at all, so that nobody can differentiate what is computed now."""
+    try:
+        from jax.core import eval_context
+        from jax.extend.core import get_opaque_trace_state
+    except ImportError:
+        return False
+    with eval_context():
+        plain = get_opaque_trace_state()
+    return get_opaque_trace_state() == plain
 
 
 def settings() -> Any:

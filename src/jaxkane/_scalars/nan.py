@@ -37,10 +37,10 @@ def nan_derivative_where(rough: Bool[Array, " *leading"], values: Any, origin: A
 
 def all_finite(values: Any) -> Bool[Array, ""]:
     """Whether all float arrays in these are finite."""
-    return jnp.all(jnp.isfinite(_flat(jax.lax.stop_gradient(eqx.filter(values, eqx.is_inexact_array)))))
+    return jnp.all(jnp.isfinite(flat(jax.lax.stop_gradient(eqx.filter(values, eqx.is_inexact_array)))))
 
 
-def _flat(values: Any) -> Array:
+def flat(values: Any) -> Array:
     """All float arrays one after the other, real and imaginary parts apart."""
     parts = [jnp.ravel(x) for x in jax.tree.leaves(values) if eqx.is_inexact_array(x)]
     parts = [part for x in parts for part in ((x.real, x.imag) if jnp.iscomplexobj(x) else (x,))]
@@ -76,14 +76,14 @@ def derivative_free_where_not_finite(f: Callable[..., Any], *arguments: Any) -> 
 
 
 def _masked(shown: bool, missing: Array, values: Any, origin: Any) -> Any:
-    flat = _flat(origin)
+    numbers = flat(origin)
 
     def one(x: Array) -> Array:
         if x.size == 0:
             return x
         real = jnp.finfo(x.dtype).dtype
         there = jnp.broadcast_to(jnp.reshape(missing, (*missing.shape, *(1,) * (x.ndim - missing.ndim))), x.shape)
-        point = flat.astype(real)
+        point = numbers.astype(real)
         if jnp.iscomplexobj(x):
             return jax.lax.complex(_mask(shown, there, x.real, point), _mask(shown, there, x.imag, point))
         return _mask(shown, there, x, point)

@@ -30,7 +30,12 @@ class Events(NamedTuple):
 
 def events_of(system: System, t: Array, state: State) -> Events:
     """What a description says may end its motion."""
-    program, found = jax.make_jaxpr(_named_events, return_shape=True)(system, t, state.q, state.u)
+    u_all = jnp.zeros(len(system.speeds) + len(system.dependent_speeds), state.q.dtype)
+
+    def named(t: Array, q: Array, u_all: Array) -> dict[str, Any]:
+        return _events(system, t, tuple(q), tuple(u_all), q.dtype)
+
+    program, found = jax.make_jaxpr(named, return_shape=True)(t, state.q, u_all)
     directions = tuple(e.direction if isinstance(e, Crossing) else 0 for e in found.values())
     return Events(tuple(found), directions, _is_read(program.jaxpr, program.jaxpr.invars[-1]))
 
@@ -44,12 +49,8 @@ def _is_read(program: Any, variable: Any) -> bool:
     return id(variable) in needed
 
 
-def _named_events(system: System, t: Component, q: Array, u: Array) -> dict[str, Any]:
-    return _events_at(Instant(system, t, q, u), q.dtype)
-
-
-def _events_at(now: Instant, dtype: Any) -> dict[str, Any]:
-    found = dict(now.system.events(now.t, now.q, now.u_all))
+def _events(system: System, t: Component, q: Any, u_all: Any, dtype: Any) -> dict[str, Any]:
+    found = dict(system.events(t, q, u_all))
     return {name: _as_float(found[name], dtype) for name in sorted(found)}
 
 
@@ -69,17 +70,21 @@ class Watched(NamedTuple):
 
 
 @fused
-def watched(system: System, t: Component, q: Array, u: Array, u_dot: Array) -> Watched:
-    """What may end a motion."""
+def watched(system: System, t: Component, q: Array, u: Array, u_dot: Array | None) -> Watched:
+    """What may end a motion. `u_dot`: None where no event reads speeds."""
+    now, like = Instant(system, t, q, u), q
+    det = determinant(now.C_dep) if now.k else 1.0
+    u_all_dot: Any = (0.0,) * len(now.u_all)
+    if u_dot is not None:
+        u_all_dot = (*u_dot, *now.dependent_accelerations(tuple(u_dot)))
 
-    def read(t: Component, q: Array, u: Array) -> Any:
-        now = Instant(system, t, q, u)
-        events = [e.value if isinstance(e, Crossing) else e for e in _events_at(now, q.dtype).values()]
-        det = determinant(now.C_dep) if now.k else 1.0
-        return as_vector(events, q), (as_vector(now.q_dot, q), as_vector([det], q)[0])
+    def read(t: Component, q: Any, u_all: Any) -> Array:
+        events = _events(system, t, q, u_all, like.dtype).values()
+        return as_vector([e.value if isinstance(e, Crossing) else e for e in events], like)
 
-    values, slope, (q_dot, det) = jax.linearize(read, t, q, u, has_aux=True)
-    return Watched(values, slope(jnp.ones_like(t), q_dot, u_dot), det)
+    at, along = (now.t, now.q, now.u_all), (1.0, now.q_dot, u_all_dot)
+    values, rates = jax.jvp(read, *(jax.tree.map(lambda x: jnp.asarray(x, like.dtype), xs) for xs in (at, along)))
+    return Watched(values, rates, as_vector([det], like)[0])
 
 
 class End(NamedTuple):
@@ -90,7 +95,9 @@ class End(NamedTuple):
     smooth: Array
 
 
-def at_zero(system: System, t: Array, state: State, which: Array, happened: Array, rates: Any, reach: Array) -> End:
+def at_zero(
+    system: System, t: Array, state: State, which: Array, happened: Array, rates: Any, reach: Array, events: Events
+) -> End:
     """The instant beside `t` at which the event `which` vanishes, with derivatives up to the second order.
 
         t_end = t - g / g_dot,   y_end = y + (t_end - t) y_dot,   twice
@@ -106,7 +113,7 @@ def at_zero(system: System, t: Array, state: State, which: Array, happened: Arra
     def stage(carry: Any, k: Array):
         (t, y), step, smooth = carry
         y_dot = rates(t, y)
-        watching = watched(system, t, y.q, y.u, y_dot.u)
+        watching = watched(system, t, y.q, y.u, y_dot.u if events.read_speeds else None)
         g, g_dot = watching.values[which], watching.rates[which]
         # Beside the first point, where to go; there halfway, by the rates in the middle; and there again.
         is_small = jnp.abs(g) <= jnp.abs(g_dot) * reach

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, cast
 
 import diffrax
@@ -19,7 +20,8 @@ from .._method.drift import correction, has_configuration_constraints, projected
 from .._method.equations import _dependent_speeds
 from .._method.kane import Instant, checked_inputs
 from .._method.now import outputs_at, rates, values_of
-from .._scalars.nan import all_finite, derivative_free_where_not_finite, nan_derivative_where, nan_where
+from .._scalars.fuse import fused
+from .._scalars.nan import all_finite, derivative_free_where_not_finite, flat, nan_derivative_where, nan_where
 from .._scalars.reads import compiled
 from .._scalars.types import Component
 from .events import Events, at_zero, events_of, watched
@@ -63,12 +65,10 @@ def solve(
     if settings.step is not None:
         refuse_held(settings.solver, signals)
         signals = for_fixed_steps(signals)
-    origin = (system, state, ts, signals, disturbance)
+    origin = flat((system, state, ts, signals, disturbance))
     valid = _is_valid(system, state, ts, signals)
     # What is not finite must not enter the solver, where it would spoil the gradient of what is shared.
-    system, state = jax.tree.map(
-        lambda x: jnp.where(valid, x, jnp.ones_like(x)) if eqx.is_inexact_array(x) else x, (system, state)
-    )
+    system, state = _safe(valid, (system, state))
     ts = jnp.where(valid, ts, jnp.arange(ts.shape[0], dtype=ts.dtype))
     signals = without_nonsense(signals, valid)
     constrained = has_configuration_constraints(system, ts[0], state.q)
@@ -123,7 +123,7 @@ def solve(
         happened = status >= Status.EVENT
         beside = jax.tree.map(lambda x, first: jnp.where(happened, x, first), (t_end, end), (ts[0], state))
         moving = lambda t, y: vector_field(t, y, (system, signals, disturbance))  # noqa: E731
-        found = at_zero(system, beside[0], beside[1], jnp.maximum(which, 0), happened, moving, 4 * reach)
+        found = at_zero(system, beside[0], beside[1], jnp.maximum(which, 0), happened, moving, 4 * reach, events)
         t_end, end = jax.tree.map(lambda x, y: jnp.where(happened, x, y), (found.t, found.state), (t_end, end))
         smooth |= happened & found.smooth
         # The last step ends a little beside the event: samples from there to here are those of the event itself.
@@ -194,7 +194,7 @@ def _to_stops(controller: Any, vector_field: Any, events: Events, system: System
     """A controller that also ends the motion: at the events, and before the dependent speeds are singular."""
 
     def watch(t, y, args):
-        u_dot = vector_field(t, y, args).u if events.read_speeds else jnp.zeros_like(y.u)
+        u_dot = vector_field(t, y, args).u if events.read_speeds else None
         return Quantities(*watched(args[0], t, y.q, y.u, u_dot))
 
     whole = jax.lax.stop_gradient(ts[-1] - ts[0])
@@ -212,14 +212,47 @@ def inputs_at(system: System, signals: Any, t: Component, state: State, all_of_t
     return {name: jnp.asarray(values.get(name, 0.0), dtype=state.q.dtype) for name in names}
 
 
+_SCALARS_UP_TO = 64  # beyond so many numbers an array is none for a program of scalars
+
+
+def _is_few(x: Any) -> bool:
+    return eqx.is_inexact_array(x) and 0 < x.size <= _SCALARS_UP_TO
+
+
 def _is_valid(system: System, state: State, ts: Array, signals: Any) -> Array:
-    positive = [jnp.all(getattr(system, name) > 0) for name, info in parameter_info(system).items() if info.positive]
-    consistent = configuration_is_met(system, ts[0], state.q)
     # A window of a fit may stand still at its last time.
     rising = jnp.all(ts[1:] >= ts[:-1]) & (ts[-1] > ts[0])
-    return jnp.all(
-        jnp.stack([all_finite((system, state, ts)), *positive, consistent, rising, signals_are_sound(signals)])
-    )
+    many = eqx.filter((system, state), _is_few, inverse=True)
+    others = all_finite((many, ts)) & rising & signals_are_sound(signals)
+    for name, info in parameter_info(system).items():
+        if info.positive and not _is_few(getattr(system, name)):
+            others &= jnp.all(getattr(system, name) > 0)
+    numbers, static = eqx.partition((system, state, ts[0]), eqx.is_array)
+    return _is_sound(*eqx.combine(jax.lax.stop_gradient(numbers), static), others)
+
+
+@fused
+def _is_sound(system: System, state: State, t: Array, others: Array) -> Array:
+    """Whether a motion can begin there, one answer from all the numbers; `others`: from those that are too many."""
+    facts = [others, configuration_is_met(system, t, state.q)]
+    facts += [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((system, state)) if _is_few(x)]
+    positive = [getattr(system, name) for name, info in parameter_info(system).items() if info.positive]
+    return functools.reduce(jnp.logical_and, [*facts, *(jnp.all(x > 0) for x in positive if _is_few(x))])
+
+
+def _safe(valid: Array, values: Any) -> Any:
+    """The values where they are valid, ones elsewhere."""
+    few, rest = eqx.partition(values, _is_few)
+    many, rest = eqx.partition(rest, eqx.is_inexact_array)
+    many = jax.tree.map(lambda x: jnp.where(valid, x, jnp.ones_like(x)), many)
+    leaves, treedef = jax.tree.flatten(few)
+    return eqx.combine(jax.tree.unflatten(treedef, _safe_scalars(valid, leaves)), many, rest)
+
+
+@fused
+def _safe_scalars(valid: Array, values: list[Array]) -> list[Array]:
+    # One program: as an operation each, the parameters would be as many kernels of XLA.
+    return [jnp.where(valid, x, jnp.ones_like(x)) for x in values]
 
 
 def _status(solution: diffrax.Solution, which: Array, events: Events) -> Array:

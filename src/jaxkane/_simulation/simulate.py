@@ -13,6 +13,7 @@ from .._description.system import State, System
 from .._method.checks import check_state, check_system, is_concrete, with_possible_bodies
 from .._method.diagnose import diagnosis
 from .._method.now import values_of
+from .._scalars.jax_internals import nothing_is_traced
 from .._scalars.types import Inputs
 from .modes import for_reverse_mode, goes_forward
 from .ride import inputs_at, solve
@@ -88,9 +89,14 @@ def simulate(
     given = (system, state, ts, with_one_times(signals))
     if adjoint == "auto" and goes_forward(given):
         settings = dataclasses.replace(settings, adjoint=ADJOINTS["forward"]())
+    told = type(settings.adjoint).__name__
     if isinstance(settings.adjoint, ADJOINTS["reverse"]):
-        given = for_reverse_mode(given)
-    ride = solve(*given, of_any_accuracy(settings, ts.dtype))
+        # A motion that nobody can differentiate is compiled without what its derivative would need: the same numbers.
+        if nothing_is_traced():
+            settings = dataclasses.replace(settings, adjoint=ADJOINTS["forward"]())
+        else:
+            given = for_reverse_mode(given)
+    ride = dataclasses.replace(solve(*given, of_any_accuracy(settings, ts.dtype)), adjoint=told)
     if is_concrete(ride.status) and int(ride.status) == Status.NO_SOLUTION:
         inputs_now = values_of(system, state.x, inputs_at(system, signals, ts[0], state))
         raise ValueError(

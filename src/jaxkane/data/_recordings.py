@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from scipy.signal import savgol_filter
 
 from .._common.lookup import refuse_unknown
 from ..fit import Trial, read_trials
@@ -222,6 +221,8 @@ def _json(name: str, file: str) -> dict[str, Any]:
 
 def _with_rates(trial: Trial, step: float = 0.002, window: int = 25) -> Trial:
     """The same, with rates to begin from: the slopes of cubics through as many samples, `step` [s] apart."""
+    from scipy.signal import savgol_filter  # which imports all of scipy.stats
+
     even = np.arange(trial.t[0], trial.t[-1] + step, step)
     rates = {}
     for name, y in trial.measured.items():

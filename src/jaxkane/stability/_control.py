@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import scipy.linalg
-import scipy.signal
 
 from .._common.lookup import hint
 from ._linearize import LinearModel
+
+if TYPE_CHECKING:
+    import scipy.signal
 
 
 def transfer_function(model: LinearModel, input: str, output: str) -> scipy.signal.TransferFunction:
@@ -21,6 +22,8 @@ def transfer_function(model: LinearModel, input: str, output: str) -> scipy.sign
 
     **Raises:** `ValueError` for an unknown name.
     """
+    import scipy.signal  # which imports all of scipy.stats: a second that most have no use for
+
     A, B, C, D = _single(model, input, output)
     numerator, denominator = scipy.signal.ss2tf(A, B, C, D)
     small = np.abs(numerator[0]) <= 1e-12 * np.abs(numerator[0]).max()
@@ -52,6 +55,8 @@ def lqr(
 
     **Raises:** `ValueError` for wrong shapes and for a model that these inputs cannot stabilize.
     """
+    from scipy.linalg import solve_continuous_are
+
     names = model.inputs if inputs is None else tuple(inputs)
     A, B = np.asarray(model.A), np.asarray(model.B)[:, [_place(model.inputs, k, "input") for k in names]]
     Q, R = _weights(Q, len(A), "Q", "states"), _weights(R, B.shape[1], "R", "inputs")
@@ -64,7 +69,7 @@ def lqr(
                 f"mode with the eigenvalue {root:.4g}, which does not decay. Leave out the states that it moves: "
                 "linearize(..., states=(...)), or add an input."
             )
-    P = scipy.linalg.solve_continuous_are(A, B, Q, R)
+    P = solve_continuous_are(A, B, Q, R)
     K = np.linalg.solve(R, B.T @ P)
     return K, P, np.linalg.eigvals(A - B @ K)
 

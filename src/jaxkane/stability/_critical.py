@@ -90,46 +90,53 @@ def critical_speeds(
     """
     values, at, states, _ = family_of(system, _default_grid(system, values, motion), motion, states)
     found = eigenvalues(system, values, motion, states=states, modes=modes)
-    is_known = jnp.all(jnp.isfinite(jax.lax.stop_gradient(found.eigenvalues)))
-    if is_concrete(is_known) and not bool(is_known):
-        gone = np.asarray(found.values)[~np.isfinite(np.asarray(jax.lax.stop_gradient(found.eigenvalues))).all(axis=1)]
-        places = ", ".join(f"{x:.6g}" for x in gone)
-        raise ValueError(
-            f"critical_speeds({type(system).__name__}): there is no steady motion at {places}, so that what becomes "
-            "stable or unstable beside it would be missed. Give values at which there is one."
-        )
-    row, column, is_one = _sign_changes(found, most)
-    is_one = is_one & is_known
+    roots: Any = jax.lax.stop_gradient(found.eigenvalues)
+    concrete = is_concrete(roots)
+    if concrete:
+        # What is decided by numbers that are known is left to NumPy: every operation would be a program of its own.
+        roots = np.asarray(roots)
+        if not np.all(np.isfinite(roots)):
+            gone = np.asarray(found.values)[~np.isfinite(roots).all(axis=1)]
+            places = ", ".join(f"{x:.6g}" for x in gone)
+            raise ValueError(
+                f"critical_speeds({type(system).__name__}): there is no steady motion at {places}, so that what "
+                "becomes stable or unstable beside it would be missed. Give values at which there is one."
+            )
+    row, column, is_one = _sign_changes(roots, most)
     critical, frequency = _refine(system, found, at, states, row, column)
-    direction = jnp.sign(_real(found, row + 1, column) - _real(found, row, column)).astype(int)
+    xp = np if concrete else jnp
+    direction = xp.sign(roots.real[row + 1, column] - roots.real[row, column]).astype(int)
     origin = (system, values)
-    critical, frequency = nan_where(~is_one, (critical, frequency), origin)
-    none = nan_where(jnp.array(True), jnp.zeros((), values.dtype), origin)
-    order = jnp.argsort(jax.lax.stop_gradient(critical))
-    return CriticalSpeeds(critical[order], frequency[order], direction[order], column[order], none, found.modes)
+    if not concrete:
+        critical, frequency = nan_where(~(is_one & jnp.all(jnp.isfinite(roots))), (critical, frequency), origin)
+    if is_concrete(critical, frequency, origin):
+        critical, frequency, none = np.asarray(critical), np.asarray(frequency), np.full((), np.nan, values.dtype)
+        order: Any = np.argsort(critical)
+    else:
+        none = nan_where(jnp.array(True), jnp.zeros((), values.dtype), origin)
+        order = jnp.argsort(jax.lax.stop_gradient(critical))
+    critical, frequency, direction, mode = (jnp.asarray(x[order]) for x in (critical, frequency, direction, column))
+    return CriticalSpeeds(critical, frequency, direction, mode, jnp.asarray(none), found.modes)
 
 
 def _default_grid(system: System, values: Any, motion: MotionAt) -> Any:
     return _GRID if values is None and motion is None else values
 
 
-def _real(found: Eigenvalues, row: Any, column: Any) -> Any:
-    return jax.lax.stop_gradient(found.eigenvalues).real[row, column]
-
-
-def _sign_changes(found: Eigenvalues, most: int) -> tuple[Any, Any, Any]:
-    """Rows after which, and columns in which, a real part changes sign; of a conjugate pair only the upper one."""
-    x = jax.lax.stop_gradient(found.eigenvalues)
+def _sign_changes(x: Any, most: int) -> tuple[Any, Any, Any]:
+    """Rows after which, and columns in which, a real part of the eigenvalues (m, n) changes sign; of a conjugate pair
+    only the upper one."""
+    xp = np if isinstance(x, np.ndarray) else jnp
     upper = (x.imag[:-1] >= 0) & (x.imag[1:] >= 0)
     # What neither grows nor decays (an undamped oscillation) has a real part of rounding errors only.
-    sign = jnp.sign(jnp.where(jnp.abs(x.real) > 1e-10 * jnp.max(jnp.abs(x), initial=0.0), x.real, 0.0))
+    sign = xp.sign(xp.where(xp.abs(x.real) > 1e-10 * xp.max(xp.abs(x), initial=0.0), x.real, 0.0))
     # One that is zero at a value itself, between two signs, has passed it.
-    before, after = jnp.concatenate([sign[:1], sign[:-1]]), jnp.concatenate([sign[1:], sign[-1:]])
-    sign = jnp.where((sign == 0) & (before * after < 0), after, sign)
+    before, after = xp.concatenate([sign[:1], sign[:-1]]), xp.concatenate([sign[1:], sign[-1:]])
+    sign = xp.where((sign == 0) & (before * after < 0), after, sign)
     changes = (sign[:-1] * sign[1:] < 0) & upper
-    if is_concrete(changes):
-        row, column = map(jnp.asarray, np.nonzero(np.asarray(changes)))
-        return row, column, jnp.ones(row.shape, bool)
+    if xp is np:
+        row, column = np.nonzero(changes)
+        return row, column, np.ones(row.shape, bool)
     row, column = jnp.nonzero(changes, size=most, fill_value=-1)
     is_one = row >= 0
     # Empty places repeat the first, so that nothing there can spoil a derivative.
