@@ -378,6 +378,48 @@ def test_windows_with_their_log_determinant_are_a_filter():
         find_continuity(first, sigma=("roll",))
 
 
+class Dragged(Cart):
+    """A cart that a motor drives, which lags behind its command; the sensor reads its force."""
+
+    lag: jk.Scalar = jk.parameter(0.5, positive=True)  # [s]
+    states = ("force",)
+
+    def loads(self, t, q, u, motion, inputs):
+        force = inputs["force"] - self.stiffness * q["x"] - self.damping * u["x_dot"]
+        return (jk.Force(force * motion.N.x, motion["cart"]),)
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return ((now["push"] - x["force"]) / self.lag,)
+
+    def outputs(self, t, q, u, motion, now):
+        return {"cell": 2.0 * now["force"]}
+
+
+@pytest.mark.slow
+def test_states_are_disturbed_too():
+    """A motor's force that wanders, by the matrix exponential of the three equations."""
+    t, rng, q_force = np.arange(0.0, 1.5, 0.1), np.random.default_rng(5), 0.8
+    A = np.array([[0.0, 1.0, 0.0], [-STIFFNESS, -DAMPING, 1.0], [0.0, 0.0, -2.0]])
+    M = np.zeros((6, 6))
+    M[:3, :3], M[3:, 3:], M[1, 4], M[2, 5] = -A, A.T, Q, q_force
+    E = scipy.linalg.expm(0.1 * M)
+    Phi, more = E[3:, 3:].T, E[3:, 3:].T @ E[:3, 3:]
+    y = {"x": 0.4 + 0.05 * rng.normal(size=t.size), "cell": rng.normal(size=t.size)}
+    sigma, H = {"x": 0.02, "cell": 0.3}, {"x": np.array([1.0, 0, 0]), "cell": np.array([0, 0, 2.0])}
+    mean, P, total = np.array([0.4, 0.1, 0.0]), np.diag([0.1, 0.2, 0.5]) ** 2, 0.0
+    for i in range(t.size):
+        if i:
+            mean, P = Phi @ mean, Phi @ P @ Phi.T + more
+        for name, h in H.items():
+            s, e = h @ P @ h + sigma[name] ** 2, y[name][i] - h @ mean
+            total += e**2 / s + np.log(2 * np.pi * s)
+            mean, P = mean + P @ h * e / s, P - np.outer(P @ h, h @ P) / s
+    trial = Trial(t, y, sigma=sigma, initial={"x": 0.4, "x_dot": 0.1})
+    options = {"unknown": {"x": 0.1, "x_dot": 0.2, "force": 0.5}, "noise": {"force": q_force, "x_dot": Q}}
+    problem = Problem.of(Dragged(), trial, "lag", simulation=TIGHT, **options)
+    assert cost(problem, problem.start) == pytest.approx(total, rel=EXACT)
+
+
 class Swing(jk.System):
     """A pendulum by its angle."""
 

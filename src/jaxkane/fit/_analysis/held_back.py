@@ -40,7 +40,8 @@ def applied_to(fit: Fit, trials: Sequence[Trial] | Trial) -> Fit:
 
 @dataclasses.dataclass(frozen=True)
 class CrossValidation:
-    """Trials left out in turn: sums of squares of each, its own starts and biases found with the parameters held.
+    """Trials left out in turn: sums of squares of each, its own starts and biases found with the parameters held; of
+    fits with process noise, minus twice the log likelihoods.
 
     - `trials`: their names; `n`: numbers of residuals; `at_start`, `fitted`, `held_out` (T,): with the parameters of
         the start, of the fit of all, and of the fit of the others.
@@ -53,11 +54,23 @@ class CrossValidation:
     fitted: np.ndarray
     held_out: np.ndarray
     estimates: dict[str, np.ndarray]
+    cost_name: str = "sum of squares"
 
     @property
     def score(self) -> float:
-        """The share of the sum of squares at the start that the fit takes away from trials it has not seen."""
+        """The share of the sum of squares at the start that the fit takes away from trials it has not seen; NaN of
+        likelihoods, which have no zero."""
+        if self.cost_name != "sum of squares":
+            return float("nan")
         return float(1 - self.held_out.sum() / self.at_start.sum())
+
+    @property
+    def verdict(self) -> str:
+        """What a fit takes away from trials it has not seen, in words."""
+        if self.cost_name != "sum of squares":
+            less = self.at_start.sum() - self.held_out.sum()
+            return f"held out, the {self.cost_name} of all is {less:.4g} below that of the start."
+        return f"held-out score: {100 * self.score:.1f} % of the start's sum of squares is taken away."
 
     def __str__(self) -> str:
         lines = [f"{'trial':<28}{'residuals':>10}{'start':>12}{'fitted':>12}{'held out':>12}"]
@@ -65,7 +78,7 @@ class CrossValidation:
         lines += [f"{name:<28}{n:>10}{a:>12.5g}{b:>12.5g}{c:>12.5g}" for name, n, a, b, c in rows]
         total = (self.n.sum(), self.at_start.sum(), self.fitted.sum(), self.held_out.sum())
         lines.append("{:<28}{:>10}{:>12.5g}{:>12.5g}{:>12.5g}".format("all", *total))
-        lines.append(f"held-out score: {100 * self.score:.1f} % of the start's sum of squares is taken away.")
+        lines.append(self.verdict)
         return "\n".join(lines)
 
 
@@ -100,6 +113,7 @@ def cross_validate(fit: Fit, folds: int | Sequence[Sequence[int]] | None = None)
         fitted=costs_by_trial(fit.problem, fit.point),
         held_out=held,
         estimates={name: np.array(values) for name, values in estimates.items()},
+        cost_name=fit.problem.cost_name,
     )
 
 

@@ -90,7 +90,7 @@ def save_report(
     if cross_validation:
         rows = [line.rsplit(maxsplit=4) for line in str(cross_validation).splitlines()[1:-1]]
         head = ("trial left out", "residuals", "start", "fitted", "held out")
-        said = f"Held-out score: {100 * cross_validation.score:.1f} % of the start's sum of squares is taken away."
+        said = cross_validation.verdict[0].upper() + cross_validation.verdict[1:]
         sections.append(("Trials left out", _paragraph(said) + _details("Every trial", _table(head, rows))))
     sections.append(("Settings", _table(("", ""), list(_settings(fit)))))
     body = "\n".join(f"<h2>{html.escape(head)}</h2>\n{part}" if head else part for head, part in sections)
