@@ -31,10 +31,16 @@ def moved(system, ts, q, u, u_dep=None):
     dep = np.zeros((n, len(system.dependent_speeds))) if u_dep is None else u_dep
     inputs = {name: jnp.zeros(n) for name in system.inputs}
     stats = {name: jnp.asarray(n) for name in ("steps", "accepted", "rejected")}
-    names = (system.coordinates, system.speeds, system.dependent_speeds)
-    q, u, dep = (jnp.asarray(x) for x in (q, u, dep))
     return jk.Trajectory(
-        jnp.asarray(ts), q, u, dep, inputs, jnp.asarray(0), jnp.asarray(ts[-1]), stats, names, (), "none"
+        **{name: jnp.asarray(x) for name, x in dict(t=ts, q=q, u=u, u_dep=dep, x=np.zeros((n, 0))).items()},
+        inputs=inputs,
+        outputs={},
+        status=jnp.asarray(0),
+        t_end=jnp.asarray(ts[-1]),
+        stats=stats,
+        names=(system.coordinates, system.speeds, system.dependent_speeds, ()),
+        events=(),
+        adjoint="none",
     )
 
 

@@ -120,7 +120,7 @@ def test_sweeps_have_derivatives():
         ({"mass": [1.0, 2.0], "length": [1.0]}, ValueError, r"differ in length: mass \(2\), length \(1\)"),
         ({"mass": [None, 2.0]}, ValueError, "'mass' must hold a row of numbers"),
         ({"mass": 3.0}, ValueError, "'mass' must hold a row of numbers"),
-        ({"rider": ["a", "b"]}, ValueError, "nothing here is a batch"),
+        ({"rider": ["a", "b"]}, ValueError, "are text, which labels a member and changes nothing"),
         ([1.0, 2.0], TypeError, "a dict of columns or a DataFrame, got list"),
         ({}, ValueError, "no columns"),
     ],
