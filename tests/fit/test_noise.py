@@ -230,6 +230,7 @@ def test_the_smoother_knows_all_measurements(case):
         motion.band("x", 95)
 
 
+@pytest.mark.slow
 def test_a_start_without_a_deviation_may_be_anywhere(case):
     """Found with the parameters, it is the mean of the smoother that began with any start, whose band is its own."""
     _, y, _ = case

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from ..._description.system import State, System
@@ -168,21 +169,26 @@ def information_of(model: Any, window: Windows, start: Array, start_dot: Array, 
     Each innovation e is Gaussian with the standard deviation s, given those before it. A step of least squares with
     these rows is one of Fisher's scoring.
     """
-    n_z, n_b = z.shape[0], b.shape[0]
-    unit = jnp.eye(n_z + n_b + x.shape[0], dtype=z.dtype)
-    directions = (start_dot.T, unit[:, :n_z], unit[:, n_z : n_z + n_b], unit[:, n_z + n_b :])
+    n_z, n_b, k = z.shape[0], b.shape[0], z.shape[0] + b.shape[0] + x.shape[0]
+    # What is a random variable of the filter is no unknown: nothing else moves with it.
+    moves = np.array([j for j in range(k) if j >= n_z + n_b or not model.noise.random[j]], dtype=np.int32)
+    unit = jnp.eye(k, dtype=z.dtype)[moves]
+    directions = (start_dot.T[moves], unit[:, n_z : n_z + n_b], unit[:, n_z + n_b :])
 
     def along(*direction):
-        def of(start, z, b, x):
+        def of(start, b, x):
             found = filtered(model, window, start, b, x)
-            return (found.innovation, found.deviation, model.priors(window, z, b, x)), found
+            return (found.innovation, found.deviation), found
 
-        return jax.jvp(of, (start, z, b, x), direction, has_aux=True)
+        return jax.jvp(of, (start, b, x), direction, has_aux=True)
 
-    (e, s, priors), (e_dot, s_dot, priors_dot), found = jax.vmap(along, out_axes=(None, -1, None))(*directions)
+    (e, s), dots, found = jax.vmap(along, out_axes=(None, -1, None))(*directions)
+    priors = model.priors(window, z, b, x)
+    priors_dot = jnp.concatenate(jax.jacfwd(model.priors, argnums=(1, 2, 3))(window, z, b, x), axis=1)
     seen = (window.weight > 0).ravel()
     e, s = e.ravel(), s.ravel()
-    e_dot, s_dot = (jnp.where(seen[:, None], d.reshape(e.size, -1), 0.0) for d in (e_dot, s_dot))
+    dots = (jnp.where(seen[:, None], d.reshape(e.size, -1), 0.0) for d in dots)
+    e_dot, s_dot = (jnp.zeros((e.size, k), e.dtype).at[:, moves].set(d) for d in dots)
     r = jnp.where(seen, e / s, 0.0)
     of_size = jnp.where(seen, (1 - r**2) / 2**0.5, 0.0)
     J = jnp.concatenate([e_dot / s[:, None], 2**0.5 * s_dot / s[:, None], priors_dot])

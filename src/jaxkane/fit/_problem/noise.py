@@ -31,10 +31,12 @@ MODES = 3
 
 
 class Noise(eqx.Module):
-    """What is disturbed, `names`: independent speeds, states and inputs; how much, `intensity` (n_w,), as given."""
+    """What is disturbed, `names`: independent speeds, states and inputs; how much, `intensity` (n_w,), as given.
+    `random` (n_z + n_b,): which of a trial's unknowns have a standard deviation, and so are variables of the filter."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     intensity: Float[Array, " n_w"]
+    random: tuple[bool, ...] = eqx.field(static=True)
 
     def intensities(self, roles: Mapping[tuple[str, str], Array]) -> Array:
         """(n_w,), those that are free by ("intensity", name)."""
@@ -67,8 +69,9 @@ class Disturbance(eqx.Module):
         return disturbed, State(jnp.zeros_like(state.q), row(self.speeds), x)
 
 
-def noise_of(system: System, given: Any, window: Any, continuity: Any) -> Noise | None:
-    """The process noise that a fit was given by name, checked; None for a fit of least squares."""
+def noise_of(system: System, given: Any, deviations: Any, window: Any, continuity: Any) -> Noise | None:
+    """The process noise that a fit was given by name, checked; None for a fit of least squares. `deviations`
+    (n_z + n_b,): of a trial's unknowns."""
     if given is None:
         return None
     if not isinstance(given, Mapping):
@@ -95,4 +98,5 @@ def noise_of(system: System, given: Any, window: Any, continuity: Any) -> Noise 
                 f"have it found, start from such a number and name Intensity({name!r}) among `free`."
             )
     dtype = jnp.result_type(float)
-    return Noise(tuple(given), jnp.asarray([float(x) for x in given.values()], dtype))
+    random = tuple(bool(x) for x in np.isfinite(np.asarray(deviations)))
+    return Noise(tuple(given), jnp.asarray([float(x) for x in given.values()], dtype), random)
