@@ -326,7 +326,8 @@ def _of_noise(system: System, item: Intensity | Sigma, noise: Mapping[str, float
             raise ValueError(f"{kind} of {what}: nothing below zero is possible, got the bounds {item.bounds}.")
         item = dataclasses.replace(item, bounds=(lower or 0.0, upper))
     known = unit_of(what, units_of(system)) if kind == "intensity" else ""
-    unit = (f"({known})^2 s" if what in system.inputs else f"({known})^2/s") if known else ""
+    known = f"({known})" if set(known) & set(" /^") else known
+    unit = (f"{known}^2 s" if what in system.inputs else f"{known}^2/s") if known else ""
     entry = _Entry(item.name or f"{kind} of {what}", item.unit or unit, role=(kind, what))
     return _scalar(entry, item, start, positive=True)
 
