@@ -1,11 +1,11 @@
 """What do gears cost? A double pendulum with two geared motors, identified from measured torques and angles.
 
-Two arms of 0.2 and 0.3 m hang from each other, each driven by a motor with a gear of 6:1 (DFKI's double pendulum, 2022;
-five runs of ten seconds). The arms' inertia, that of the rotors and the friction of the gears are found in windows of
-half a second, each of which begins where it likes: such motions forget their beginning soon. Twice: with viscous and dry
-friction; and with what gears do besides, friction in proportion to the torque that they carry, zeros of the angles that
-are off, and clocks that differ. No parameters explain the run sysid_00 with the others; its deviations are taken as five
-times as large, so that the others are not bent to it.
+Two arms of 0.2 and 0.3 m hang from each other, each driven by a motor with a gear of 6:1 (DFKI's double pendulum,
+2022; five runs of ten seconds). The arms' inertia, that of the rotors and the friction of the gears are found in
+windows of half a second, each of which begins where it likes: such motions forget their beginning soon. Twice: with
+viscous and dry friction; and with what gears do besides, friction in proportion to the torque that they carry, zeros
+of the angles that are off, and clocks that differ. No parameters explain the run sysid_00 with the others; its
+deviations are taken as five times as large, so that the others are not bent to it.
 
     variable             meaning                                                              unit
     angle1, angle2       of the first arm from hanging, of the second relative to the first   rad
@@ -19,8 +19,8 @@ times as large, so that the others are not bent to it.
     zero1, zero2         where the encoders read zero                                         rad
 
 Run:      python examples/identify_geared_arms.py [--out FOLDER]
-Appears:  both tables of estimates, the medians of the windows' rms errors, and identify_geared_arms.png: one run's angles,
-          and what each model leaves.
+Appears:  both tables of estimates, the medians of the windows' rms errors, and identify_geared_arms.png: a run, and how
+          many windows each model explains how well.
 Takes:    about a minute and a half.
 """
 
@@ -117,20 +117,18 @@ def windows_rms(fit, channel):
 
 
 def picture(fits, path):
-    figure, axes = plt.subplots(3, 1, figsize=(9, 6.5), sharex=True)
-    last = [*fits.values()][-1]
-    trial, name = last.problem.trials[2], last.trial_names[2]
+    figure, axes = plt.subplot_mosaic([["run", "run"], ["angle1", "angle2"]], figsize=(9, 6), layout="constrained")
+    trial = next(iter(fits.values())).problem.trials[2]
     for channel, color, label in (("angle1", INK, "first arm"), ("angle2", "#8a8f98", "second arm, relative to it")):
-        axes[0].plot(trial.t, trial.measured[channel], color=color, linewidth=1.0, label=label)
-    for color, (label, fit) in zip((GOLD, BLUE), fits.items(), strict=True):
-        for ax, channel in zip(axes[1:], ("angle1", "angle2"), strict=True):
-            ax.plot(trial.t, 1e3 * 0.01 * fit.residuals[name][channel], color=color, linewidth=0.8, label=label)
-    axes[0].set_ylabel("angle [rad]")
-    axes[0].legend(loc="upper right", ncols=2)
-    axes[1].set_ylabel("first arm:\nsimulated - measured [mrad]")
-    axes[2].set(xlabel="time [s]", ylabel="second arm:\nsimulated - measured [mrad]")
-    axes[1].legend(loc="upper right", ncols=2)
-    figure.tight_layout()
+        axes["run"].plot(trial.t, trial.measured[channel], color=color, linewidth=1.0, label=label)
+        for other, (name, fit) in zip((GOLD, BLUE), fits.items(), strict=True):
+            errors = 1e3 * np.sort(windows_rms(fit, channel))
+            axes[channel].step(errors, np.arange(1, errors.size + 1) / errors.size, color=other, label=name)
+        axes[channel].set(xscale="log", xlabel=f"{label}: rms error [mrad]", ylabel="share of the windows")
+        axes[channel].grid(alpha=0.3)
+    axes["run"].set(xlabel=f"time [s] of {trial.name}", ylabel="angle [rad]")
+    axes["run"].legend(loc="upper right", ncols=2)
+    axes["angle1"].legend(loc="lower right")
     figure.savefig(path, dpi=120)
 
 
