@@ -125,6 +125,8 @@ def picture(fits, path):
             errors = 1e3 * np.sort(windows_rms(fit, channel))
             axes[channel].step(errors, np.arange(1, errors.size + 1) / errors.size, color=other, label=name)
         axes[channel].set(xscale="log", xlabel=f"{label}: rms error [mrad]", ylabel="share of the windows")
+        axes[channel].set_xticks([3, 10, 30, 100], ["3", "10", "30", "100"])
+        axes[channel].minorticks_off()
         axes[channel].grid(alpha=0.3)
     axes["run"].set(xlabel=f"time [s] of {trial.name}", ylabel="angle [rad]")
     axes["run"].legend(loc="upper right", ncols=2)
