@@ -78,7 +78,7 @@ def _short_runs(equal: np.ndarray) -> bool:
     """Whether what repeats does so in many short runs, and not in one long rest."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], equal.astype(int), [0]])))
     runs = edges[1::2] - edges[::2]
-    return len(runs) >= 10 and runs.max() < 0.2 * len(equal)
+    return bool(len(runs) >= 10 and runs.max() < 0.2 * len(equal))
 
 
 def _limit(y: np.ndarray) -> str:
