@@ -1,6 +1,9 @@
 """Parameters from measured motion: trials, exact derivatives, optimizers, and how far to trust what is found."""
 
 from ._analysis.base_parameters import base_parameters as base_parameters
+from ._analysis.candidates import Candidate as Candidate
+from ._analysis.compare import Comparison as Comparison
+from ._analysis.compare import compare as compare
 from ._analysis.design import Design as Design
 from ._analysis.design import design as design
 from ._analysis.first_guess import FirstGuess as FirstGuess
@@ -25,6 +28,9 @@ from ._analysis.regressor import regressor as regressor
 from ._analysis.signs import contrary_signs as contrary_signs
 from ._analysis.smoothed import Smoothed as Smoothed
 from ._analysis.smoothed import smoothed as smoothed
+from ._analysis.suspected import Suspect as Suspect
+from ._analysis.suspected import Suspects as Suspects
+from ._analysis.suspects import suspects as suspects
 from ._data.read import read_trials as read_trials
 from ._data.trial import Trial as Trial
 from ._fit import fit as fit
@@ -45,6 +51,7 @@ from ._problem.parameters import Free as Free
 from ._problem.parameters import Gain as Gain
 from ._problem.parameters import Inertia as Inertia
 from ._problem.parameters import Intensity as Intensity
+from ._problem.parameters import Offset as Offset
 from ._problem.parameters import Sigma as Sigma
 from ._problem.problem import Problem as Problem
 from ._problem.simulation import Simulation as Simulation

@@ -96,7 +96,7 @@ def cross_validate(fit: Fit, folds: int | Sequence[Sequence[int]] | None = None)
         raise ValueError("Leaving trials out needs two at least: cut a long one with `Trial.between`.")
     if folds is None:
         folds = T if T <= 10 else 5
-    groups = _folds(folds, T)
+    groups = folds_of(folds, T)
     held, estimates = np.full(T, np.nan), {name: [] for name in fit.names}
     for group in groups:
         others = fit.problem.only(set(range(T)) - set(group))
@@ -117,7 +117,7 @@ def cross_validate(fit: Fit, folds: int | Sequence[Sequence[int]] | None = None)
     )
 
 
-def _folds(folds: int | Sequence[Sequence[int]], T: int) -> list[list[int]]:
+def folds_of(folds: int | Sequence[Sequence[int]], T: int) -> list[list[int]]:
     if isinstance(folds, int):
         if not 2 <= folds <= T:
             raise ValueError(f"`folds`: {T} trials can be left out in 2 to {T} parts, not in {folds}.")

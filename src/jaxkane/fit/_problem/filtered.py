@@ -126,7 +126,7 @@ def _flow(model: Any, system: System, roles: Any, window: Windows, v: Array, dis
         settings = dataclasses.replace(settings, step=ts[1] - ts[0])
     signals = with_one_times(model.signals(window, b, roles))
     ride = solve(system, State(*parts_of(system, v[:n])), ts, signals, settings, disturbance)
-    return (jnp.concatenate([ride.q[1], ride.u[1], ride.x[1], b]), model.simulated(ride, b)), ride.status
+    return (jnp.concatenate([ride.q[1], ride.u[1], ride.x[1], b]), model.simulated(ride, b, roles)), ride.status
 
 
 def brought_back(system: System, t: Array, v: Array, S: Array) -> tuple[Array, Array]:

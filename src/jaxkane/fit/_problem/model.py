@@ -28,6 +28,10 @@ from .blocks import Blocks
 from .filtered import Filtered, filtered, information_of, minus_twice_log_likelihood
 from .noise import Noise
 from .parameters import Parameters
+from .shifted import earlier
+
+Roles = dict[tuple[str, str], Array]
+"""Gains, offsets and delays that all trials have in common, by what they are of: ("gain of input", name)."""
 
 
 class Unknowns(eqx.Module):
@@ -120,12 +124,20 @@ class Model(eqx.Module):
 
     def consistent(self, window: Windows, z: Array, x: Array) -> Array:
         """The start (n_q + n_u + n_x,) of one window, its dependent coordinates found by `assemble`."""
-        system, _ = self.parameters.apply(self.system, x)
+        system, roles = self.parameters.apply(self.system, x)
         if self.noise is not None:  # a start with a deviation is no unknown of a filter, but what it begins with
             z = jnp.where(jnp.isfinite(self.nuisance.start_deviation), 0.0, z)
-        start = window.start.at[self.unknown_places].add(z)
+        start = self.known(window.start, roles).at[self.unknown_places].add(z)
         state = assemble(system, *parts_of(system, start), t=window.t[0], free=self.assembled)
         return joined(state.q, state.u, state.x)
+
+    def known(self, start: Array, roles: Roles) -> Array:
+        """What is known of a start (n_q + n_u + n_x,), with the gains and offsets that all trials have in common."""
+        for i, name in enumerate(state_names(self.system)):
+            for kind, change in (("gain of start", jnp.multiply), ("offset of start", jnp.add)):
+                if (kind, name) in roles:
+                    start = start.at[i].set(change(start[i], roles[kind, name]))
+        return start
 
     def simulate(self, window: Windows, start: Array, b: Array, x: Array) -> Trajectory:
         """One window's motion."""
@@ -134,46 +146,52 @@ class Model(eqx.Module):
         signals = with_one_times(self.signals(window, b, roles))
         return solve(system, State(*parts_of(system, start)), window.t, signals, settings)
 
-    def signals(self, window: Windows, b: Array, roles: dict[tuple[str, str], Array]) -> dict[str, Any]:
+    def signals(self, window: Windows, b: Array, roles: Roles) -> dict[str, Any]:
         """The inputs of one window by name."""
         system, signals = self.system, {}
         for i, name in enumerate(system.inputs):
-            bias = self.nuisance.of_trial(b, "bias of input", name, 0.0)
+            bias = self.nuisance.of_trial(b, "bias of input", name, 0.0) + roles.get(("offset of input", name), 0.0)
             if name in self.driven:
-                gain = roles.get(("gain", name), 1.0) * self.nuisance.of_trial(b, "gain of input", name, 1.0)
+                gain = roles.get(("gain of input", name), 1.0) * self.nuisance.of_trial(b, "gain of input", name, 1.0)
                 times, values = self._times_of(name, window, b, roles), gain * window.inputs[i] + bias
                 if name in self.held and times is not window.t_input and self.settings.step is not None:
                     signals[name] = Ramps(times, values, 2.0 * window.step)
                 else:
                     signals[name] = Samples(times, values, hold=name in self.held)
-            elif ("bias of input", name) in self.nuisance.trial:
+            elif ("bias of input", name) in self.nuisance.trial or ("offset of input", name) in roles:
                 signals[name] = bias
         return signals
 
-    def _times_of(self, name: str, window: Windows, b: Array, roles: dict[tuple[str, str], Array]) -> Array:
+    def _times_of(self, name: str, window: Windows, b: Array, roles: Roles) -> Array:
         """When an input's samples act (n_in,) [s]: the same array for all that have no delay, since kinks that are
         known to be at the same times cost no more than those of one input."""
-        if ("delay", name) not in roles and ("delay of input", name) not in self.nuisance.trial:
+        if ("delay of input", name) not in roles and ("delay of input", name) not in self.nuisance.trial:
             return window.t_input
-        delay = roles.get(("delay", name), 0.0) + self.nuisance.of_trial(b, "delay of input", name, 0.0)
+        delay = roles.get(("delay of input", name), 0.0) + self.nuisance.of_trial(b, "delay of input", name, 0.0)
         return window.t_input + delay
 
-    def simulated(self, ride: Trajectory, b: Array) -> Array:
+    def simulated(self, ride: Trajectory, b: Array, roles: Roles) -> Array:
         """What the sensors would have said (n_c, n_t)."""
         rows = []
         for c in self.channels:
-            gain = self.nuisance.of_trial(b, "gain of sensor", c, 1.0)
-            rows.append(gain * ride[c] + self.nuisance.of_trial(b, "bias of sensor", c, 0.0))
+            y = ride[c]
+            if ("delay of sensor", c) in roles:
+                y = earlier(ride.t, y, roles["delay of sensor", c])
+            gain = self.nuisance.of_trial(b, "gain of sensor", c, 1.0) * roles.get(("gain of sensor", c), 1.0)
+            bias = self.nuisance.of_trial(b, "bias of sensor", c, 0.0) + roles.get(("offset of sensor", c), 0.0)
+            rows.append(gain * y + bias)
         return jnp.stack(rows)
 
     def residuals(self, window: Windows, start: Array, z: Array, b: Array, x: Array) -> tuple[Array, Any]:
         """Residuals of one window, priors included (m,), in which the next window starts where it is first thought to;
         and what was seen."""
         ride = self.simulate(window, start, b, x)
-        simulated, n = self.simulated(ride, b), self.nuisance
+        roles = self.parameters.apply(self.system, x)[1]
+        simulated, n = self.simulated(ride, b, roles), self.nuisance
         difference = jnp.where(window.weight > 0, (simulated - window.measured) * window.weight, 0.0)
         end = joined(ride.q[-1], ride.u[-1], ride.x[-1])
-        jump = jnp.where(window.linked > 0, (end - window.next_start)[self.unknown_places] / n.jump, 0.0)
+        following = self.known(window.next_start, roles)
+        jump = jnp.where(window.linked > 0, (end - following)[self.unknown_places] / n.jump, 0.0)
         rows = [difference.ravel(), *([jump] if n.chained else []), self.priors(window, z, b, x)]
         return jnp.concatenate(rows), Seen(simulated, ride.status)
 

@@ -16,7 +16,7 @@ from ..._method.now import output_names
 from .._data.trial import Trial
 from .._data.windows import state_names
 from .model import Nuisance
-from .parameters import Delay
+from .parameters import Delay, where_of
 
 Names = Sequence[str] | Mapping[str, float | None]
 """Names, or names with the standard deviation of a Gaussian prior around the initial guess (None: no prior)."""
@@ -115,5 +115,5 @@ def held_and_delayed(
     """Inputs under a zero-order hold, and those that act with a delay which is to be found."""
     items = [free] if isinstance(free, Delay) else free if isinstance(free, (list, tuple)) else ()
     delayed = [name for kind, name in nuisance.trial if kind == "delay of input"]
-    delayed += [item.input for item in items if isinstance(item, Delay)]
+    delayed += [item.what for item in items if isinstance(item, Delay) and where_of(system, item) == "input"]
     return tuple(checked_names(system, "hold", hold, system.inputs)), tuple(delayed)

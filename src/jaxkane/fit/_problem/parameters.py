@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -17,9 +17,11 @@ from ..._common.lookup import hint
 from ..._description.parameters import declared, leaf_name, learned_part
 from ..._description.system import System
 from ..._description.units import unit_of, units_of
+from ..._method.now import output_names
 from .bijections import Interval, PossibleBody
 
 Prior = tuple[float, float]
+Where = Literal["input", "sensor", "start"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,35 +57,73 @@ class Free:
 
 @dataclasses.dataclass(frozen=True)
 class Gain:
-    """The gain of an input, common to all trials: the system receives gain * samples + bias.
+    """A factor common to all trials: of an input, of a sensor, or of what is known of the starts.
 
-    `input`: its name; the rest as in `Free`.
+        Gain("steer_torque"), Gain("roll_rate", prior=(1.0, 0.02)), Gain("rear_wheel_rate", of="start")
+
+    - `what`: the name of an input (the system receives gain * samples + offset), of a channel (gain * simulated +
+        offset is compared with the measurement), or of a coordinate, speed or state.
+    - `of`: "input", "sensor" or "start", where every window begins with gain * (what its trial knows) + offset, as of a
+        speedometer that is wrong by a factor in all rides. By default an input where there is one of this name, else a
+        sensor.
+
+    The rest as in `Free`.
     """
 
-    input: str
+    what: str
     start: float = 1.0
     bounds: tuple[float | None, float | None] | None = None
     scale: float | None = None
     prior: Prior | None = None
     name: str | None = None
     unit: str = ""
+    of: Where | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Offset:
+    """A constant common to all trials, that is added to an input, to what a sensor says, or to what is known of starts.
+
+        Offset("roll", prior=(0.0, 0.02))                  # the zero of a sensor, the same in all rides
+
+    `what`, `of` and the rest as in `Gain`. The scale is by default 1, in the unit of what it is added to: give another
+    where one is much, since what is called undetermined is counted in it.
+    """
+
+    what: str
+    start: float = 0.0
+    bounds: tuple[float | None, float | None] | None = None
+    scale: float | None = None
+    prior: Prior | None = None
+    name: str | None = None
+    unit: str = ""
+    of: Where | None = None
 
 
 @dataclasses.dataclass(frozen=True)
 class Delay:
-    """The delay [s] with which an input acts, common to all trials: the system receives samples(t - delay).
+    """A delay [s] common to all trials, with which an input acts or a sensor reports.
 
-    Earlier than `LONGEST_DELAY` the first sample stands. Of an input under a zero-order hold the jumps move; where the
-    steps of integration have one length, each is a ramp of two steps. The rest as in `Free`.
+    - Of an input: the system receives samples(t - delay); earlier than `LONGEST_DELAY` the first one stands. Under a
+        zero-order hold the jumps move; where the steps of integration have one length, each is a ramp of two steps.
+    - Of a sensor: simulated(t - delay) is compared with the measurement, by cubics through what is simulated at the
+        samples; the motion before a window is continued as it begins, so a delay should be short beside a window.
+
+    `what`, `of` and the rest as in `Gain`.
     """
 
-    input: str
+    what: str
     start: float = 0.0
     bounds: tuple[float | None, float | None] | None = None
     scale: float | None = 0.02
     prior: Prior | None = None
     name: str | None = None
     unit: str = "s"
+    of: Where | None = None
+
+
+Shared = (Gain, Offset, Delay)
+"""What is the same in all trials, and no parameter of the system."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -155,7 +195,7 @@ class _Entry:
     name: str
     unit: str
     targets: tuple[tuple[int, int, float], ...] = ()
-    role: tuple[str, str] | None = None  # ("gain" or "delay", input), ("intensity", disturbed), ("sigma", channel)
+    role: tuple[str, str] | None = None  # such as ("gain of input", name), ("intensity", disturbed), ("sigma", channel)
     part: str = ""  # the learned function that it belongs to
 
 
@@ -209,7 +249,7 @@ class Parameters(eqx.Module):
         return split(x, np.cumsum(self.sizes)[:-1])
 
     def apply(self, system: System, x: Float[Array, " p"]) -> tuple[System, dict[tuple[str, str], Array]]:
-        """The system with these parameters, and by ("gain", input) gains, delays, intensities and factors of sigma."""
+        """The system with these parameters; gains, offsets, delays and the noise's by ("gain of input", name)."""
         leaves, structure = jax.tree.flatten(system)
         roles = {}
         values = self.values(x)
@@ -251,6 +291,13 @@ def _checked_prior(name: str, prior: Any) -> Prior:
     return float(prior[0]), float(prior[1])
 
 
+def as_items(free: Any) -> list[Any]:
+    """What a fit takes as `free`, one by one."""
+    if isinstance(free, (str, Free, Inertia, Intensity, Sigma, Gain, Offset, Delay)) or callable(free):
+        return [free]
+    return list(free)
+
+
 def parameters_of(
     system: System,
     free: Sequence[Any] | Any,
@@ -262,12 +309,11 @@ def parameters_of(
     **Raises:** `ValueError` that names a parameter, input, disturbed speed or channel that does not exist, is named
     twice, starts outside its bounds, or as a body that cannot be.
     """
-    alone = (str, Free, Gain, Delay, Inertia, Intensity, Sigma)
-    free = [free] if isinstance(free, alone) or callable(free) else list(free)
+    free = as_items(free)
     parts: list[tuple[list[_Entry], Any, list[float], list[float], list[Prior | None]]] = []
     for item in free:
-        if isinstance(item, (Gain, Delay)):
-            parts.append(_of_input(system, item))
+        if isinstance(item, Shared):
+            parts.append(_of_all_trials(system, item, noise))
         elif isinstance(item, (Intensity, Sigma)):
             parts.append(_of_noise(system, item, noise, channels))
         elif isinstance(item, Inertia):
@@ -296,13 +342,16 @@ def parameters_of(
     )
 
 
-def _of_input(system: System, item: Gain | Delay):
-    role = type(item).__name__.lower()
-    if item.input not in system.inputs:
+def _of_all_trials(system: System, item: Gain | Offset | Delay, noise: Mapping[str, float] | None):
+    kind, where = type(item).__name__.lower(), where_of(system, item)
+    if noise is not None and (kind, where) == ("delay", "sensor"):
         raise ValueError(
-            f"{type(system).__name__} has no input {item.input!r}; {hint(item.input, system.inputs, 'it has')}"
+            f"Delay({item.what!r}): a filter of process noise compares each measurement with the motion at its time. "
+            "Let the sensor's delay be a state of the system, `jaxkane.sensors.delayed`."
         )
-    entry = _Entry(item.name or f"{role} of {item.input}", item.unit, role=(role, item.input))
+    label = f"{kind} of {'start of ' if where == 'start' else ''}{item.what}"
+    unit = item.unit or (units_of(system).get(item.what, "") if isinstance(item, Offset) else "")
+    entry = _Entry(item.name or label, unit, role=(f"{kind} of {where}", item.what))
     return _scalar(entry, item, item.start, positive=False)
 
 
@@ -330,6 +379,30 @@ def _of_noise(system: System, item: Intensity | Sigma, noise: Mapping[str, float
     unit = (f"{known}^2 s" if what in system.inputs else f"{known}^2/s") if known else ""
     entry = _Entry(item.name or f"{kind} of {what}", item.unit or unit, role=(kind, what))
     return _scalar(entry, item, start, positive=True)
+
+
+def where_of(system: System, item: Gain | Offset | Delay) -> Where:
+    """Whether it is of an input, of a sensor or of the starts.
+
+    **Raises:** `ValueError` where there is nothing of that name.
+    """
+    motion = (*system.coordinates, *system.speeds)
+    known = {
+        "input": tuple(system.inputs),
+        "sensor": (*motion, *system.dependent_speeds, *system.states, *output_names(system)),
+        "start": (*motion, *system.states),
+    }
+    title, kind = type(system).__name__, type(item).__name__
+    if item.of is not None and (item.of not in known or (kind, item.of) == ("Delay", "start")):
+        of = "'input' or 'sensor'" if kind == "Delay" else "'input', 'sensor' or 'start'"
+        raise ValueError(f"{kind}({item.what!r}): `of` is {of}, or None; got {item.of!r}.")
+    where = item.of or ("input" if item.what in known["input"] else "sensor")
+    if item.what not in known[where]:
+        among = known[where] if item.of else (*known["input"], *known["sensor"])
+        what = {"input": "input", "sensor": "channel", "start": "coordinate, independent speed or state"}
+        named = what[item.of] if item.of else "input or channel"
+        raise ValueError(f"{title} has no {named} {item.what!r}; {hint(item.what, among, 'it has')}")
+    return where
 
 
 def _of_leaves(system: System, item: Free):
@@ -362,7 +435,7 @@ def _followers(system: System, name: str, factor: float) -> list[tuple[int, int,
     return [(i, place, float(factor)) for i in chosen for place in range(leaves[i][1].size)]
 
 
-def _scalar(entry: _Entry, item: Free | Gain | Delay | Intensity | Sigma, start: float, positive: bool):
+def _scalar(entry: _Entry, item: Free | Gain | Offset | Delay | Intensity | Sigma, start: float, positive: bool):
     name = entry.name
     lower, upper = _checked_bounds(name, item.bounds, positive)
     if not math.isfinite(start):

@@ -17,6 +17,7 @@ from ..._description.system import System
 from .._analysis.held_back import CrossValidation, cross_validate
 from .._analysis.profile import Profile
 from .._analysis.signs import contrary_signs
+from .._analysis.suspected import Suspects
 from .._problem.problem import refuse_other
 from .._result.identifiability import combination
 from .._result.result import STATUS, Fit, known_values
@@ -54,6 +55,7 @@ def save_report(
     truth: Mapping[str, float] | Any = None,
     cross_validation: CrossValidation | bool = False,
     profiles: Sequence[Profile] = (),
+    suspects: Suspects | None = None,
     trials: int | None = 6,
     title: str | None = None,
 ) -> Path:
@@ -64,6 +66,7 @@ def save_report(
     - `path`: of the page. `title`: its heading, by default the system's name.
     - `truth`: parameters by name, or a system, where they are known.
     - `cross_validation`: what `cross_validate` gave, or True to do it now. `profiles`: what `profile` gave.
+    - `suspects`: what `suspects` gave, of this fit or of the one before it.
     - `trials`: how many are drawn, from the first to the last; None for all.
 
     **Returns:** the path.
@@ -92,6 +95,9 @@ def save_report(
         head = ("trial left out", "residuals", "start", "fitted", "held out")
         said = cross_validation.verdict[0].upper() + cross_validation.verdict[1:]
         sections.append(("Trials left out", _paragraph(said) + _details("Every trial", _table(head, rows))))
+    if suspects:
+        refuse_other(suspects, Suspects, "`suspects=`", "save_report(fit, path, suspects=suspects(fit, candidates))")
+        sections.append(("What may be missing", f'<div class="wide">{suspects._repr_html_()}</div>'))
     sections.append(("Settings", _table(("", ""), list(_settings(fit)))))
     body = "\n".join(f"<h2>{html.escape(head)}</h2>\n{part}" if head else part for head, part in sections)
     path = Path(path)

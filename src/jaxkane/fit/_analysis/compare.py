@@ -1,0 +1,146 @@
+"""Fits beside each other: parameters, sums of squares, what is accounted for, what can be believed. Fits nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+import html
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from .._data.trial import Trial
+from .._problem.problem import refuse_other
+from .._result.result import Fit
+from .._result.tables import plain, table
+from .held_back import applied_to
+from .plausible import plausible_of
+
+Table = tuple[str, list[list[str]]]
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Comparison:
+    """What `compare` gives; print it for the tables.
+
+    - `fits`: by name. `held_out`: by name, the parameters of each on trials that were held back; empty without any.
+    - `objections`: by name, what is not plausible of each fit's parameters, in words.
+    """
+
+    fits: Mapping[str, Fit]
+    held_out: Mapping[str, Fit]
+    objections: Mapping[str, tuple[str, ...]]
+
+    @property
+    def tables(self) -> list[Table]:
+        """A heading and rows, of which the first is the head, for each."""
+        found = [("Parameters, with the errors of their intervals", self._parameters()), ("All", self._sums())]
+        found.append(("Sum of squares and variance accounted for, by channel", self._channels(self.fits)))
+        found.append(("Sum of squares, by trial", self._trials(self.fits)))
+        if self.held_out:
+            found.append(("Held back: by channel", self._channels(self.held_out)))
+            found.append(("Held back: by trial", self._trials(self.held_out)))
+        return found
+
+    def _parameters(self) -> list[list[str]]:
+        names = list(dict.fromkeys(name for fit in self.fits.values() for name in fit.names))
+        units = {n: u for fit in self.fits.values() for n, u in zip(fit.names, fit.parameters.units, strict=True)}
+        rows = [["parameter", *self.fits]]
+        for name in names:
+            cells = []
+            for fit in self.fits.values():
+                errors = fit.clustered_errors if fit.robust else fit.standard_errors
+                cells.append(f"{fit.estimates[name]:.5g} ({errors[name]:.2g})" if name in fit.names else "")
+            rows.append([f"{name} [{units[name]}]" if units[name] else name, *cells])
+        return rows
+
+    def _sums(self) -> list[list[str]]:
+        fits, columns = list(self.fits.values()), list(self.fits)
+        rows = [["", *columns], ["sum of squares", *(f"{fit.cost:.6g}" for fit in fits)]]
+        if self.held_out:
+            rows.append(["held back", *(f"{self.held_out[name].cost:.6g}" for name in columns)])
+        rows.append(["residuals", *(str(fit.problem.size[0]) for fit in fits)])
+        rows.append(["unknowns", *(str(fit.problem.size[1]) for fit in fits)])
+        rows.append(["variance of a residual", *(f"{fit.variance:.3g}" for fit in fits)])
+        rows.append(["neighbours' correlation", *(f"{fit.autocorrelation:.2f}" for fit in fits)])
+        rows.append(["not plausible", *("; ".join(self.objections[name]) or "nothing" for name in columns)])
+        return rows
+
+    def _channels(self, fits: Mapping[str, Fit]) -> list[list[str]]:
+        channels = list(dict.fromkeys(c for fit in fits.values() for c in fit.problem.channels))
+        rows = [["channel", *fits]]
+        for channel in channels:
+            cells = []
+            for fit in fits.values():
+                share = fit.variance_accounted_for.get(channel, math.nan)
+                squares = sum(float(np.nansum(r[channel] ** 2)) for r in fit.residuals.values() if channel in r)
+                cells.append(f"{squares:.5g}, {100 * share:.1f} %" if channel in fit.problem.channels else "")
+            rows.append([channel, *cells])
+        return rows
+
+    def _trials(self, fits: Mapping[str, Fit]) -> list[list[str]]:
+        trials = list(dict.fromkeys(name for fit in fits.values() for name in fit.trial_names))
+        of = {
+            name: {t: sum(float(np.nansum(r**2)) for r in channels.values()) for t, channels in fit.residuals.items()}
+            for name, fit in fits.items()
+        }
+        return [
+            ["trial", *fits],
+            *([t, *(f"{of[name][t]:.5g}" if t in of[name] else "" for name in fits)] for t in trials),
+        ]
+
+    def __str__(self) -> str:
+        return "\n\n".join(f"{heading}\n{plain(rows)}" for heading, rows in self.tables)
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return "".join(f"<p>{html.escape(heading)}</p>{table(rows)}" for heading, rows in self.tables)
+
+
+def compare(
+    fits: Mapping[str, Fit] | Sequence[Fit],
+    held_out: Sequence[Trial] | Trial | None = None,
+    *,
+    plausible: Mapping[str, Any] | None = None,
+) -> Comparison:
+    """Fits beside each other: which is nearer to what was measured, where, and which can be believed.
+
+        print(compare({"viscous": one, "with dry friction": other}, held_out=others))
+
+    **Arguments:**
+
+    - `fits`: by name; of a sequence, the free parameters are the names.
+    - `held_out`: trials that none of them has seen: their starts and biases are found, the parameters are not
+        (`applied_to`). Those of bicycles by `bicycle_rides`.
+    - `plausible`: as in `suspects`.
+
+    **Returns:** a `Comparison`: print it for tables of parameters with errors (clustered by trial where the residuals
+    are correlated), sums of squares on both sides, as a whole, by channel and by trial, and what is not plausible.
+
+    **Raises:** `TypeError` for what is no `Fit`; `ValueError` for none, and two of the same name.
+    """
+    if isinstance(fits, Fit):
+        raise TypeError("compare takes fits by name, as in compare({'first': one, 'second': other}); got one Fit.")
+    if isinstance(fits, Mapping):
+        named = dict(fits)
+    else:
+        for fit in fits:
+            refuse_other(fit, Fit, "compare", "compare({'first': fit(...), 'second': fit(...)})")
+        names = [", ".join(fit.names) for fit in fits]
+        if len(set(names)) < len(names):
+            raise ValueError("Two of these fits have the same free parameters: name them, compare({'first': ...}).")
+        named = dict(zip(names, fits, strict=True))
+    if not named:
+        raise ValueError("There is no fit to compare.")
+    for fit in named.values():
+        refuse_other(fit, Fit, "compare", "compare({'first': fit(...), 'second': fit(...)})")
+    said = plausible or {}
+    return Comparison(
+        fits=named,
+        held_out={} if held_out is None else {name: applied_to(fit, held_out) for name, fit in named.items()},
+        objections={
+            name: tuple(plausible_of(fit.parameters, said).objections(fit.estimates)) for name, fit in named.items()
+        },
+    )

@@ -1,0 +1,277 @@
+"""What a model lacks is found by name, what it does not lack is not; simulated pendulums whose truth is known."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane.fit import (
+    Candidate,
+    Delay,
+    Fit,
+    Free,
+    Gain,
+    LeastSquares,
+    Offset,
+    Simulation,
+    Trial,
+    compare,
+    cross_validate,
+    fit,
+    save_report,
+    suspects,
+)
+
+TS = np.linspace(0.0, 2.0, 41)
+NOISE = {"angle": 0.004, "rate": 0.02}
+POSED = {"unknown": ("angle", "rate"), "optimizer": LeastSquares(), "simulation": Simulation(step=0.025)}
+
+
+class Pendulum(jk.System):
+    """Gravity and inertia in one, and what may act beside them."""
+
+    stiffness: jk.Scalar = jk.parameter(20.0, positive=True)  # [1/s^2]
+    damping: jk.Scalar = jk.parameter(0.3)
+    dry: jk.Scalar = jk.parameter(0.0)
+    quadratic: jk.Scalar = jk.parameter(0.0)
+    spring: jk.Scalar = jk.parameter(0.0)
+    unused: jk.Scalar = jk.parameter(1.0)
+    coordinates = ("angle",)
+    speeds = ("rate",)
+    inputs = ("torque",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        B = N.rotate(2, q["angle"], u["rate"], "B")
+        return jk.Motion([jk.Body(1.0, (1.0, 1.0, 1.0), O.fixed(0.0 * B.x), B, name="bob")], frames={"B": B})
+
+    def loads(self, t, q, u, motion, inputs):
+        s = u["rate"]
+        torque = inputs["torque"] - self.stiffness * jnp.sin(q["angle"]) - self.damping * s
+        torque = torque - self.dry * jnp.tanh(s / 0.1) - self.quadratic * s * jnp.abs(s) - self.spring * q["angle"]
+        return jk.Torque(torque * motion["B"].y, motion["bob"])
+
+
+def record(seed, n=6, system=None, late=0, **changes):
+    """Trials of a pendulum; `changes` are numbers added to channels. `late`: by how many samples the torque acts."""
+    rng, trials, system = np.random.default_rng(seed), [], Pendulum() if system is None else system
+    for i in range(n):
+        times = np.linspace(-0.2, 2.0, 45)
+        push = 3.0 * np.sin(4.0 * times + i) + 2.0 * np.cos(7.0 * times - i)
+        acts = push[4 - late : 45 - late]
+        start = jk.State({"angle": 0.9 - 0.25 * i}, {"rate": 0.5 * (i % 3)})
+        ride = jk.simulate(system, start, jnp.asarray(TS), {"torque": jnp.asarray(acts)}, step=0.0125)
+        y = {c: np.asarray(ride[c]) + changes.get(c, 0.0) + rng.normal(0.0, s, TS.size) for c, s in NOISE.items()}
+        trials.append(Trial(TS, y, {"torque": push[4:]}, sigma=NOISE, name=f"swing {i}"))
+    return trials
+
+
+FREE = ("stiffness", "damping")
+FIVE = ("dry", "quadratic", "spring", Gain("torque"), Offset("angle", scale=0.1))
+
+
+def fitted(trials, **more) -> Fit:
+    return fit(Pendulum(), trials, FREE, **{**POSED, **more})
+
+
+@pytest.fixture(scope="module")
+def rubbing():
+    """A fit without dry friction of pendulums that have it."""
+    return fitted(record(0, system=Pendulum(dry=0.4)))
+
+
+@pytest.fixture(scope="module")
+def found(rubbing):
+    return suspects(rubbing, FIVE, depth=3, refits=2)
+
+
+def test_dry_friction_is_found_among_five(rubbing, found):
+    assert found.taken == ("dry",)
+    assert found.best is found.rows[0]
+    assert len(found.rows) == 5
+    best = found.best
+    assert best.p < 1e-4
+    assert abs(best.values["dry"] - 0.4) < 3.5 * best.errors["dry"] < 0.1
+    assert best.cost == pytest.approx(found.fit.cost, rel=1e-6)
+    assert best.promised == pytest.approx(best.cost, rel=0.05)
+    assert found.fit.names == (*FREE, "dry")
+    assert found.fit.variance < 1.3 < rubbing.variance
+    assert best.errors["dry"] == pytest.approx(found.fit.standard_errors["dry"], rel=0.05)
+    # Beside it nothing stands: the search ends by itself.
+    assert len(found.rounds) == 2
+    assert not any(row.stands for row in found.rounds[1])
+
+
+def test_the_promise_is_that_of_a_fit(rubbing, found):
+    """Beside fits that are posed anew, each with one more parameter, and trials left out of them by refits."""
+    for item in FIVE[:2]:
+        anew = fit(Pendulum(), rubbing.problem.trials, (*FREE, item), **POSED)
+        row = next(row for row in found.rows if row.name == item)
+        assert row.cost == pytest.approx(anew.cost, rel=1e-6)
+        assert row.promised == pytest.approx(anew.cost, rel=0.1)
+        assert dict(row.values) == pytest.approx(anew.estimates, rel=1e-3)
+        assert row.predicted == pytest.approx(cross_validate(anew).held_out.sum(), rel=0.05)
+
+
+def test_what_is_not_there_is_not_taken():
+    taken = 0
+    for seed in range(20):
+        without = fitted(record(seed))
+        taken += bool(suspects(without, ("dry", "spring", Offset("angle", scale=0.1)), refits=1).taken)
+    assert taken <= 3  # at a level of 0.05 one is expected, and more than three come once in sixty
+
+
+def test_negative_friction_is_not_believed(rubbing):
+    asked = ("quadratic", Free("spring", bounds=(0.0, None)))
+    found = suspects(
+        rubbing, asked, refits=None, level=0.9, plausible={"damping": (0.0, 0.6), "quadratic": (0.0, None)}
+    )
+    assert not found.taken
+    quadratic, spring = (next(row for row in found.rows if row.name == name) for name in ("quadratic", "spring"))
+    assert quadratic.objections == ("damping = 0.9051 is above 0.6", "quadratic = -0.1769 is below 0") or (
+        len(quadratic.objections) == 2 and "quadratic" in quadratic.objections[1]
+    )
+    assert quadratic.verdict.startswith("not plausible: damping = 0.9")
+    # Its bound is where it starts: it is searched for on both sides, and believed on one.
+    assert spring.values["spring"] < 0
+    assert "spring = -" in spring.verdict
+
+
+def test_one_sensor_is_off_in_all_trials():
+    trials = record(3, angle=0.05)
+    kinds = (Offset("angle", scale=0.1), Offset("rate"), Gain("rate"), Delay("torque"), Delay("rate"), "dry")
+    found = suspects(fitted(trials), kinds, refits=1)
+    assert found.taken == ("offset of angle",)
+    assert found.fit.estimates["offset of angle"] == pytest.approx(0.05, abs=4 * found.best.errors["offset of angle"])
+    # The same, as every trial's own: more unknowns for what is one number.
+    own = suspects(fitted(trials), [Candidate("zeros", sensor_bias="angle"), kinds[0]], refits=2)
+    assert own.taken == ("offset of angle",)
+    zeros = next(row for row in own.rows if row.name == "zeros")
+    anew = fitted(trials, sensor_bias="angle")
+    assert zeros.cost == pytest.approx(anew.cost, rel=1e-5)
+    assert zeros.promised == pytest.approx(anew.cost, rel=0.05)
+
+
+def test_a_known_start_is_off_in_all_trials():
+    trials = [trial.begun({"rate": 0.5 * (i % 3) + 0.1}) for i, trial in enumerate(record(4))]
+    found = suspects(fitted(trials, unknown="angle"), [Offset("rate", of="start"), "dry", "quadratic"])
+    assert found.taken == ("offset of start of rate",)
+    assert found.fit.estimates["offset of start of rate"] == pytest.approx(-0.1, abs=0.01)
+
+
+@pytest.mark.parametrize("hold", [(), ("torque",)], ids=["linear", "held"])
+def test_a_torque_that_acts_late(hold):
+    """By two samples of 0.05 s; of a held one the delay is found to where its mean is taken for it."""
+    trials = record(5, late=2)
+    asked = (Delay("torque"), Gain("torque"), "dry")
+    found = suspects(fitted(trials, hold=hold), asked, plausible={"delay of torque": (0.0, 0.3)})
+    assert found.taken == ("delay of torque",)
+    expected = 0.1 if not hold else 0.075  # what is linear between samples acts like what is held half a sample longer
+    assert found.fit.estimates["delay of torque"] == pytest.approx(expected, abs=0.003)
+
+
+class Lagging(Pendulum):
+    """The torque follows its command with a lag."""
+
+    lag: jk.Scalar = jk.parameter(0.1, positive=True)
+    states = ("acting",)
+
+    def loads(self, t, q, u, motion, inputs):
+        return super().loads(t, q, u, motion, {"torque": inputs["acting"]})
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return jk.sensors.low_pass(now["torque"], x["acting"], self.lag)[0]
+
+
+def test_another_system_with_a_state():
+    """What is not neutral anywhere is fitted."""
+    trials = record(6, system=Lagging(lag=0.08))
+    lag = Candidate("motor lag", system=Lagging(), free="lag", unknown="acting")
+    found = suspects(fitted(trials), ["dry", Delay("torque"), lag], depth=2, refits=3)
+    assert found.taken[0] == "motor lag"
+    assert np.isnan(found.best.promised)
+    assert found.fit.names == (*FREE, "lag")
+    assert found.fit.estimates["lag"] == pytest.approx(0.08, abs=0.004)
+
+
+def test_what_data_cannot_tell_is_said(rubbing):
+    posed = {"input_bias": "torque"}
+    found = suspects(
+        fitted(rubbing.problem.trials, **posed), ["unused", Offset("torque"), Candidate("own", input_gain="torque")]
+    )
+    verdicts = {row.name: row.verdict for row in found.rows}
+    assert verdicts["unused"] == "unused is not seen by these data"
+    assert verdicts["offset of torque"] == "offset of torque cannot be told from what is free"
+    assert "unused" in str(found)
+    assert np.isnan(next(row for row in found.rows if row.name == "unused").errors["unused"])
+
+
+def test_one_trial_alone(rubbing):
+    alone = fitted(rubbing.problem.trials[:1])
+    found = suspects(alone, ["dry", "spring"])
+    assert "nothing is left out" in found.headings[0]
+    assert np.isnan(found.rows[0].predicted)
+    assert found.taken == ("dry",)
+    with pytest.raises(ValueError, match="one trial alone cannot be left out"):
+        suspects(alone, "dry", folds=2)
+
+
+@pytest.mark.parametrize(
+    ("asked", "options", "message"),
+    [
+        ((), {}, "There is no candidate"),
+        (("damping",), {}, "damping: damping is free in the fit already"),
+        (("dry", "dry"), {}, "Two candidates are called dry"),
+        (("dyr",), {}, "Pendulum has no parameter 'dyr'; did you mean 'dry'"),
+        ((Candidate("nothing"),), {}, "nothing: nothing is freed"),
+        ((Candidate("again", unknown="angle"),), {}, "the start of angle is unknown already"),
+        ((Candidate("a", free="dry", plausible={"dyr": (0, 1)}),), {}, "a: `plausible` names dyr"),
+        (("dry",), {"plausible": {"dyr": (0.0, 1.0)}}, "`plausible` names dyr"),
+        (("dry",), {"plausible": {"damping": (1.0, 0.0)}}, "nothing lies between"),
+        (("dry",), {"plausible": {"dry": 0.2}}, "a share is positive, and of a start that is not zero"),
+        (("dry",), {"level": 0.0}, "`level` is a probability"),
+        (("dry",), {"depth": 0}, "`depth` is a whole number of 1"),
+        (("dry",), {"refits": -1}, "`refits` is a whole number of 0"),
+        ((Offset("angel"),), {}, "no input or channel 'angel'; did you mean 'angle'"),
+        ((Gain("torque", of="start"),), {}, "no coordinate, independent speed or state 'torque'"),
+        ((Delay("angle", of="start"),), {}, "`of` is 'input' or 'sensor', or None"),
+    ],
+)
+def test_what_cannot_be_asked_is_named(rubbing, asked, options, message):
+    with pytest.raises(ValueError, match=message):
+        suspects(rubbing, asked, **options)
+
+
+def test_what_is_asked_of_a_fit_at_a_minimum(rubbing):
+    with pytest.raises(TypeError, match="suspects takes a Fit"):
+        suspects(rubbing.problem, "dry")
+    with pytest.raises(ValueError, match="has not converged"):
+        suspects(dataclasses.replace(rubbing, status="steps"), "dry")
+
+
+def test_fits_beside_each_other(rubbing, found):
+    held = record(9, system=Pendulum(dry=0.4))
+    table = compare({"viscous": rubbing, "with friction": found.fit}, held, plausible={"damping": 0.5})
+    assert table.held_out["with friction"].cost < 0.3 * table.held_out["viscous"].cost
+    assert table.objections["viscous"] == ("damping = 0.5362 is above 0.45",)
+    text = str(table)
+    for words in ("with friction", "dry", f"{found.fit.cost:.6g}", "swing 5", "neighbours' correlation", "Held back"):
+        assert words in text
+    assert f"{found.fit.cost:.6g}" in table._repr_html_()
+    with pytest.raises(ValueError, match="There is no fit"):
+        compare({})
+    with pytest.raises(TypeError, match="got one Fit"):
+        compare(rubbing)
+    with pytest.raises(ValueError, match="same free parameters"):
+        compare([rubbing, rubbing])
+    with pytest.raises(TypeError, match="compare takes a Fit"):
+        compare([rubbing.problem])
+
+
+def test_a_page_of_the_report(found, tmp_path):
+    page = save_report(found.fit, tmp_path / "fit.html", suspects=found).read_text(encoding="utf-8")
+    assert "What may be missing" in page
+    assert "no more than chance" in page
+    assert "Taken: dry" in found._repr_html_()
