@@ -89,7 +89,7 @@ pendulum = DoublePendulum(mass=1.0, length=0.5)
         ([trial()], ("mass", lambda s: s.mass), {}, "names mass twice"),
         ([trial()], Free("mass", bounds=(2.0, 3.0)), {}, "mass starts at 1, which is not inside its bounds"),
         ([trial()], Free("mass", prior=(1.0, 0.0)), {}, "mass: a prior is"),
-        ([trial()], Gain("wind"), {}, "has no input 'wind'"),
+        ([trial()], Gain("wind"), {}, "has no input or channel 'wind'"),
         ([trial()], "mass", {"unknown": ("roll",)}, "`unknown` names roll"),
         ([trial()], "mass", {"sensor_bias": ("theta2",)}, "`sensor_bias` names theta2"),
         ([trial()], "mass", {"unknown": {"theta1": 0.0}}, "the standard deviation of theta1 must be positive"),

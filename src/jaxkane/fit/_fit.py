@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
 import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from .._description.system import System
 from ._data.trial import Trial
-from ._optimize.gradient_descent import GradientDescent
-from ._optimize.minimize import minimize
 from ._optimize.optimizer import Optimizer
+from ._optimize.solve import solve
 from ._problem.model import Unknowns
 from ._problem.names import Names
 from ._problem.parameters import Prior
@@ -106,28 +102,3 @@ def fit(
         processes=processes,
     )
     return solve(problem, optimizer, steps, start, checkpoint, callback, progress)
-
-
-def solve(
-    problem: Problem,
-    optimizer: Optimizer | None,
-    steps: int | None,
-    start: Unknowns | None,
-    checkpoint: str | os.PathLike[str] | None,
-    callback: Callable[[Unknowns, float], None] | None,
-    progress: bool,
-) -> Fit:
-    """`minimize`, gone on with from where it ended, as long as the steps of integration are too coarse there."""
-    optimizer = GradientDescent() if optimizer is None else optimizer
-    run: Any = {"steps": steps, "callback": callback, "progress": progress}
-    result = minimize(problem, optimizer, start=start, checkpoint=checkpoint, **run)
-    # The file is that of the first steps: what follows begins near its end.
-    for _ in range(3):
-        if not result.problem.chooses_steps or result.status != "converged" or not result.too_coarse:
-            break
-        problem = result.problem.finer(result.point)
-        if np.array_equal(problem.windows.step, result.problem.windows.step):
-            break
-        again = minimize(problem, optimizer.without_preparation(), start=result.point, **run)
-        result = dataclasses.replace(again, history=(*result.history, *again.history[1:]))
-    return result

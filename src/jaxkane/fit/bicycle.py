@@ -11,8 +11,8 @@ import numpy as np
 from ..catalog import WhippleBicycle
 from ..catalog._bicycle_file import read_bicycle_file
 from ._data.trial import Trial
-from ._fit import solve
 from ._optimize.optimizer import Optimizer
+from ._optimize.solve import solve
 from ._problem.model import Unknowns
 from ._problem.parameters import Inertia, Prior, parameters_of
 from ._problem.problem import Problem

@@ -21,7 +21,8 @@ class Suspect:
         where `cost` is a number, else as the linearization has them.
     - `promised`, `cost`: the sum of squares by the linearization, and fitted (NaN where it was not). `p`: the
         probability that chance promises as much.
-    - `predicted`: the sum of squares of trials that are left out in turn.
+    - `predicted`: the sum of squares of trials that are left out in turn; unknowns of the trials' own, which those that
+        are left out find too, count twice the variance of a residual each.
     - `objections`: what is not plausible, in words. `verdict`: why it does not stand, or "stands"; `stands`.
     """
 

@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from ..._common.lookup import refuse_unknown
 from .._optimize.least_squares import LeastSquares
-from .._optimize.minimize import minimize
+from .._optimize.solve import solve
 from .._problem.problem import Problem, refuse_other
 from .._result.result import Fit
 from .candidates import Candidate, candidates_of, posed_with
@@ -125,4 +125,4 @@ def _fitted(fit: Fit, taken: Sequence[Candidate], standing: Standing) -> Fit:
     problem = Problem.of(trials=fit.problem.trials, **posed_with(fit, taken))
     if problem.chooses_steps:
         problem = problem.with_steps(fit.problem.windows.step)
-    return minimize(problem, LeastSquares(), start=standing.carried_to(problem))
+    return solve(problem, LeastSquares(), start=standing.carried_to(problem))

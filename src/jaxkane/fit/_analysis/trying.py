@@ -19,7 +19,7 @@ from .._result.covariance import slopes_of, values_of
 from .._result.result import Fit
 from .candidates import Candidate, Extended, carried, extended, groups_of
 from .plausible import Plausible, plausible_of
-from .score import Rows, beside_zero, chance, is_clustered, score, solved
+from .score import Rows, beside_zero, chance, independent_share, is_clustered, score, solved
 from .suspected import Suspect
 
 Folds = Sequence[Sequence[int]] | None
@@ -141,6 +141,10 @@ class Trying:
         moved = np.zeros(len(more.names))
         moved[x] = solved(A, r)
         values = np.asarray(values_of(more.problem.parameters, more.point.x)) + slopes @ moved
+        left_out = float("nan")
+        if nested and self.folds is not None:
+            freedom = was.freedom - len(new) - count
+            left_out = rows.left_out(x, self.folds) + _own_share(count, found.least, freedom, was.correlation)
         row_names = tuple(more.names[i] for i in new)
         row = Suspect(
             name=candidate.name,
@@ -149,7 +153,7 @@ class Trying:
             errors=_errors(row_names, slopes[np.ix_(new, new)], found.covariance),
             promised=was.cost - found.drop if nested else float("nan"),
             p=found.p if nested else float("nan"),
-            predicted=rows.left_out(x, self.folds) if nested and self.folds is not None else float("nan"),
+            predicted=left_out,
             verdict=_untold(more, new, found) if nested else "",
         )
         objections = common.plausible.objections(row.values)
@@ -186,7 +190,7 @@ class Trying:
             errors=_errors(found.names[n:], slopes[n:, n:], now.covariance),
             cost=after.cost,
             p=p,
-            predicted=after.left_out(self.folds),
+            predicted=after.left_out(self.folds) + _own_share(count, after.cost, after.freedom, after.correlation),
             objections=tuple(o for o in common.plausible.objections(after.values) if o not in before),
         )
         return row, after
@@ -250,6 +254,12 @@ def _held(at: Linearization) -> np.ndarray:
     blocks, first = at.blocks, at.blocks.n_z + at.blocks.n_next
     norms = np.linalg.norm(np.asarray(blocks.R)[:, :, first : first + blocks.n_b], axis=(0, 1))
     return float(jnp.finfo(blocks.R.dtype).eps) ** 0.4 / np.where(norms > 0, norms, 1.0)
+
+
+def _own_share(count: int, cost: float, freedom: int, correlation: float) -> float:
+    """What unknowns of the trials' own flatter a prediction by: trials that are left out find theirs, which takes away
+    a variance each, and adds one to what comes after (as in Akaike's criterion)."""
+    return 2.0 * count * cost / freedom / independent_share(correlation) if count and freedom > 0 else 0.0
 
 
 def _errors(names: Sequence[str], slopes: np.ndarray, covariance: np.ndarray) -> dict[str, float]:

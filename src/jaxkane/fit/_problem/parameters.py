@@ -386,23 +386,23 @@ def where_of(system: System, item: Gain | Offset | Delay) -> Where:
 
     **Raises:** `ValueError` where there is nothing of that name.
     """
-    motion = (*system.coordinates, *system.speeds)
-    known = {
-        "input": tuple(system.inputs),
-        "sensor": (*motion, *system.dependent_speeds, *system.states, *output_names(system)),
-        "start": (*motion, *system.states),
-    }
-    title, kind = type(system).__name__, type(item).__name__
-    if item.of is not None and (item.of not in known or (kind, item.of) == ("Delay", "start")):
-        of = "'input' or 'sensor'" if kind == "Delay" else "'input', 'sensor' or 'start'"
-        raise ValueError(f"{kind}({item.what!r}): `of` is {of}, or None; got {item.of!r}.")
-    where = item.of or ("input" if item.what in known["input"] else "sensor")
-    if item.what not in known[where]:
-        among = known[where] if item.of else (*known["input"], *known["sensor"])
-        what = {"input": "input", "sensor": "channel", "start": "coordinate, independent speed or state"}
-        named = what[item.of] if item.of else "input or channel"
+    title, kind, of = type(system).__name__, type(item).__name__, item.of
+    if of not in (None, "input", "sensor", "start") or (kind, of) == ("Delay", "start"):
+        known = "'input' or 'sensor'" if kind == "Delay" else "'input', 'sensor' or 'start'"
+        raise ValueError(f"{kind}({item.what!r}): `of` is {known}, or None; got {of!r}.")
+    if of in (None, "input") and item.what in system.inputs:
+        return "input"
+    starts = (*system.coordinates, *system.speeds, *system.states) if of != "input" else ()
+    sensors = (*starts, *system.dependent_speeds, *output_names(system)) if of in (None, "sensor") else ()
+    among, named = {
+        None: ((*system.inputs, *sensors), "input or channel"),
+        "input": (system.inputs, "input"),
+        "sensor": (sensors, "channel"),
+        "start": (starts, "coordinate, independent speed or state"),
+    }[of]
+    if item.what not in among:
         raise ValueError(f"{title} has no {named} {item.what!r}; {hint(item.what, among, 'it has')}")
-    return where
+    return of or "sensor"
 
 
 def _of_leaves(system: System, item: Free):
