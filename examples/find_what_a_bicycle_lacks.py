@@ -68,9 +68,9 @@ def main():
     arguments = parser.parse_args()
     jk.configure()
     recording = jk.data.steer_by_wire()
-    rides, values = recording.trials, {"dry_friction": 0.0, "quadratic_damping": 0.0, **recording.parameters}
+    rides = recording.trials
     options = {"input_bias": ("roll_torque", "steer_torque"), "hold": ("steer_torque",), "optimizer": LeastSquares()}
-    first = fit_bicycle(rides, Bicycle.from_parameters(values), "steer_damping", **options)
+    first = fit_bicycle(rides, Bicycle.from_parameters(recording.parameters), "steer_damping", **options)
     speeds = np.array([ride.initial["speed"][0] for ride in rides])
     by_speed = [np.flatnonzero(speeds == v).tolist() for v in np.unique(speeds)]
     found = suspects(first, CANDIDATES, depth=4, refits=3, plausible=PLAUSIBLE, folds=by_speed, progress=True)

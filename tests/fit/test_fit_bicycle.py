@@ -8,6 +8,8 @@ import pytest
 import jaxkane as jk
 from jaxkane.catalog import WhippleBicycle
 from jaxkane.fit import (
+    Delay,
+    Free,
     Gain,
     GradientDescent,
     LeastSquares,
@@ -19,6 +21,7 @@ from jaxkane.fit import (
     frame_inertia,
     minimize,
     multi_start,
+    suspects,
 )
 
 SIGMA = {"roll": 0.005, "steer": 0.005, "roll_rate": 0.03, "steer_rate": 0.05}
@@ -148,6 +151,36 @@ def test_four_parameters_of_a_measured_bicycle(measured):
     assert any(note.startswith("IBxx went to") and "implausible" in note for note in more.notes)
     # Rides left out are fitted almost as well.
     assert cross_validate(result).score > 0.85
+
+
+class Rubbing(WhippleBicycle):
+    """With dry friction in the steering."""
+
+    dry_friction: jk.Scalar = jk.parameter(0.0, unit="N m")
+
+    def loads(self, t, q, u, motion, inputs):
+        torque = -self.dry_friction * jnp.tanh(u["steer_rate"] / 0.05)
+        more = jk.Torque(torque * motion["C"].z, motion["fork"], reaction_on=motion["rear frame"])
+        return (*super().loads(t, q, u, motion, inputs), more)
+
+
+@pytest.mark.slow
+def test_what_the_measured_bicycle_lacks(measured):
+    """None of it is an inertia or a length: the filters of roll and roll rate, the gyroscope's gain, dry friction."""
+    rides, _ = measured
+    bicycle = Rubbing.from_parameters(jk.data.steer_by_wire().parameters)
+    first = fit_bicycle(rides, bicycle, "steer_damping", optimizer=LeastSquares(), **OPTIONS)
+    lacking = [Free("dry_friction", bounds=(0.0, None)), Delay("roll"), Delay("roll_rate"), Gain("roll_rate")]
+    speeds = np.array([ride.initial["speed"][0] for ride in rides])
+    by_speed = [np.flatnonzero(speeds == v).tolist() for v in np.unique(speeds)]
+    found = suspects(first, [*lacking, "c", "IHzz"], depth=5, refits=1, folds=by_speed, plausible={"IHzz": 0.5})
+    assert set(found.taken) >= {"delay of roll", "delay of roll_rate", "gain of roll_rate", "dry_friction"}
+    after = dict(zip(found.taken, found.costs[1:], strict=False)) | {found.taken[-1]: found.fit.cost}
+    assert after[found.taken[3]] < 1500
+    # Rides at speeds that were left out are predicted as well.
+    assert found.rounds[3][0].predicted < 1700 < 3900 < found.left_out[0]
+    assert 0.1 < found.fit.estimates["dry_friction"] < 0.25  # [N m]; 0.2 were measured by the makers
+    assert abs(found.fit.estimates["gain of roll_rate"] - 1.17) < 0.02
 
 
 def test_a_ride_needs_its_speed():
