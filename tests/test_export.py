@@ -520,10 +520,10 @@ def test_many_speeds_are_exported_but_for_what_lapack_does():
 
 
 class ByMatrix(Bob):
-    """A description that multiplies matrices."""
+    """A description that multiplies matrices too large to be written out."""
 
     def loads(self, t, q, u, motion, inputs):
-        x = jnp.asarray(q) @ jnp.array([[1.0, 2.0], [3.0, 4.0]])
+        x = jnp.concatenate([jnp.asarray(q), jnp.zeros(70)]) @ jnp.ones((70 + len(q), 2))
         return [jk.Force(x[0] * motion.N.x, motion.bodies[0])]
 
 

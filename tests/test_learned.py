@@ -17,8 +17,12 @@ from jaxkane.fit import Free, LeastSquares, Trial, fit
 ts = np.linspace(0.0, 3.0, 61)
 
 
-def network(seed=0, activation=jnp.tanh):
-    return eqx.nn.MLP("scalar", "scalar", 4, 1, activation, key=jax.random.key(seed))
+def network(seed=2):
+    """With the same numbers in every version of JAX."""
+    rng = np.random.default_rng(seed)
+    law = eqx.nn.MLP("scalar", "scalar", 4, 1, jnp.tanh, key=jax.random.key(0))
+    arrays, rest = eqx.partition(law, eqx.is_inexact_array)
+    return eqx.combine(jax.tree.map(lambda x: jnp.asarray(rng.uniform(-0.5, 0.5, x.shape)), arrays), rest)
 
 
 class Pendulum(jk.System):
@@ -70,6 +74,7 @@ def test_it_is_one_program_of_scalars(pendulum):
     assert is_plain(program.jaxpr)
 
 
+@pytest.mark.slow
 def test_its_derivative(pendulum):
     def last(weight):
         law = eqx.tree_at(lambda law: law.layers[0].weight, pendulum.law.function, weight)
@@ -89,10 +94,10 @@ def test_a_law_is_learned_and_the_mass_stays_physical(pendulum):
     trial = Trial(ts, {"angle": true["angle"] + noise}, sigma=1e-3, initial={"angle": 1.0, "rate": 0.5})
     free = ["mass", Free("law", prior=(0.0, 1.0))]
     found = fit(Pendulum(network(), mass=0.45), trial, free, optimizer=LeastSquares(), steps=60)
-    assert found.cost < 120
-    elsewhere = jk.State([0.7], [0.0])
+    assert found.cost < 60
+    elsewhere = jk.State([0.95], [0.0])
     rough, learned = (jk.simulate(p, elsewhere, ts)["angle"] for p in (Rough(network(), mass=0.4), found.system))
-    assert np.abs(rough - learned).max() < 0.02  # of 0.7; without friction they are 0.3 apart
+    assert np.abs(rough - learned).max() < 0.02  # of 0.95; without friction they are 0.3 apart
     assert abs(found.estimates["mass"] - 0.4) < 4 * found.standard_errors["mass"]
     text = str(found)
     assert "rms of 13 learned numbers" in text

@@ -96,6 +96,7 @@ def test_what_is_asked_at_one_time(cart, ride):
         jk.accelerations(cart, 0.0, [0.0], [0.0], {"froce": 1.0})
 
 
+@pytest.mark.slow
 def test_derivatives_in_both_modes_and_in_batches(cart):
     def last(cart, force):
         ride = jk.simulate(cart, jk.State({"place": 0.2}, {}, {"force": force}), ts, {"command": 5.0})
@@ -117,6 +118,7 @@ def test_derivatives_in_both_modes_and_in_batches(cart):
     assert float(rides["acceleration"][0, -1]) != float(rides["acceleration"][1, -1])
 
 
+@pytest.mark.slow
 def test_a_batch_by_sweep(cart):
     rides = sweep(cart, START, ts, {"command": 5.0}, table={"lag": [0.1, 0.2], "force": [3.0, 1.0]})
     assert rides["acceleration"].shape == (2, 21)
@@ -149,6 +151,7 @@ def test_a_controller_reads_a_state(cart):
     np.testing.assert_allclose(ride["command"], -2.0 * ride["force"] + ride["filtered"], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_audit_knows_their_power(cart):
     ride = jk.simulate(cart, START, np.linspace(0.0, 1.0, 201), {"command": 5.0})
     kept = jk.audit(cart, ride)

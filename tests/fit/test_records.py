@@ -80,6 +80,7 @@ def test_a_sensor_in_degrees_or_upside_down(factor, words):
     assert any(note.startswith("gyro ") and words in note for note in found.notes)
 
 
+@pytest.mark.slow
 def test_a_trial_that_no_parameters_explain_is_named():
     system = Cart(mass=1.0, stiffness=4.0, damping=0.2)
     rng, trials = np.random.default_rng(0), []
