@@ -191,9 +191,9 @@ class Lagging(Pendulum):
 
 @pytest.mark.slow
 def test_another_system_with_a_state():
-    """What is not neutral anywhere is fitted."""
+    """What is not neutral anywhere is fitted; what its system begins with is not what is plausible."""
     trials = record(6, system=Lagging(lag=0.08))
-    lag = Candidate("motor lag", system=Lagging(), free="lag", unknown="acting")
+    lag = Candidate("motor lag", system=Lagging(stiffness=3.0), free="lag", unknown="acting")
     found = suspects(fitted(trials), ["dry", Delay("torque"), lag], depth=2, refits=3)
     assert found.taken[0] == "motor lag"
     assert np.isnan(found.best.promised)
@@ -231,6 +231,7 @@ def test_one_trial_alone(rubbing):
         ((), {}, "There is no candidate"),
         (("damping",), {}, "damping: damping is free in the fit already"),
         (("dry", "dry"), {}, "Two candidates are called dry"),
+        (("dry", Candidate("bound", free=Free("dry", bounds=(-1.0, 1.0)))), {}, "free dry in different ways"),
         (("dyr",), {}, "Pendulum has no parameter 'dyr'; did you mean 'dry'"),
         ((Candidate("nothing"),), {}, "nothing: nothing is freed"),
         ((Candidate("again", unknown="angle"),), {}, "the start of angle is unknown already"),

@@ -71,7 +71,8 @@ class Candidate:
 def candidates_of(fit: Fit, given: Any) -> tuple[Candidate, ...]:
     """What was given, as candidates.
 
-    **Raises:** `ValueError` for none, for one that frees nothing or what is free already, and for names that repeat.
+    **Raises:** `ValueError` for none, for one that frees nothing or what is free already, for names that repeat, and
+    two that free the same differently.
     """
     given = (given,) if isinstance(given, Candidate) else as_items(given)
     found = tuple(_candidate(fit, each) for each in given)
@@ -83,6 +84,8 @@ def candidates_of(fit: Fit, given: Any) -> tuple[Candidate, ...]:
         raise ValueError(f"Two candidates are called {', '.join(twice)}: give each a name, Candidate(name, ...).")
     for candidate in found:
         _refuse_nothing_new(fit, candidate)
+    for group in groups_of(fit, found):
+        posed_with(fit, group)  # refuses two that free the same differently
     return found
 
 

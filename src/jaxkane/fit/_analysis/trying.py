@@ -120,7 +120,13 @@ class Trying:
             return [Hope(c, Suspect(c.name, verdict=why)) for c in group]
         said = {name: value for c in group for name, value in c.plausible.items()}
         said |= {name: value for name, value in self.said.items() if name in more.names}
-        common = Common(more, at, _held(at), plausible_of(more.problem.parameters, said))
+        # What was free has started where the fit did, whatever another system begins with.
+        ranges = {
+            p: r
+            for of in (more.problem.parameters, self.fit.parameters)
+            for p, r in plausible_of(of, said).ranges.items()
+        }
+        common = Common(more, at, _held(at), Plausible(ranges))
         return [self._promised(candidate, common) for candidate in group]
 
     def _promised(self, candidate: Candidate, common: Common) -> Hope:
