@@ -16,7 +16,7 @@ Run:      python examples/find_what_a_bicycle_lacks.py [--out FOLDER]
           The rides are shipped with the library (`jaxkane.data.steer_by_wire`).
 Appears:  a table for every round, the two fits beside each other, and find_what_a_bicycle_lacks.html, the report.
           Rides are left out by speed: what was found at three speeds predicts the fourth.
-Takes:    two minutes, nearly all of it compilation.
+Takes:    about three minutes, nearly all of it compilation.
 """
 
 import argparse

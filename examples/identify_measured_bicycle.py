@@ -72,7 +72,8 @@ def main():
     print(f"The report: {page}")
     print(
         "\nWhat to believe: the damping. The other fits lower the sum of squares by moving the fork's inertia and\n"
-        "the trail to where no such bicycle is: they make up for what the model lacks (the motor, the tyres)."
+        "the trail to where no such bicycle is: they make up for what the model lacks.\n"
+        "What that is, examples/find_what_a_bicycle_lacks.py finds out."
     )
 
 
