@@ -130,6 +130,7 @@ def test_the_likelihood_is_that_of_the_linear_motion(case):
     np.testing.assert_allclose(slopes, differences, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_information_is_fishers_on_average(case):
     """1/2 tr (C^-1 dC C^-1 dC) + dm^T C^-1 dm, of all measurements at once."""
     _, y, problem = case
@@ -165,6 +166,7 @@ def test_the_fit_is_the_maximum(case, found):
         lambda p: minus_twice_log_likelihood(y, *values(p)), [np.log(STIFFNESS), DAMPING, np.log(Q), 0.0], tol=1e-8
     )
     assert found.cost == pytest.approx(best.fun, abs=1e-4)
+    assert -2 * marginal_likelihood(found) == pytest.approx(found.cost, rel=1e-12)
     errors = np.array(list(found.standard_errors.values()))
     assert np.all(np.abs(np.array(list(found.estimates.values())) - values(best.x)) < 0.02 * errors)
     assert list(found.estimates) == ["stiffness", "damping", "intensity of x_dot", "sigma of x"]

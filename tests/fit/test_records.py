@@ -70,6 +70,7 @@ class Sensed(Cart):
         return {"gyro": u["x_dot"]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("factor", "words"), [(57.3, "seems to be recorded in degrees"), (-1.0, "goes the other way")])
 def test_a_sensor_in_degrees_or_upside_down(factor, words):
     system = Sensed(mass=1.0, stiffness=4.0, damping=0.2)

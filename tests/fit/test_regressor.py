@@ -383,6 +383,7 @@ def test_a_regressor_of_many_instants_is_enough():
         base_parameters(jax.tree.map(lambda x: x[0], rows))
 
 
+@pytest.mark.slow
 def test_deviations_cover_the_truth():
     """Of 25 data sets with noisy torques, each base parameter; with a known sigma, and with an estimated one."""
     truth, at = swings()
@@ -473,6 +474,7 @@ def test_accelerations_of_noisy_samples():
 # ---- a first guess
 
 
+@pytest.mark.slow
 def test_first_guess_of_a_measured_double_pendulum():
     """Free swings: ratios of four base parameters of its makers' estimates within 3 %; friction has its sign."""
     recording = jk.data.multi_arm_pendulum(2)
@@ -492,6 +494,7 @@ def test_first_guess_of_a_measured_double_pendulum():
     assert "standard deviations from these" in str(guess)
 
 
+@pytest.mark.slow
 def test_bodies_that_can_be():
     """Torques that ask for a negative moment of inertia: what is returned has a positive pseudo-inertia."""
     ball = mechanism(

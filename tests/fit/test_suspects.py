@@ -104,6 +104,7 @@ def test_dry_friction_is_found_among_five(rubbing, found):
     assert not any(row.stands for row in found.rounds[1])
 
 
+@pytest.mark.slow
 def test_the_promise_is_that_of_a_fit(rubbing, found):
     """Beside fits that are posed anew, each with one more parameter, and trials left out of them by refits."""
     for item in FIVE[:2]:
@@ -115,6 +116,7 @@ def test_the_promise_is_that_of_a_fit(rubbing, found):
         assert row.predicted == pytest.approx(cross_validate(anew).held_out.sum(), rel=0.05)
 
 
+@pytest.mark.slow
 def test_what_is_not_there_is_not_taken():
     taken = 0
     for seed in range(20):
