@@ -1,6 +1,7 @@
 """What a model lacks is found by name, what it does not lack is not; simulated pendulums whose truth is known."""
 
 import dataclasses
+import types
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +24,7 @@ from jaxkane.fit import (
     save_report,
     suspects,
 )
+from jaxkane.fit._analysis.candidates import groups_of
 
 TS = np.linspace(0.0, 2.0, 41)
 NOISE = {"angle": 0.004, "rate": 0.02}
@@ -285,3 +287,12 @@ def test_a_page_of_the_report(found, tmp_path):
     assert "What may be missing" in page
     assert "no more than chance" in page
     assert "Taken: dry" in found._repr_html_()
+
+
+@pytest.mark.parametrize("held", [("push",), ()])
+def test_a_delay_of_what_is_held_is_asked_by_itself(held):
+    """Its jumps are ramps: beside it no other candidate would be compared with the fit as it stands."""
+    problem = types.SimpleNamespace(system=None, model=types.SimpleNamespace(held=held))
+    asked = [Candidate("a", "mass"), Candidate("late", Delay("push")), Candidate("b", "stiffness")]
+    groups = [[c.name for c in group] for group in groups_of(types.SimpleNamespace(problem=problem), asked)]
+    assert groups == ([["a", "b"], ["late"]] if held else [["a", "late", "b"]])

@@ -14,7 +14,7 @@ from ..._common.lookup import refuse_unknown
 from ..._description.system import System
 from .._problem.model import Unknowns
 from .._problem.names import Names
-from .._problem.parameters import as_items, parameters_of
+from .._problem.parameters import Delay, as_items, parameters_of
 from .._problem.part import Part
 from .._problem.problem import Problem
 from .._problem.simulation import Simulation
@@ -194,7 +194,11 @@ class Extended:
 
 
 def groups_of(fit: Fit, candidates: Sequence[Candidate]) -> Iterator[list[Candidate]]:
-    """Candidates that one problem can hold: those of the same system, with the same unknown starts."""
+    """Candidates that one problem can hold: those of the same system, with the same unknown starts.
+
+    What delays an input under a zero-order hold stands by itself: its jumps are then ramps of two steps, by which the
+    motion differs a little before anything is delayed.
+    """
     groups: list[list[Candidate]] = []
     for candidate in candidates:
         for group in groups:
@@ -208,7 +212,14 @@ def groups_of(fit: Fit, candidates: Sequence[Candidate]) -> Iterator[list[Candid
 
 def _same_frame(fit: Fit, a: Candidate, b: Candidate) -> bool:
     systems = [c.system or fit.problem.system for c in (a, b)]
-    return _by_name(a.unknown) == _by_name(b.unknown) and bool(eqx.tree_equal(*systems))
+    same = _by_name(a.unknown) == _by_name(b.unknown) and _held_and_late(fit, a) == _held_and_late(fit, b)
+    return same and bool(eqx.tree_equal(*systems))
+
+
+def _held_and_late(fit: Fit, candidate: Candidate) -> set[str]:
+    """Inputs under a zero-order hold that a candidate delays."""
+    late = {item.what for item in candidate.items if isinstance(item, Delay)} | {*_by_name(candidate.input_delay)}
+    return late & {*fit.problem.model.held}
 
 
 def extended(
