@@ -138,6 +138,11 @@ class System(eqx.Module, metaclass=Kind):
         return {}
 
 
+def names_of(system: System) -> tuple[tuple[str, ...], ...]:
+    """Of coordinates, independent and dependent speeds, and states of the first order: what a motion is read by."""
+    return tuple(map(tuple, (system.coordinates, system.speeds, system.dependent_speeds, system.states)))
+
+
 _FOUND_BY_NAME = tuple(kind for kind in NAMES if kind != "dependent_coordinates")  # these are coordinates
 
 

@@ -208,19 +208,12 @@ def outputs_at(system: System, t: Array, q: Array, u: Array, inputs: Mapping[str
     """Outputs by name, from arrays that are known to fit; `inputs` holds the states too."""
     if not has_outputs(system):
         return {}
-    if is_written_out(len(system.speeds)):
-        return _outputs_written_out(system, t, q, u, inputs)
-    return _outputs_with_accelerations(system, t, q, u, inputs, motion_rates(system, t, q, u, dict(inputs))[1])
+    inputs = dict(inputs)
+    return _outputs_now(system, t, q, u, inputs, motion_rates(system, t, q, u, inputs)[1])
 
 
 @fused
-def _outputs_written_out(system, t, q, u, inputs):
-    now = Instant(system, t, q, u, inputs)
-    return {name: as_vector([x], q)[0] for name, x in read_at(now, now.accelerations(), _outputs).items()}
-
-
-@fused
-def _outputs_with_accelerations(system, t, q, u, inputs, u_dot):
+def _outputs_now(system, t, q, u, inputs, u_dot):
     now = Instant(system, t, q, u, inputs)
     found = read_at(now, as_row(u_dot, system.speeds, "u_dot"), _outputs)
     return {name: as_vector([x], q)[0] for name, x in found.items()}

@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from .._common.lookup import not_there
 from .._description.parameters import parameter_info
-from .._description.system import State, System
+from .._description.system import State, System, names_of
 from .._description.units import units_of
 from .._method.checks import configuration_is_met
 from .._method.drift import correction, has_configuration_constraints, projected
@@ -49,8 +49,7 @@ class Now(eqx.Module):
         if name in system.dependent_speeds:
             now = Instant(system, self.t, self.q, self.u)
             return jnp.asarray(now.u_dep[system.dependent_speeds.index(name)])
-        known = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.states)
-        raise not_there(name, known, "the state")
+        raise not_there(name, [each for names in names_of(system) for each in names], "the state")
 
 
 @compiled
@@ -75,13 +74,11 @@ def solve(
 
     def vector_field(t, y, args):
         system, signals, disturbance = args
-        inputs = inputs_at(system, signals, t, y)
-        if disturbance is None:
-            y_dot = rates(system, t, y.q, y.u, values_of(system, y.x, inputs))
-        else:
+        inputs, more = inputs_at(system, signals, t, y), None
+        if disturbance is not None:
             inputs, more = disturbance(t, inputs, y)
-            y_dot = rates(system, t, y.q, y.u, values_of(system, y.x, inputs))
-            y_dot = jax.tree.map(jnp.add, y_dot, more)
+        y_dot = rates(system, t, y.q, y.u, values_of(system, y.x, inputs))
+        y_dot = y_dot if more is None else jax.tree.map(jnp.add, y_dot, more)
         if constrained and settings.stabilize:
             y_dot = State(y_dot.q + settings.stabilize * correction(system, t, y.q), y_dot.u, y_dot.x)
         return jax.tree.map(lambda rate: jnp.where(valid, rate, jnp.zeros_like(rate)), y_dot)
@@ -159,12 +156,7 @@ def solve(
             "accepted": solution.stats["num_accepted_steps"],
             "rejected": solution.stats["num_rejected_steps"],
         },
-        names=(
-            tuple(system.coordinates),
-            tuple(system.speeds),
-            tuple(system.dependent_speeds),
-            tuple(system.states),
-        ),
+        names=names_of(system),
         events=events.names,
         adjoint=type(settings.adjoint).__name__,
         units=tuple(units_of(system).items()),

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._common.lookup import by_name, hint
-from .._description.system import System
+from .._description.system import System, names_of
 from .._scalars.reads import compiled
 from ._solve import jacobian
-from ._steady import Problem, SteadyMotion, as_motion, names_of
+from ._steady import Problem, SteadyMotion, as_motion
 
 
 class Family(eqx.Module):

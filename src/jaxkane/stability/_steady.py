@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._common.lookup import by_name, hint
-from .._description.system import State, System
+from .._description.system import State, System, names_of
 from .._method.checks import check_system, configuration_residual, is_concrete
 from .._method.equations import dependent_speeds
 from .._method.kane import as_array, checked_values
@@ -208,11 +208,6 @@ def as_motion(system, t, q, u, inputs, residual, missing=None, origin=()) -> Ste
     x = jnp.stack([inputs[k] for k in system.states]) if system.states else jnp.zeros(0, q.dtype)
     given = {k: value for k, value in inputs.items() if k not in system.states}
     return SteadyMotion(q, u, u_dep, x, given, t, residual, names_of(system))
-
-
-def names_of(system: System) -> tuple[tuple[str, ...], ...]:
-    """Of coordinates, independent and dependent speeds, and states."""
-    return tuple(map(tuple, (system.coordinates, system.speeds, system.dependent_speeds, system.states)))
 
 
 def _why_not(name: str, problem: Problem, motion: SteadyMotion, slopes: np.ndarray, J: np.ndarray) -> str:

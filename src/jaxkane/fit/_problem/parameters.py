@@ -56,7 +56,21 @@ class Free:
 
 
 @dataclasses.dataclass(frozen=True)
-class Gain:
+class Shared:
+    """What is the same in all trials, and no parameter of the system. See `Gain`."""
+
+    what: str
+    start: float = 0.0
+    bounds: tuple[float | None, float | None] | None = None
+    scale: float | None = None
+    prior: Prior | None = None
+    name: str | None = None
+    unit: str = ""
+    of: Where | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class Gain(Shared):
     """A factor common to all trials: of an input, of a sensor, or of what is known of the starts.
 
         Gain("steer_torque"), Gain("roll_rate", prior=(1.0, 0.02)), Gain("rear_wheel_rate", of="start")
@@ -70,18 +84,11 @@ class Gain:
     The rest as in `Free`.
     """
 
-    what: str
     start: float = 1.0
-    bounds: tuple[float | None, float | None] | None = None
-    scale: float | None = None
-    prior: Prior | None = None
-    name: str | None = None
-    unit: str = ""
-    of: Where | None = None
 
 
 @dataclasses.dataclass(frozen=True)
-class Offset:
+class Offset(Shared):
     """A constant common to all trials, that is added to an input, to what a sensor says, or to what is known of starts.
 
         Offset("roll", prior=(0.0, 0.02))                  # the zero of a sensor, the same in all rides
@@ -90,18 +97,9 @@ class Offset:
     where one is much, since what is called undetermined is counted in it.
     """
 
-    what: str
-    start: float = 0.0
-    bounds: tuple[float | None, float | None] | None = None
-    scale: float | None = None
-    prior: Prior | None = None
-    name: str | None = None
-    unit: str = ""
-    of: Where | None = None
-
 
 @dataclasses.dataclass(frozen=True)
-class Delay:
+class Delay(Shared):
     """A delay [s] common to all trials, with which an input acts or a sensor reports.
 
     - Of an input: the system receives samples(t - delay); earlier than `LONGEST_DELAY` the first one stands. Under a
@@ -112,18 +110,8 @@ class Delay:
     `what`, `of` and the rest as in `Gain`.
     """
 
-    what: str
-    start: float = 0.0
-    bounds: tuple[float | None, float | None] | None = None
     scale: float | None = 0.02
-    prior: Prior | None = None
-    name: str | None = None
     unit: str = "s"
-    of: Where | None = None
-
-
-Shared = (Gain, Offset, Delay)
-"""What is the same in all trials, and no parameter of the system."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -342,7 +330,7 @@ def parameters_of(
     )
 
 
-def _of_all_trials(system: System, item: Gain | Offset | Delay, noise: Mapping[str, float] | None):
+def _of_all_trials(system: System, item: Shared, noise: Mapping[str, float] | None):
     kind, where = type(item).__name__.lower(), where_of(system, item)
     if noise is not None and (kind, where) == ("delay", "sensor"):
         raise ValueError(
@@ -381,7 +369,7 @@ def _of_noise(system: System, item: Intensity | Sigma, noise: Mapping[str, float
     return _scalar(entry, item, start, positive=True)
 
 
-def where_of(system: System, item: Gain | Offset | Delay) -> Where:
+def where_of(system: System, item: Shared) -> Where:
     """Whether it is of an input, of a sensor or of the starts.
 
     **Raises:** `ValueError` where there is nothing of that name.
@@ -435,7 +423,7 @@ def _followers(system: System, name: str, factor: float) -> list[tuple[int, int,
     return [(i, place, float(factor)) for i in chosen for place in range(leaves[i][1].size)]
 
 
-def _scalar(entry: _Entry, item: Free | Gain | Offset | Delay | Intensity | Sigma, start: float, positive: bool):
+def _scalar(entry: _Entry, item: Free | Shared | Intensity | Sigma, start: float, positive: bool):
     name = entry.name
     lower, upper = _checked_bounds(name, item.bounds, positive)
     if not math.isfinite(start):
