@@ -23,7 +23,7 @@ SOURCE = Path(jk.__file__).parent
 # Rooms: each may import from those above it, and within itself. What the rooms do not say, is read in their own files:
 # no file imports another that imports it, directly or by way of others.
 FLOORS = ["_common", "_scalars", "rotations", "_description", "loads", "sensors", "catalog"]
-FLOORS += ["joints", "convert", "_method", "_simulation", "sweep", "plot", "fit", "data", "stability"]
+FLOORS += ["joints", "convert", "_method", "_simulation", "sweep", "plot", "fit", "data", "stability", "bicycles"]
 FLOORS += ["symbolic", "export", "_animate"]
 FLOORS_OF_FIT = ["_data", "_problem", "_result", "_optimize", "_analysis", "_report", "_fit", "bicycle"]
 

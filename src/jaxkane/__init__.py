@@ -59,6 +59,7 @@ __version__ = "0.1.0"
 
 # Rooms that a description and its motion do not need, and what they import (scipy, optax), are imported when named.
 if _typing.TYPE_CHECKING:
+    from . import bicycles as bicycles
     from . import catalog as catalog
     from . import convert as convert
     from . import data as data
@@ -73,7 +74,7 @@ if _typing.TYPE_CHECKING:
     from ._animate import Sketch as Sketch
     from ._animate import animate as animate
 
-_ROOMS = ("catalog", "convert", "data", "export", "fit", "joints", "plot", "stability", "sweep", "symbolic")
+_ROOMS = ("bicycles", "catalog", "convert", "data", "export", "fit", "joints", "plot", "stability", "sweep", "symbolic")
 _OF_ANIMATE = ("Animation", "Sketch", "animate")
 
 

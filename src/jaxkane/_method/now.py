@@ -9,9 +9,10 @@ motion; then it is read with the answers. What asks for none is read once.
 
 from __future__ import annotations
 
+import copy
 import functools
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -42,6 +43,12 @@ class Now(Inputs):
         self.u_dot = u_dot
         self._instant, self._N, self._answers = instant, N, answers
         self._asked: list[Vector] = []
+
+    def with_values(self, values: Mapping[str, Component]) -> Self:
+        """The same instant, for a part of a system that receives other inputs than the system does."""
+        other = copy.copy(self)
+        other.update(values)
+        return other
 
     def acceleration(self, point: Point) -> Vector:
         """Of a Point in the inertial frame [m/s^2]."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Mapping
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
 
@@ -104,6 +104,9 @@ class WhippleBicycle(System):
     dependent_speeds = ("yaw_rate", "pitch_rate", "front_wheel_rate")
     dependent_coordinates = ("pitch",)
     inputs = ("roll_torque", "drive_torque", "steer_torque")
+    lateral: ClassVar[tuple[str, ...]] = ("roll", "steer", "roll_rate", "steer_rate")
+    """Coordinates, speeds and states that move to first order when a bicycle leaves straight riding, where those of
+    Meijaard et al. (2007) suffice."""
     units = dict.fromkeys(coordinates[:6], "rad") | {"x": "m", "y": "m"}
     units |= dict.fromkeys((*speeds, *dependent_speeds), "rad/s") | dict.fromkeys(inputs, "N m")
 

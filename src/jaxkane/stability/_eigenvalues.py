@@ -107,11 +107,12 @@ def eigenvalues(
 
 def family_of(system: System, values: Any, motion: MotionAt, states: Sequence[str] | None):
     """Values, (system, value) -> motion, states, and whether the modes have the bicycle's names."""
-    is_straight = motion is None and isinstance(system, WhippleBicycle)
-    if is_straight:
-        motion = straight_ahead
-        if system.speeds == WhippleBicycle.speeds:  # one with more has more states that move with these
-            states = LATERAL if states is None else tuple(states)
+    is_straight = False
+    if motion is None and isinstance(system, WhippleBicycle):
+        is_straight, motion = True, straight_ahead
+        more = len(system.speeds) > len(WhippleBicycle.speeds) or system.states
+        if states is None and not (more and system.lateral == LATERAL):  # what else moves, the system does not say
+            states = system.lateral
     if motion is None:
         raise ValueError(
             f"{type(system).__name__} has no family of steady motions by default: give `motion`, a function "

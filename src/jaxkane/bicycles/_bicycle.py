@@ -1,0 +1,321 @@
+"""A bicycle put together from parts, on the parameters of the Whipple bicycle. Knows kinematics and its parts' methods.
+
+Its motion follows Example 7 and Meijaard et al. (2007). Where a tyre slips, velocities of its contact that ideal
+rolling makes zero are speeds, and forces of the tyre stand in the place of those of the constraint.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from typing import Any, Self
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from .._common.lookup import not_there, refuse_unknown
+from .._description.bodies import Body, Motion
+from .._description.vectors import Frame, Point, Vector, inertial
+from .._scalars.components import add, mul
+from .._scalars.types import Component
+from ..catalog.bicycle import WhippleBicycle
+from ._head import HeadTwist
+from ._part import Part
+from ._tyre import Contact, Tyre, rolling_speed
+
+REAR, FRONT = "rear", "front"
+_ASIDE = ("_lateral_slip", "_lateral_deflection")
+
+
+class Bicycle(WhippleBicycle):
+    """A bicycle with parts: tyres, a rider, steering, a drive, who steers it, and what else it carries.
+
+        Bicycle.benchmark().with_parts(
+            front_tyre=Tyre(lateral=LateralSlip(9000.0, 900.0, relaxation_length=0.1)),
+            rider=LeaningRider(...),
+        )
+
+    Without parts it is the `WhippleBicycle`, whose parameters it has under the same names; those of a part have its
+    name before theirs: "rider.stiffness", "front_tyre.lateral.cornering_stiffness".
+
+    **Arguments** beside Meijaard's parameters:
+
+    - `rear_tyre`, `front_tyre`: `Tyre`, by default a knife edge that rolls. A tyre that slips makes independent speeds
+        of what rolling determined: of the rear one "rear_lateral_slip" and "rear_longitudinal_slip" [m/s], of the front
+        one "yaw_rate" and "front_wheel_rate"; with a relaxation length it has states, as "front_lateral_deflection"
+        [m].
+    - `head`: `HeadTwist`, a frame that gives way in torsion at the steering head.
+    - `rider`, `control`, `steering`, `drive`: a `Part` each. `extra`: any more.
+
+    Parts are asked in this order: `rider`, `control`, `steering`, `drive`, `extra`. A class that inherits from this one
+    may have fields of its own that hold parts.
+
+    The motion names what that of `WhippleBicycle` names, and the frame "H" of the fork at zero steer.
+    """
+
+    rear_tyre: Tyre = eqx.field(default_factory=Tyre)
+    front_tyre: Tyre = eqx.field(default_factory=Tyre)
+    head: HeadTwist | None = None
+    rider: Part | None = None
+    control: Part | None = None
+    steering: Part | None = None
+    drive: Part | None = None
+    extra: tuple[Part, ...] = eqx.field(default=(), converter=tuple)
+
+    def __check_init__(self) -> None:
+        for name, kind in (("rear_tyre", Tyre), ("front_tyre", Tyre), ("head", HeadTwist | None)):
+            if not isinstance(getattr(self, name), kind):
+                raise TypeError(f"{type(self).__name__}: `{name}` is a {_called(kind)}, got {getattr(self, name)!r}.")
+        for name in ("rider", "control", "steering", "drive", "extra"):
+            for part in _as_tuple(getattr(self, name)):
+                if not isinstance(part, Part):
+                    raise TypeError(f"{type(self).__name__}: `{name}` holds a Part of jaxkane.bicycles, got {part!r}.")
+
+    def with_parts(self, **parts: Any) -> Self:
+        """A copy with other parts, or parameters, by the names of the fields."""
+        refuse_unknown(parts, [f.name for f in dataclasses.fields(self)], f"{type(self).__name__} has no field")
+        return dataclasses.replace(self, **parts)
+
+    @property
+    def parts(self) -> tuple[Part, ...]:
+        """All parts, in the order in which they are asked; tyres are none of them."""
+        held = (getattr(self, field.name) for field in dataclasses.fields(self))
+        return tuple(part for each in held for part in _as_tuple(each) if isinstance(part, Part))
+
+    @property
+    def coordinates(self) -> tuple[str, ...]:
+        return (*WhippleBicycle.coordinates, *self._of_parts("coordinates"))
+
+    @property
+    def speeds(self) -> tuple[str, ...]:
+        lateral, longitudinal = self.front_tyre.lateral is not None, self.front_tyre.longitudinal is not None
+        of_front = ("yaw_rate",) * lateral + ("front_wheel_rate",) * longitudinal
+        of_rear = tuple(f"rear_{name}_slip" for name, _ in self.rear_tyre.laws)
+        return (*WhippleBicycle.speeds, *of_front, *of_rear, *self._of_parts("speeds"))
+
+    @property
+    def dependent_speeds(self) -> tuple[str, ...]:
+        rest = [name for name in WhippleBicycle.dependent_speeds if name not in self.speeds]
+        return (*rest, *self._of_parts("dependent_speeds"))
+
+    @property
+    def dependent_coordinates(self) -> tuple[str, ...]:
+        return (*WhippleBicycle.dependent_coordinates, *self._of_parts("dependent_coordinates"))
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        return (*WhippleBicycle.inputs, *self._of_parts("inputs"))
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        deflections = [f"{end}_{name}_deflection" for end, tyre in self._tyres() for name in tyre.deflects]
+        return (*deflections, *self._of_parts("states"))
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        slips = [f"rear_{name}_slip" for name, _ in self.rear_tyre.laws]
+        found = {**WhippleBicycle.units, **dict.fromkeys(slips, "m/s")}
+        found |= {name: "m" for name in self.states if name.endswith("_deflection")}
+        for part in self.parts:
+            found |= part.units
+        return found
+
+    @property
+    def lateral(self) -> tuple[str, ...]:
+        """Names of what its linear model about straight riding holds: the coordinates, speeds and states that move to
+        first order when it leaves the upright plane."""
+        of_tyres = [name for name in (*self.speeds, *self.states) if name == "yaw_rate" or name.endswith(_ASIDE)]
+        moving = {*WhippleBicycle.lateral, *of_tyres, *(name for part in self.parts for name in part.lateral())}
+        return tuple(name for name in (*self.coordinates, *self.speeds, *self.states) if name in moving)
+
+    def _of_parts(self, kind: str) -> tuple[str, ...]:
+        return tuple(name for part in self.parts for name in getattr(part, kind))
+
+    def _tyres(self) -> Iterator[tuple[str, Tyre]]:
+        yield from ((REAR, self.rear_tyre), (FRONT, self.front_tyre))
+
+    def q_dot(self, t, q, u):
+        forward, aside = self._contact_rates(q, u)
+        turning = [u[f"{part}_rate"] for part in ("roll", "rear_wheel", "steer", "yaw", "pitch", "front_wheel")]
+        cos, sin = jnp.cos(q["yaw"]), jnp.sin(q["yaw"])
+        moving = [add(mul(forward, cos), mul(-1.0, mul(aside, sin))), add(mul(forward, sin), mul(aside, cos))]
+        return (*turning, *moving, *(rate for part in self.parts for rate in part.q_dot(self, t, q, u)))
+
+    def _contact_rates(self, q: Any, u: Any) -> tuple[Component, Component]:
+        """Velocities of the place of the rear contact on the ground, forward and to the right [m/s].
+
+        Of a torus with the crown radius c, that rolls without slip: -(spin) (r - c + c cos(roll)) and c * roll_rate.
+        """
+        tyre, (along, across) = self.rear_tyre, self._rear_slip(u)
+        spin = u["rear_wheel_rate"] + u["pitch_rate"]
+        forward = rolling_speed(tyre, spin, jnp.cos(q["roll"]), self.rR, along)
+        return forward, across if tyre.crown is None else add(across, tyre.crown * u["roll_rate"])
+
+    def _rear_slip(self, u: Any) -> tuple[Component, Component]:
+        """Velocities of the rear tyre's contact, along the heading and across it [m/s]."""
+        longitudinal, lateral = self.rear_tyre.longitudinal is not None, self.rear_tyre.lateral is not None
+        return u["rear_longitudinal_slip"] if longitudinal else 0.0, u["rear_lateral_slip"] if lateral else 0.0
+
+    def motion(self, t, q, u):
+        N, O = inertial()
+        Y = N.rotate(3, q["yaw"], u["yaw_rate"], "Y")
+        R = Y.rotate(1, q["roll"], u["roll_rate"], "R")
+        B = R.rotate(2, q["pitch"], u["pitch_rate"], "B")  # rear frame
+        tilted = B.rotate(2, self.lam, 0.0, "tilt")
+
+        # S on the steer axis, and everything else, from the rear wheel's centre G_A (Example 7).
+        cos, sin = jnp.cos(self.lam), jnp.sin(self.lam)
+        xS = (self.w + self.c) * cos * cos - self.rR * sin * cos
+        zS = xS * sin / cos
+
+        omega_A = B.angular_velocity + u["rear_wheel_rate"] * B.y
+        along, across = self._rear_slip(u)
+        place = q["x"] * N.x + q["y"] * N.y
+        r_P_A = -self.rear_tyre.reach(R.z, N.z, self.rR)
+        P = Point(Y.vector(along, across, 0.0), O, place)  # of the tyre
+        G_A = Point(P.velocity + omega_A.cross(r_P_A), P, r_P_A)
+        G_B = G_A.fixed(self.xB * B.x + (self.zB + self.rR) * B.z)
+        S = G_A.fixed(xS * B.x - zS * B.z)
+        if self.head is not None:
+            tilted, S = self.head.turned(tilted, S, q, u)
+        C = tilted.rotate(3, q["steer"], u["steer_rate"], "C")  # fork, 3 along the steer axis
+        H = C.rotate(2, -self.lam, 0.0, "H")  # fork, aligned with B at zero steer
+
+        def from_S(x, z):  # a place measured from P, upright, as a vector fixed in the fork
+            return ((x - xS) * H.x + (z + self.rR + zS) * H.z).express(C)
+
+        G_C = S.fixed(from_S(self.xH, self.zH))
+        G_D = S.fixed(from_S(self.w, -self.rF))
+        omega_D = C.angular_velocity + u["front_wheel_rate"] * C.y
+        n1, _, n3 = N.z.components_in(C)
+        down = C.vector(n1, 0.0, n3).normalize()  # in the plane of the front wheel
+        r_D_Q = self.front_tyre.reach(down, N.z, self.rF)
+        Q = Point(G_D.velocity + omega_D.cross(r_D_Q), G_D, r_D_Q)
+
+        A_inertia = (self.IRxx, self.IRyy, self.IRxx)
+        B_inertia = ((self.IBxx, 0.0, self.IBxz), (0.0, self.IByy, 0.0), (self.IBxz, 0.0, self.IBzz))
+        H_inertia = ((self.IHxx, 0.0, self.IHxz), (0.0, self.IHyy, 0.0), (self.IHxz, 0.0, self.IHzz))
+        D_inertia = (self.IFxx, self.IFyy, self.IFxx)
+        bodies = (
+            Body(self.mR, A_inertia, G_A, R, omega_A, name="rear wheel"),
+            Body(self.mB, B_inertia, G_B, B, name="rear frame"),
+            Body(self.mH, H_inertia, G_C, H, name="fork"),
+            Body(self.mF, D_inertia, G_D, C, omega_D, name="front wheel"),
+        )
+        frames = {"Y": Y, "B": B, "C": C, "H": H}
+        motion = BicycleMotion(bodies, points={"P": P, "Q": Q, "S": S}, frames=frames)
+        forward, _ = self._contact_rates(q, u)
+        motion.rear = Contact(P, Y.x, Y.y, N.z, q["roll"], forward)
+        motion.front = self._front_contact(Q, C, down, omega_D, u)
+        motion = motion.extended((), self.front_tyre.residuals(motion.front))
+        for part in self.parts:
+            motion = part.motion(self, motion, t, q, u)
+        return motion
+
+    def _front_contact(self, Q: Point, C: Frame, down: Vector, omega_D: Vector, u: Any) -> Contact:
+        N = C.root
+        if self.front_tyre.rolls and self.front_tyre.rolling_resistance is None:  # what follows is not asked for
+            return Contact(Q, C.x, C.y, N.z, 0.0, 0.0)
+        heading = C.y.cross(N.z).normalize()
+        sin_camber, cos_camber = C.y.dot(N.z), down.dot(N.z)
+        turning = omega_D.dot(down) / cos_camber  # about the ground's normal; the rest of omega_D is spin and camber
+        spin = omega_D.dot(C.y) - turning * sin_camber
+        speed = rolling_speed(self.front_tyre, spin, cos_camber, self.rF, 0.0)
+        if self.front_tyre.longitudinal is not None:
+            speed = speed + Q.velocity.dot(heading)
+        return Contact(Q, heading, N.z.cross(heading), N.z, jnp.arctan2(sin_camber, cos_camber), speed)
+
+    def _wheels(self, motion: Any) -> Iterator[tuple[str, Tyre, Contact, Body, Component]]:
+        yield REAR, self.rear_tyre, motion.rear, motion["rear wheel"], self.rR
+        yield FRONT, self.front_tyre, motion.front, motion["front wheel"], self.rF
+
+    def tyre_loads(self, motion: Motion) -> dict[str, Component]:
+        """What the ground carries under each wheel [N], "rear" and "front", if nothing accelerated: from the moments of
+        all weights about the contacts."""
+        gravity, N, Y = self.g * motion.N.z, motion.N, motion["Y"]
+        P = motion["P"]
+        moments = [body.center.position_from(P).cross(body.mass * gravity).dot(Y.y) for body in motion.bodies]
+        apart = motion["Q"].position_from(P).cross(N.z).dot(Y.y)
+        front = sum(moments[1:], moments[0]) / apart
+        masses = [body.mass for body in motion.bodies]
+        total = sum(masses[1:], masses[0]) * gravity.dot(N.z)
+        return {REAR: total - front, FRONT: front}
+
+    def _deflections(self, end: str, tyre: Tyre, values: Any) -> dict[str, Component]:
+        return {name: values[f"{end}_{name}_deflection"] for name in tyre.deflects}
+
+    def tyre_forces(self, motion: Any, values: Mapping[str, Component]) -> dict[str, Component]:
+        """Forces of the ground on the tyres that slip [N], as "front_lateral_force"; `values` as of `loads`."""
+        carried = self.tyre_loads(motion)
+        found = {}
+        for end, tyre, contact, _, _ in self._wheels(motion):
+            forces = tyre.forces(contact, carried[end], self._deflections(end, tyre, values))
+            found |= {f"{end}_{name}_force": force for name, force in forces.items()}
+        return found
+
+    def _commanded(self, t: Any, q: Any, u: Any, motion: Motion, values: Mapping[str, Component]) -> dict[str, Any]:
+        """Inputs and states by name, with what the parts add to the inputs."""
+        values = Commanded(values)
+        for part in self.parts:
+            for name, command in part.commands(self, t, q, u, motion, values).items():
+                if name not in self.inputs:
+                    label = f"the inputs of {type(self).__name__}, of which {type(part).__name__} adds to this one"
+                    raise not_there(name, self.inputs, label)
+                values[name] = add(values[name], command)
+        return values
+
+    def loads(self, t, q, u, motion, inputs):
+        values = self._commanded(t, q, u, motion, inputs)
+        found: list[Any] = [super().loads(t, q, u, motion, values)]
+        ground = [each for each in self._wheels(motion) if each[1].laws or each[1].rolling_resistance is not None]
+        carried = self.tyre_loads(motion) if ground else {}
+        for end, tyre, contact, wheel, radius in ground:
+            deflections = self._deflections(end, tyre, values)
+            found.append(tuple(tyre.loads(contact, wheel, radius, carried[end], deflections)))
+        found += [part.loads(self, t, q, u, motion, values) for part in self.parts]
+        return found
+
+    def state_rates(self, t, q, u, x, motion, now):
+        now = now.with_values(self._commanded(t, q, u, motion, now))
+        rates = []
+        for end, tyre, contact, _, _ in self._wheels(motion):
+            rates += tyre.deflection_rates(contact, self._deflections(end, tyre, x))
+        for part in self.parts:
+            rates += list(part.state_rates(self, t, q, u, x, motion, now))
+        return rates
+
+    def outputs(self, t, q, u, motion, now):
+        now = now.with_values(self._commanded(t, q, u, motion, now))
+        found: dict[str, Any] = dict(self.tyre_forces(motion, now))
+        for part in self.parts:
+            found |= part.outputs(self, t, q, u, motion, now)
+        return found
+
+    def configuration_constraints(self, t, q):
+        motion = self.motion(t, q, (0.0,) * (len(self.speeds) + len(self.dependent_speeds)))
+        height = motion["Q"].position.dot(motion.N.z)  # of the front contact, downwards
+        return [height, *(x for part in self.parts for x in part.configuration_constraints(self, t, q, motion))]
+
+
+class BicycleMotion(Motion):
+    """A motion that knows both contacts with the ground."""
+
+    __slots__ = ("front", "rear")
+
+    rear: Contact
+    front: Contact
+
+
+class Commanded(dict[str, Any]):
+    """Inputs and states by name, as parts receive them."""
+
+    def __missing__(self, name: str) -> Component:
+        raise not_there(name, self, "the inputs and states of this bicycle")
+
+
+def _as_tuple(parts: Any) -> tuple[Any, ...]:
+    return parts if isinstance(parts, tuple) else () if parts is None else (parts,)
+
+
+def _called(kind: Any) -> str:
+    return getattr(kind, "__name__", "HeadTwist or None")

@@ -1,0 +1,97 @@
+"""What a bicycle can carry besides: the methods of a part. Knows the description; knows no particular part."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import equinox as eqx
+
+from .._description.bodies import Motion
+from .._description.parameters import check_parameter, parameter_info
+from .._scalars.types import Component
+
+if TYPE_CHECKING:
+    from ._bicycle import Bicycle
+
+
+def check_parameters(part: Any) -> None:
+    """Refuse parameters that are no finite numbers; None stands for one that is not there."""
+    for name, info in parameter_info(part).items():
+        if getattr(part, name) is not None:
+            check_parameter(f"{type(part).__name__}.{name}", getattr(part, name), info)
+
+
+class Part(eqx.Module):
+    """A part of a `Bicycle`: its array leaves are parameters, its methods add to the bicycle's description.
+
+        class Basket(Part):
+            load: Scalar = parameter(5.0, positive=True, unit="kg")
+
+            def motion(self, bicycle, motion, t, q, u):
+                place = motion["S"].fixed(0.2 * motion["C"].x - 0.3 * motion["C"].z)
+                return motion.extended([Body(self.load, 0.0, place, name="basket")])
+
+        bicycle = Bicycle.benchmark().with_parts(extra=[Basket()])
+
+    A subclass names what it adds: `coordinates`, `speeds`, `dependent_speeds`, `dependent_coordinates`, `inputs`,
+    `states` and `units`, as a `System` does; and overrides those methods that it needs. `q`, `u` and `x` hold all
+    values of the bicycle, read by name.
+    """
+
+    coordinates: ClassVar[tuple[str, ...]] = ()
+    speeds: ClassVar[tuple[str, ...]] = ()
+    dependent_speeds: ClassVar[tuple[str, ...]] = ()
+    dependent_coordinates: ClassVar[tuple[str, ...]] = ()
+    inputs: ClassVar[tuple[str, ...]] = ()
+    states: ClassVar[tuple[str, ...]] = ()
+    units: ClassVar[Mapping[str, str]] = {}
+
+    def __check_init__(self) -> None:
+        check_parameters(self)
+
+    def q_dot(self, bicycle: Bicycle, t: Component, q: Any, u: Any) -> Sequence[Component]:
+        """Rates of the part's coordinates. By default those speeds that have the coordinates' names and "_rate"."""
+        return [u[f"{name}_rate"] for name in self.coordinates]
+
+    def motion(self, bicycle: Bicycle, motion: Motion, t: Component, q: Any, u: Any) -> Motion:
+        """The motion of the bicycle with what the part adds: bodies, velocity residuals, points and frames.
+
+        `motion` is that of the bicycle and the parts before this one: `motion.extended([...])`.
+        """
+        return motion
+
+    def commands(
+        self, bicycle: Bicycle, t: Component, q: Any, u: Any, motion: Motion, values: Mapping[str, Component]
+    ) -> Mapping[str, Component]:
+        """What the part adds to inputs of the bicycle, by name: `{"steer_torque": -self.gain * q["roll"]}`.
+
+        `values` holds inputs and states by name, those with what the parts before this one have added.
+        """
+        return {}
+
+    def loads(
+        self, bicycle: Bicycle, t: Component, q: Any, u: Any, motion: Motion, values: Mapping[str, Component]
+    ) -> Any:
+        """Forces and torques; `values` holds inputs, with all that was added to them, and states by name."""
+        return ()
+
+    def state_rates(
+        self, bicycle: Bicycle, t: Component, q: Any, u: Any, x: Any, motion: Motion, now: Any
+    ) -> Sequence[Component]:
+        """Rates of the part's states of the first order; `now` as in `System.state_rates`, its inputs with all that was
+        added to them."""
+        return ()
+
+    def outputs(self, bicycle: Bicycle, t: Component, q: Any, u: Any, motion: Motion, now: Any) -> Mapping[str, Any]:
+        """What the part's sensors say, by name."""
+        return {}
+
+    def configuration_constraints(self, bicycle: Bicycle, t: Component, q: Any, motion: Motion) -> Sequence[Component]:
+        """Residuals that are zero in every possible configuration; `motion` is that of rest."""
+        return ()
+
+    def lateral(self) -> tuple[str, ...]:
+        """Names of the part's coordinates, speeds and states that move when the bicycle leaves the upright plane: those
+        of its linear models. By default all."""
+        return (*self.coordinates, *self.speeds, *self.states)

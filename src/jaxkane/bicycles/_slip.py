@@ -1,0 +1,139 @@
+"""Laws of a tyre that slips: forces from slip. Knows numbers; knows no wheel.
+
+Slip is a velocity of the contact over the speed at which the wheel runs along: the tangent of the slip angle across the
+wheel, the slip ratio along it. With a relaxation length it follows through the tyre's deflection v (Pacejka 2012, *Tire
+and Vehicle Dynamics*, section 7.2.1), which is finite and right at rest, where the tyre is a spring:
+
+    dv/dt = -(slip velocity) - |speed| (v / relaxation_length - camber's equivalent),   slip = v / relaxation_length
+"""
+
+from __future__ import annotations
+
+import abc
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax.numpy as jnp
+
+from .._description.parameters import parameter
+from .._scalars.types import Component, Scalar
+from ._part import check_parameters
+
+CREEPING = 0.01
+"""[m/s]: a speed below which a tyre without relaxation length is not what it says, but stays finite."""
+
+
+class Slip(eqx.Module):
+    """How a tyre's slip gives a force. A law of your own gives `force`; and `equivalent`, where camber counts."""
+
+    if TYPE_CHECKING:
+        relaxation_length: Scalar | None
+
+    def __check_init__(self) -> None:
+        check_parameters(self)
+
+    @abc.abstractmethod
+    def force(self, slip: Component, load: Component) -> Component:
+        """[N] of the ground on the tyre; `slip`: positive where the contact moves to the negative side; `load` [N]."""
+
+    def equivalent(self, camber: Component) -> Component:
+        """The slip that would give the force of a camber angle [rad]."""
+        return 0.0
+
+    def moment(self, force: Component, camber: Component) -> Component:
+        """[N m] about the ground's normal, downwards."""
+        return 0.0
+
+    def slip(self, velocity: Component, speed: Component, camber: Component, deflection: Component | None) -> Component:
+        if deflection is not None:
+            return deflection / self.relaxation_length
+        return self.equivalent(camber) - velocity / jnp.sqrt(speed * speed + CREEPING**2)
+
+    def deflection_rate(
+        self, velocity: Component, speed: Component, camber: Component, deflection: Component
+    ) -> Component:
+        """[m/s], see above."""
+        lag = deflection / self.relaxation_length - self.equivalent(camber)
+        return -velocity - jnp.abs(speed) * lag
+
+
+class LateralSlip(Slip):
+    """Lateral force in proportion to slip and camber, as in Sharp (1971).
+
+        sigma / |V| dF/dt + F = cornering_stiffness * slip + camber_stiffness * camber
+
+    **Arguments:** `cornering_stiffness` [N/rad]; `camber_stiffness` [N/rad]; `relaxation_length` sigma [m], None for
+    a force that follows at once; `pneumatic_trail` [m] behind the contact at which the force acts; `twisting_stiffness`
+    [N m/rad], the moment of camber.
+    """
+
+    cornering_stiffness: Scalar = parameter(positive=True, unit="N/rad")
+    camber_stiffness: Scalar | None = parameter(None, unit="N/rad")
+    relaxation_length: Scalar | None = parameter(None, positive=True, unit="m")
+    pneumatic_trail: Scalar | None = parameter(None, unit="m")
+    twisting_stiffness: Scalar | None = parameter(None, unit="N m/rad")
+
+    def force(self, slip, load):
+        return self.cornering_stiffness * slip
+
+    def equivalent(self, camber):
+        if self.camber_stiffness is None:
+            return 0.0
+        return self.camber_stiffness / self.cornering_stiffness * camber
+
+    def moment(self, force, camber):
+        return _moment(self, force, camber)
+
+
+class MagicFormula(Slip):
+    """Lateral force by the Magic Formula, in proportion to the load (Pacejka 2012, eq. 4.1 to 4.6).
+
+        F = load * friction * sin(shape * atan(b - curvature * (b - atan(b)))),
+        b = stiffness / (shape * friction) * (slip + camber_ratio * camber)
+
+    **Arguments:** `stiffness` [1/rad]: cornering stiffness over load; `friction`: largest force over load; `shape` and
+    `curvature`: C and E of the formula; `camber_ratio`: stiffness by camber over that by slip; the rest as in
+    `LateralSlip`.
+    """
+
+    stiffness: Scalar = parameter(positive=True, unit="1/rad")
+    friction: Scalar = parameter(1.0, positive=True)
+    shape: Scalar = parameter(1.3, positive=True)
+    curvature: Scalar = parameter(0.0)
+    camber_ratio: Scalar | None = parameter(None)
+    relaxation_length: Scalar | None = parameter(None, positive=True, unit="m")
+    pneumatic_trail: Scalar | None = parameter(None, unit="m")
+    twisting_stiffness: Scalar | None = parameter(None, unit="N m/rad")
+
+    def force(self, slip, load):
+        b = self.stiffness / (self.shape * self.friction) * slip
+        b = b - self.curvature * (b - jnp.arctan(b))
+        return load * self.friction * jnp.sin(self.shape * jnp.arctan(b))
+
+    def equivalent(self, camber):
+        return 0.0 if self.camber_ratio is None else self.camber_ratio * camber
+
+    def moment(self, force, camber):
+        return _moment(self, force, camber)
+
+
+class LongitudinalSlip(Slip):
+    """Longitudinal force in proportion to the slip ratio.
+
+    **Arguments:** `stiffness` [N]: force over slip ratio; `relaxation_length` [m] as in `LateralSlip`.
+    """
+
+    stiffness: Scalar = parameter(positive=True, unit="N")
+    relaxation_length: Scalar | None = parameter(None, positive=True, unit="m")
+
+    def force(self, slip, load):
+        return self.stiffness * slip
+
+
+def _moment(law: LateralSlip | MagicFormula, force: Component, camber: Component) -> Component:
+    moment: Component = 0.0
+    if law.pneumatic_trail is not None:
+        moment = moment - law.pneumatic_trail * force
+    if law.twisting_stiffness is not None:
+        moment = moment + law.twisting_stiffness * camber
+    return moment
