@@ -62,6 +62,7 @@ PAGES = {
     "fit": "identification",
     "sweep": "sweeps",
     "stability": "stability",
+    "bicycles": "bicycles",
     "plot": "pictures",
     "catalog": "catalogue",
     "convert": "bringing_models",

@@ -137,7 +137,8 @@ def test_public_names():
 
 
 def test_every_public_function_says_what_it_does():
-    for module in (jk, jk.loads, jk.fit, jk.sweep, jk.stability, jk.catalog, jk.rotations, jk.symbolic, jk.export):
+    rooms = (jk.loads, jk.sensors, jk.fit, jk.sweep, jk.stability, jk.catalog, jk.bicycles, jk.rotations)
+    for module in (jk, *rooms, jk.symbolic, jk.export):
         for name, thing in vars(module).items():
             ours = getattr(thing, "__module__", "").startswith("jaxkane")
             if ours and not name.startswith("_") and thing.__module__ != "jaxkane._scalars.components":

@@ -27,6 +27,12 @@ REAR, FRONT = "rear", "front"
 _ASIDE = ("_lateral_slip", "_lateral_deflection")
 
 
+def _as_tuple(parts: Any) -> tuple[Any, ...]:
+    if isinstance(parts, (tuple, list)):
+        return tuple(parts)
+    return () if parts is None else (parts,)
+
+
 class Bicycle(WhippleBicycle):
     """A bicycle with parts: tyres, a rider, steering, a drive, who steers it, and what else it carries.
 
@@ -60,7 +66,7 @@ class Bicycle(WhippleBicycle):
     control: Part | None = None
     steering: Part | None = None
     drive: Part | None = None
-    extra: tuple[Part, ...] = eqx.field(default=(), converter=tuple)
+    extra: tuple[Part, ...] = eqx.field(default=(), converter=_as_tuple)
 
     def __check_init__(self) -> None:
         for name, kind in (("rear_tyre", Tyre), ("front_tyre", Tyre), ("head", HeadTwist | None)):
@@ -311,10 +317,6 @@ class Commanded(dict[str, Any]):
 
     def __missing__(self, name: str) -> Component:
         raise not_there(name, self, "the inputs and states of this bicycle")
-
-
-def _as_tuple(parts: Any) -> tuple[Any, ...]:
-    return parts if isinstance(parts, tuple) else () if parts is None else (parts,)
 
 
 def _called(kind: Any) -> str:
