@@ -1,0 +1,269 @@
+"""What a model that MuJoCo has compiled says, as parts of a mechanism of joints; and what has no counterpart."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..joints import Actuator, Coupling, Joint, Link, Loop, Mechanism, Site, ball, free, hinge, mechanism, slide
+
+
+class Reader:
+    """What a compiled model says, as parts of a mechanism."""
+
+    def __init__(self, mujoco: Any, model: Any, name: str | None):
+        self.m, self.kinds = model, mujoco
+        self.name = name or _model_name(model) or "Mechanism"
+        self.left_out: list[str] = []
+        self.gravity: Any = [float(x) for x in model.opt.gravity]
+        if self._is_off("GRAVITY"):
+            self.gravity = (0.0, 0.0, 0.0)
+        self.bodies = self._names("body", model.nbody)
+        self.joints = self._names("joint", model.njnt)
+        self.sites: list[Site] = []
+        self.loops: list[Loop | Coupling] = []
+
+    def _is_off(self, *flags: str) -> bool:
+        """Whether the model disables one of these; not every version has each."""
+        bits = [int(getattr(self.kinds.mjtDisableBit, f"mjDSBL_{flag}", 0)) for flag in flags]
+        return any(int(self.m.opt.disableflags) & bit for bit in bits)
+
+    def _names(self, kind: str, n: int) -> list[str]:
+        found: list[str] = []
+        for i in range(n):
+            name = getattr(self.m, kind)(i).name.replace(".", "_") or f"{kind}{i}"
+            found.append(_other(name, found, "_"))
+        return found
+
+    def mechanism(self, strict: bool, dependent: Sequence[str] | None) -> Mechanism:
+        m = self.m
+        if not m.nv:
+            raise ValueError(f"{self.name}: the file has no joint, so that nothing moves.")
+        links = [self._link(i) for i in range(1, m.nbody)]
+        taken = {*self.bodies, *(f"{j} joint" for j in self.joints)}
+        for i in range(m.nsite):
+            name = _other(m.site(i).name.replace(".", "_") or f"site{i}", taken, "_site")
+            taken.add(name)
+            self.sites.append(
+                Site(name, self._carrier(m.site_bodyid[i]), _floats(m.site_pos[i]), _euler(m.site_quat[i]))
+            )
+        self._read_equalities(taken)
+        actuators = list(self._actuators())
+        self.left_out += self._not_taken()
+        left_out = tuple(dict.fromkeys(self.left_out))
+        if left_out:
+            listed = "; ".join(left_out)
+            if strict:
+                raise ValueError(
+                    f"{self.name}: these have no counterpart: {listed}. With strict=False they are left out."
+                )
+            warnings.warn(f"{self.name}: left out, having no counterpart: {listed}.", UserWarning, stacklevel=3)
+        return mechanism(
+            links,
+            gravity=self.gravity,
+            actuators=actuators,
+            sites=self.sites,
+            loops=self.loops,
+            dependent=dependent,
+            name=self.name,
+            left_out=left_out,
+        )
+
+    def _carrier(self, body: int) -> str | None:
+        return None if body == 0 else self.bodies[body]
+
+    def _link(self, i: int) -> Link:
+        m = self.m
+        first, count = int(m.body_jntadr[i]), int(m.body_jntnum[i])
+        joints = [self._joint(j) for j in range(first, first + count)]
+        is_free = count and m.jnt_type[first] == int(self.kinds.mjtJoint.mjJNT_FREE)  # placed by its coordinates alone
+        moves = m.body_weldid[i] != 0
+        mass = float(m.body_mass[i])
+        has_mass = moves and (mass > 0.0 or bool(np.any(m.body_inertia[i] > 0.0)))
+        return Link(
+            self.bodies[i],
+            self._carrier(m.body_parentid[i]),
+            joints,
+            position=(0.0, 0.0, 0.0) if is_free else _floats(m.body_pos[i]),
+            orientation=None if is_free else _euler(m.body_quat[i]),
+            mass=mass if has_mass else None,
+            center=_floats(m.body_ipos[i]),
+            inertia=_inertia(m.body_inertia[i], m.body_iquat[i]),
+        )
+
+    def _joint(self, j: int) -> Joint:
+        m, kind, name = self.m, self.m.jnt_type[j], self.joints[j]
+        dof, place = int(m.jnt_dofadr[j]), int(m.jnt_qposadr[j])
+        common = {
+            "damping": 0.0 if self._is_off("DAMPER", "PASSIVE") else float(m.dof_damping[dof]),
+            "armature": float(m.dof_armature[dof]),
+            "stiffness": 0.0 if self._is_off("SPRING", "PASSIVE") else float(m.jnt_stiffness[j]),
+        }
+        types = self.kinds.mjtJoint
+        if kind in (int(types.mjJNT_HINGE), int(types.mjJNT_SLIDE)):
+            common |= {"reference": float(m.qpos0[place])}
+            common |= {"rest": float(m.qpos_spring[place])} if common["stiffness"] else {}
+            if kind == int(types.mjJNT_SLIDE):
+                return slide(name, _floats(m.jnt_axis[j]), **common)
+            return hinge(name, _floats(m.jnt_axis[j]), anchor=_floats(m.jnt_pos[j]), **common)
+        start = place + (3 if kind == int(types.mjJNT_FREE) else 0)
+        if common["stiffness"] and not np.allclose(m.qpos_spring[start : start + 4], (1, 0, 0, 0), atol=1e-12):
+            self.left_out.append(f"the stiffness of the joint {name!r}, which rests turned")
+            common["stiffness"] = 0.0
+        if kind == int(types.mjJNT_BALL):
+            return ball(name, anchor=_floats(m.jnt_pos[j]), **common)
+        rest = _floats(m.qpos_spring[place : place + 3]) if common["stiffness"] else (0.0, 0.0, 0.0)
+        return free(name, rest=rest, **common)
+
+    def _actuators(self) -> Iterator[Actuator]:
+        m, kinds = self.m, self.kinds
+        taken = {*self.joints}
+        for j, name in enumerate(self.joints):
+            if m.jnt_type[j] in (int(kinds.mjtJoint.mjJNT_HINGE), int(kinds.mjtJoint.mjJNT_SLIDE)):
+                taken.add(f"{name}_rate")
+        for i in range(0 if self._is_off("ACTUATION") else int(m.nu)):
+            group = int(m.actuator_group[i])
+            if 0 <= group <= 30 and int(m.opt.disableactuator) >> group & 1:
+                continue
+            own = m.actuator(i).name or f"actuator{i}"
+            why = self._why_not(i)
+            if why:
+                self.left_out.append(f"the actuator {own!r}, {why}")
+                continue
+            name = _other(own.replace(".", "_"), taken, "_input")
+            taken.add(name)
+            j = int(m.actuator_trnid[i, 0])
+            size = 3 if m.jnt_type[j] == int(kinds.mjtJoint.mjJNT_BALL) else 1
+            bias = m.actuator_biasprm[i] * (m.actuator_biastype[i] == int(kinds.mjtBias.mjBIAS_AFFINE))
+            if m.actuator_ctrllimited[i] or m.actuator_forcelimited[i]:
+                self.left_out.append("limits of controls and forces")
+            yield Actuator(
+                name,
+                self.joints[j],
+                _floats(m.actuator_gear[i, :size]),
+                gain=float(m.actuator_gainprm[i, 0]),
+                offset=float(bias[0]),
+                position_gain=-float(bias[1]),
+                velocity_gain=-float(bias[2]),
+            )
+
+    def _why_not(self, i: int) -> str:
+        """Why an actuator has no counterpart."""
+        m, kinds = self.m, self.kinds
+        joint = int(m.actuator_trnid[i, 0])
+        if m.actuator_trntype[i] not in (int(kinds.mjtTrn.mjTRN_JOINT), int(kinds.mjtTrn.mjTRN_JOINTINPARENT)):
+            return "which does not act on a joint"
+        of_ball = m.jnt_type[joint] == int(kinds.mjtJoint.mjJNT_BALL)
+        if m.jnt_type[joint] == int(kinds.mjtJoint.mjJNT_FREE):
+            return "which acts on a free joint"
+        if of_ball and m.actuator_trntype[i] == int(kinds.mjtTrn.mjTRN_JOINTINPARENT):
+            return "which acts on a ball joint along its parent's axes"
+        if m.actuator_dyntype[i] != int(kinds.mjtDyn.mjDYN_NONE) or m.actuator_actnum[i]:
+            return "which has a state of its own"
+        if m.actuator_gaintype[i] != int(kinds.mjtGain.mjGAIN_FIXED):
+            return "whose gain is not constant"
+        if m.actuator_biastype[i] not in (int(kinds.mjtBias.mjBIAS_NONE), int(kinds.mjtBias.mjBIAS_AFFINE)):
+            return "whose bias is not affine"
+        affine = m.actuator_biastype[i] == int(kinds.mjtBias.mjBIAS_AFFINE)
+        if of_ball and affine and m.actuator_biasprm[i, 1]:
+            return "which feeds back the rotation of a ball joint"
+        more = [getattr(m, f"actuator_{what}", None) for what in ("damping", "dampingpoly", "armature", "delay")]
+        if any(x is not None and np.any(x[i]) for x in more):
+            return "which has damping, armature or delay of its own"
+        return ""
+
+    def _read_equalities(self, taken: set[str]) -> None:
+        m, kinds = self.m, self.kinds.mjtEq
+        for i in range(0 if self._is_off("EQUALITY", "CONSTRAINT") else m.neq):
+            kind, data = m.eq_type[i], m.eq_data[i]
+            name = m.eq(i).name.replace(".", "_") or f"equality{i}"
+            if not m.eq_active0[i]:
+                continue
+            first, second = int(m.eq_obj1id[i]), int(m.eq_obj2id[i])
+            if kind == int(kinds.mjEQ_JOINT):
+                self.loops.append(self._coupling(first, second, data))
+                continue
+            if kind not in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)):
+                self.left_out.append(f"the equality {name!r}, which is no connect, weld or joint")
+                continue
+            rigid = kind == int(kinds.mjEQ_WELD)
+            if m.eq_objtype[i] == int(self.kinds.mjtObj.mjOBJ_SITE):
+                self.loops.append(Loop(self.sites[first].name, self.sites[second].name, rigid))
+                continue
+            # connect: anchors in both bodies; weld: the anchor in the second, the pose of it seen from the first
+            ends = (data[3:6], data[0:3]) if rigid else (data[0:3], data[3:6])
+            turned = (_euler(data[6:10]), None) if rigid else (None, None)
+            names = []
+            for k, (body, place, orientation) in enumerate(zip((first, second), ends, turned, strict=True)):
+                end = _other(f"{name}_{k + 1}", taken, "_end")
+                taken.add(end)
+                names.append(end)
+                self.sites.append(Site(end, self._carrier(body), _floats(place), orientation))
+            self.loops.append(Loop(names[0], names[1], rigid))
+
+    def _coupling(self, first: int, second: int, data: np.ndarray) -> Coupling:
+        m = self.m
+        zero = lambda j: float(m.qpos0[m.jnt_qposadr[j]])  # noqa: E731
+        if second < 0:
+            return Coupling(self.joints[first], None, (zero(first) + float(data[0]),))
+        # q1 - zero1 = p(q2 - zero2)
+        polynomial = np.polynomial.Polynomial(data[:5])(np.polynomial.Polynomial([-zero(second), 1.0]))
+        coefficients = polynomial.coef + np.eye(1, len(polynomial.coef))[0] * zero(first)
+        return Coupling(self.joints[first], self.joints[second], _floats(coefficients))
+
+    def _not_taken(self) -> Iterator[str]:
+        """What else is in the model and changes its motion."""
+        m = self.m
+        collides = np.any(m.geom_contype != 0) and np.any(m.geom_conaffinity != 0)
+        off = lambda flag: self._is_off(flag, "CONSTRAINT")  # noqa: E731
+        has = lambda name: bool(np.any(getattr(m, name, 0)))  # noqa: E731 (older versions lack some)
+        found = {
+            "contacts": (collides or m.npair > 0) and not off("CONTACT"),
+            "limits of joints": has("jnt_limited") and not off("LIMIT"),
+            "friction of joints": has("dof_frictionloss") and not off("FRICTIONLOSS"),
+            "limits of controls and forces": has("jnt_actfrclimited") and m.nu > 0,
+            "tendons": m.ntendon > 0,
+            "damping or stiffness that is not linear": any(has(n) for n in ("dof_dampingpoly", "jnt_stiffnesspoly")),
+            "springs that yield": getattr(m, "nplastic", 0) > 0,
+            "drag and lift of a medium": m.opt.density > 0 or m.opt.viscosity > 0,
+            "gravity compensation": has("body_gravcomp"),
+            "flexible bodies": m.nflex > 0,
+            "plugins": m.nplugin > 0,
+            "bodies moved by hand (mocap), which rest": m.nmocap > 0,
+        }
+        return (what for what, there in found.items() if there)
+
+
+def _model_name(model: Any) -> str:
+    name = bytes(model.names[:200]).split(b"\0", 1)[0].decode("utf-8", "replace")
+    return "" if name == "MuJoCo Model" else name  # which is that of a file without one
+
+
+def _other(name: str, taken: Any, ending: str) -> str:
+    while name in taken:
+        name += ending
+    return name
+
+
+def _floats(values: Any) -> tuple[float, ...]:
+    return tuple(float(x) for x in values)
+
+
+def _euler(quaternion: Any) -> tuple[float, ...]:
+    """Scalar last, as everywhere here; MuJoCo has it first."""
+    w, x, y, z = _floats(quaternion)
+    return (x, y, z, w)
+
+
+def _inertia(moments: Any, quaternion: Any) -> list[list[float]]:
+    """Principal moments in turned axes, along the body's; what is zero but for rounding is zero."""
+    w, v = float(quaternion[0]), np.asarray(quaternion[1:], float)
+    cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    R = np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
+    I = R @ np.diag(np.asarray(moments, float)) @ R.T
+    I = 0.5 * (I + I.T)
+    I[np.abs(I) < 1e-15 * np.trace(I)] = 0.0
+    return I.tolist()
