@@ -7,7 +7,7 @@ was given: speeds of both signs and several sizes, and other numbers in the plac
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any
 
 import jax
@@ -15,22 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from .._description.bodies import Force, Load, Motion
 from .._description.system import System
-from .._description.vectors import Frame, Point
-from .._scalars.components import is_exact
-from .._scalars.fuse import fused
-from .._scalars.linear import as_vector, stack
 from .._scalars.numbers import derivative_in_numbers, in_numbers
 from .._scalars.reads import version_of
-from .._scalars.types import Component
-from .kane import Reading
+from .description_facts import Found, configuration_residual, facts_of
 
 _CHECKED: dict[Any, None] = {}  # structures, the oldest first
 MOST_REMEMBERED = 1000
 _SIZES = (-1.0, 1e-2, -20.0, 1e3)  # multiples of trial speeds of order 1
-
-Found = dict[tuple[Any, ...], Any]  # (number, kind, names ...) -> numbers; the number keeps the order of the reading
 
 
 def check_description(system: System, t: Any, q: Any) -> None:
@@ -105,14 +97,14 @@ class _Description:
         return self._check_state(beside.astype(self.q.dtype)) or judged
 
     def read(self, q: np.ndarray, u: np.ndarray) -> Found:
-        return in_numbers(_reading, self.system, self.t, q, u.astype(q.dtype), self.inputs)
+        return in_numbers(facts_of, self.system, self.t, q, u.astype(q.dtype), self.inputs)
 
     def read_along(self, q: np.ndarray, u: np.ndarray, now: Found) -> Found:
         """How all that is read changes along the motion [1/s]."""
         q_dot = np.concatenate([x.ravel() for x in _of_kind(now, "rate").values()])
         at = self.system, self.t, q, u.astype(q.dtype), self.inputs
         along = None, np.ones((1,), q.dtype), q_dot[:, None], None, None
-        return jax.tree.map(lambda x: x[..., 0], derivative_in_numbers(_reading, at, along))
+        return jax.tree.map(lambda x: x[..., 0], derivative_in_numbers(facts_of, at, along))
 
     def _trial_speeds(self) -> np.ndarray:
         n = len(self.speeds)
@@ -278,106 +270,6 @@ class _Description:
             )
 
 
-# -- what is read
-
-
-@fused
-def _reading(system: System, t: Any, q: Any, u: Any, inputs: Any) -> Found:
-    reading = Reading(system, inputs)
-    q, u, like = tuple(q[i] for i in range(len(q))), tuple(u[i] for i in range(len(u))), q
-    motion = reading.motion(t, q, u)
-    loads = reading.loads_at(t, q, u, motion)
-    twice = sorted({*motion.points, *motion.frames} & {*system.auxiliary_speeds})
-    if twice:
-        raise ValueError(
-            f"{reading.name}: {_listed(twice)} is the name of an auxiliary speed and of a point or a frame: "
-            "constraint_forces gives both a force by that name."
-        )
-    facts = [*_of_speeds(reading, t, q, u), *_of_bodies(motion), *_of_points(motion, loads), *_of_frames(motion, loads)]
-    return {(i, *key): stack(rows).astype(like.dtype) for i, (key, rows) in enumerate(facts)}
-
-
-Fact = tuple[tuple[str, ...], list[tuple[Component, ...]]]
-
-
-def _of_speeds(reading: Reading, t: Any, q: Any, u: Any) -> Iterator[Fact]:
-    for name, rate in zip(reading.system.coordinates, reading.rates(t, q, u), strict=True):
-        yield ("rate", name), [(rate,)]
-    for i, residual in enumerate(reading.residuals(t, q, u)):
-        yield ("residual", str(i)), [(residual,)]
-    for i, h in enumerate(reading.configuration(t, q)):
-        yield ("constraint", str(i)), [(h,)]
-
-
-def _of_bodies(motion: Motion) -> Iterator[Fact]:
-    for body in motion.bodies:
-        yield ("velocity", f"the velocity of {body.name!r}"), [body.center.velocity.components]
-        yield ("velocity", f"the angular velocity of {body.name!r}"), [body.angular_velocity.components]
-        if body.angular_velocity is not body.frame.angular_velocity:
-            spin = (body.angular_velocity - body.frame.angular_velocity).components_in(body.frame)
-            yield ("body", body.name, body.frame.name), [spin, *body.inertia]
-        if body.about is not None:
-            r = body.about.position_from(body.center)
-            carried = body.center.velocity + body.frame.angular_velocity.cross(r)
-            velocities = [x.components_in(body.frame) for x in (body.about.velocity, carried)]
-            yield ("about", body.name, body.frame.name), velocities
-        if body.center.has_position and not all(_is_sure(point) for point in _chain(body.center)):
-            place, velocity = (x.components_in(motion.N) for x in (body.center.position, body.center.velocity))
-            yield ("center", f"the mass centre of {body.name!r}"), [place, velocity]
-
-
-def _of_points(motion: Motion, loads: Iterable[Load]) -> Iterator[Fact]:
-    """Named points, what loads act on, and what these and the bodies were made from."""
-    seen: set[Point] = set()
-    centers = {body.center: f"the mass centre of {body.name!r}" for body in motion.bodies}
-    named = {point: f"the point {name!r}" for name, point in motion.points.items()}
-    acted_on = {load.point: f"the point {load.point.name!r} of a load" for load in loads if isinstance(load, Force)}
-    words = {**acted_on, **named, **centers}
-    for point in words:
-        if point not in centers:
-            yield ("velocity", f"the velocity of {words[point]}"), [point.velocity.components]
-        for link in _chain(point):
-            if link in seen or link._claim is None or (link._base is None and link in centers):
-                continue
-            seen.add(link)
-            frame, velocity = link._claim
-            rows = [link._offset.components_in(frame), velocity.components_in(frame)]  # type: ignore[union-attr]
-            if not all(is_exact(x) for x in rows[0]) or not all(is_exact(x) and x == 0.0 for x in rows[1]):
-                # A point that `loads` made from a motion without speeds is at rest too, and is no point of contact.
-                at_rest = link._base is None and frame is motion.N
-                yield ("contact" if at_rest else "place", words.get(link, f"the point {link.name!r}"), frame.name), rows
-
-
-def _of_frames(motion: Motion, loads: Iterable[Load]) -> Iterator[Fact]:
-    bodies, points = motion.bodies, [*motion.points.values()]
-    starts = [*(body.frame for body in bodies), *motion.frames.values()]
-    starts += [x.velocity.frame for x in (*(body.center for body in bodies), *points, *loads)]
-    seen: dict[Frame, None] = {}
-    for start in starts:
-        frame: Frame | None = start
-        while frame is not None and frame.parent is not None and frame not in seen:
-            seen[frame] = None
-            frame = frame.parent
-    for frame in seen:
-        rows = [*frame._to_child, frame._spin]
-        if not all(is_exact(x) for row in rows for x in row) or any(frame._spin):
-            yield ("frame", frame.name, frame.parent.name), rows  # type: ignore[union-attr]
-
-
-def _chain(point: Point | None) -> Iterator[Point]:
-    while point is not None:
-        yield point
-        point = point._base
-
-
-def _is_sure(point: Point) -> bool:
-    """Whether a point moves as its place does, if what it was made from does and its claim is right."""
-    if point._base is not None:
-        return point._claim is not None
-    known = (*point.velocity.components, *(point._offset.components if point._offset is not None else ()))
-    return all(is_exact(x) and x == 0.0 for x in known)  # the origin
-
-
 def _of_kind(found: Found, kind: str) -> Found:
     return {key: x for key, x in found.items() if key[1] == kind}
 
@@ -403,9 +295,3 @@ def _rotation_error(frame: Any) -> float:
 
 def _listed(words: Iterable[str]) -> str:
     return ", ".join(words)
-
-
-@fused
-def configuration_residual(system: System, t: Any, q: Any):
-    """Residuals (h,) of the configuration constraints."""
-    return as_vector(Reading(system).configuration(t, tuple(q[i] for i in range(len(q)))), q)

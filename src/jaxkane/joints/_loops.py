@@ -14,7 +14,8 @@ import scipy.linalg
 from jax.core import Tracer
 
 from .._common.lookup import not_there
-from ._mechanism import Field, Mechanism, Structure, class_of
+from ._mechanism import Field, Mechanism, class_of
+from ._structure import Structure
 
 
 def with_dependent(

@@ -8,12 +8,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, ClassVar
 
-import jax
-
-from .._common.lookup import hint, not_there
+from .._common.lookup import hint
 from .._description.bodies import Body, Force, Motion
 from .._description.parameters import parameter, parameter_info
 from .._description.system import System
@@ -22,66 +20,7 @@ from .._scalars.components import ZERO3, add, dot, is_zero, mul, sub
 from .._scalars.types import Component, Scalar, Triple
 from ..rotations import Matrix
 from ._joints import Placed, Shape, total
-
-KINDS = "mass center inertia position anchor site gravity damping stiffness rest armature"
-KINDS += " gain offset position_gain velocity_gain"
-"""Kinds of parameters: the first part of their names."""
-
-
-class LinkShape(NamedTuple):
-    name: str
-    parent: str | None
-    orientation: Matrix | None
-    joints: tuple[Shape, ...]
-    has_mass: bool
-
-
-class SiteShape(NamedTuple):
-    name: str
-    link: str | None
-    orientation: Matrix | None
-
-
-class ActuatorShape(NamedTuple):
-    name: str
-    joint: str
-    gear: tuple[float, ...]
-
-
-class LoopShape(NamedTuple):
-    first: str
-    second: str
-    rigid: bool
-    kept: tuple[int, ...]  # of its residuals
-
-    @property
-    def size(self) -> int:
-        return 6 if self.rigid else 3
-
-
-class CouplingShape(NamedTuple):
-    first: str
-    second: str | None
-    coefficients: tuple[float, ...]
-    is_kept: bool
-
-
-class Structure(NamedTuple):
-    """All that is static in a mechanism."""
-
-    name: str
-    links: tuple[LinkShape, ...]  # parents before children
-    sites: tuple[SiteShape, ...] = ()
-    actuators: tuple[ActuatorShape, ...] = ()
-    loops: tuple[LoopShape, ...] = ()
-    couplings: tuple[CouplingShape, ...] = ()
-    dependent_speeds: tuple[str, ...] = ()
-    dependent_coordinates: tuple[str, ...] = ()
-    left_out: tuple[str, ...] = ()
-
-    @property
-    def joints(self) -> tuple[Shape, ...]:
-        return tuple(joint for link in self.links for joint in link.joints)
+from ._structure import KINDS, MOMENTS, ActuatorShape, Named, Structure
 
 
 class Mechanism(System):
@@ -281,9 +220,6 @@ class TreeMotion(Motion):
     sites: dict[str, tuple[Frame, Point]]
 
 
-MOMENTS = ("xx", "yy", "zz", "xy", "xz", "yz")
-
-
 def _moved(P: Point, F: Frame, r: Triple) -> Point:
     return P if all(is_zero(x) for x in r) else P.fixed(F.vector(*r))
 
@@ -302,38 +238,6 @@ def _polynomial(coefficients: tuple[float, ...], x: Component) -> tuple[Componen
     return value, slope
 
 
-class Named(dict[str, Any]):
-    """Parameters by name. One that is zero in the structure is none, and is refused as such."""
-
-    def __init__(self, of: str, structure: Structure):
-        super().__init__()
-        self.of, self.structure = of, structure
-
-    def __missing__(self, name: str) -> Any:
-        kind, *parts = self.of.split(".")
-        if name not in (_PARTS_OF[kind](self.structure) if not parts else (*"xyz", *MOMENTS)):
-            raise not_there(name, self, f"`{self.of}`")
-        raise KeyError(
-            f"{self.structure.name} has no parameter {self.of}.{name}: it was written as 0 where the mechanism was "
-            "made, and is part of its structure, which cannot be changed. Give jax.numpy.zeros(()) there."
-        )
-
-
-def _flat(named: Named) -> tuple[list[tuple[Any, Any]], tuple[Any, ...]]:
-    names = sorted(named)
-    return [(jax.tree_util.DictKey(name), named[name]) for name in names], (named.of, named.structure, *names)
-
-
-def _from_flat(static: tuple[Any, ...], values: Any) -> Named:
-    of, structure, *names = static
-    named = Named(of, structure)
-    named.update(zip(names, values, strict=True))
-    return named
-
-
-jax.tree_util.register_pytree_with_keys(Named, _flat, _from_flat)
-
-
 def _view(kind: str) -> property:
     def read(self: Mechanism) -> Named:
         found = Named(kind, self.structure)
@@ -348,19 +252,6 @@ def _view(kind: str) -> property:
 
     return property(read, doc=f"The parameters `{kind}.NAME`, by name.")
 
-
-_OF_LINKS, _OF_JOINTS, _OF_ACTUATORS = (
-    lambda structure: [link.name for link in structure.links],
-    lambda structure: [joint.name for joint in structure.joints],
-    lambda structure: [actuator.name for actuator in structure.actuators],
-)
-_PARTS_OF: dict[str, Callable[[Structure], Sequence[str]]] = {
-    **dict.fromkeys(("mass", "center", "inertia", "position"), _OF_LINKS),
-    **dict.fromkeys(("anchor", "damping", "stiffness", "rest", "armature"), _OF_JOINTS),
-    **dict.fromkeys(("gain", "offset", "position_gain", "velocity_gain"), _OF_ACTUATORS),
-    "site": lambda structure: [site.name for site in structure.sites],
-    "gravity": lambda structure: ("x", "y", "z"),
-}
 
 for _kind in KINDS.split():
     setattr(Mechanism, _kind, _view(_kind))

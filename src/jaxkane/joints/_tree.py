@@ -11,19 +11,9 @@ from jax.core import Tracer
 from .._common.lookup import not_there
 from ._joints import Hinge, Joint, Shape, Slide, components, exact_numbers, is_structural_zero
 from ._loops import with_dependent
-from ._mechanism import (
-    MOMENTS,
-    ActuatorShape,
-    CouplingShape,
-    Field,
-    LinkShape,
-    LoopShape,
-    Mechanism,
-    SiteShape,
-    Structure,
-    class_of,
-)
+from ._mechanism import Field, Mechanism, class_of
 from ._parts import Actuator, Coupling, Link, Loop, Site, matrix_of
+from ._structure import MOMENTS, ActuatorShape, CouplingShape, LinkShape, LoopShape, SiteShape, Structure
 
 _POSITIVE_MOMENTS = frozenset(MOMENTS[:3])
 
