@@ -10,9 +10,9 @@ from .._description.system import System
 from ._data.trial import Trial
 from ._optimize.optimizer import Optimizer
 from ._optimize.solve import solve
+from ._problem.free import Prior
 from ._problem.model import Unknowns
 from ._problem.names import Names
-from ._problem.parameters import Prior
 from ._problem.problem import Problem
 from ._problem.simulation import Simulation
 from ._result.result import Fit

@@ -22,7 +22,7 @@ from ..._method.kane import as_array, checked_values, refuse_incomplete
 from ..._method.newton_euler import Carried, carried, columns_of, unbalanced, values_of
 from ..._scalars.jax_internals import concretely
 from ..._scalars.reads import compiled
-from .._problem.parameters import find_leaves
+from .._problem.leaves import find_leaves
 
 Names = str | Callable[[Any], Any] | Sequence[str | Callable[[Any], Any]]
 

@@ -15,8 +15,9 @@ from ..._method.drift import has_configuration_constraints
 from ..._method.now import output_names
 from .._data.trial import Trial
 from .._data.windows import state_names
+from .free import Delay
 from .model import Nuisance
-from .parameters import Delay, where_of
+from .parameters import where_of
 
 Names = Sequence[str] | Mapping[str, float | None]
 """Names, or names with the standard deviation of a Gaussian prior around the initial guess (None: no prior)."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -19,161 +19,8 @@ from ..._description.system import System
 from ..._description.units import unit_of, units_of
 from ..._method.now import output_names
 from .bijections import Interval, PossibleBody
-
-Prior = tuple[float, float]
-Where = Literal["input", "sensor", "start"]
-
-
-@dataclasses.dataclass(frozen=True)
-class Free:
-    """A parameter to be found, with what is known about it.
-
-        Free("IBxx", bounds=(0.5, 20.0)), Free(lambda system: system.body.mass, prior=(12.0, 0.5))
-
-    **Arguments:**
-
-    - `where`: a name ("IBxx"), a path ("body.mass"), or a function from the system to a leaf as in `eqx.tree_at`. A
-        leaf with axes counts as its entries.
-    - `start`: the initial guess; by default the system's value.
-    - `bounds`: (lower, upper) of which either may be None; it never leaves them. By default (0, None), a logarithmic
-        scale, where the parameter is declared positive, and none elsewhere.
-    - `scale`: how much is a lot, in the parameter's unit; by default the start's magnitude; for a start at
-        zero the prior's deviation, or 1: give it there, since what is called undetermined is counted in it.
-    - `prior`: (mean, standard deviation) of what was measured elsewhere.
-    - `tied`: other parameters that follow it: their name and factor, `Free("rR", tied={"rF": 1.0})`. All entries of
-        one with axes follow.
-    - `name`, `unit`: for tables; by default those of the parameter.
-    """
-
-    where: str | Callable[[Any], Any]
-    start: float | None = None
-    bounds: tuple[float | None, float | None] | None = None
-    scale: float | None = None
-    prior: Prior | None = None
-    tied: Mapping[str, float] = dataclasses.field(default_factory=dict, hash=False)
-    name: str | None = None
-    unit: str = ""
-
-
-@dataclasses.dataclass(frozen=True)
-class Shared:
-    """What is the same in all trials, and no parameter of the system. See `Gain`."""
-
-    what: str
-    start: float = 0.0
-    bounds: tuple[float | None, float | None] | None = None
-    scale: float | None = None
-    prior: Prior | None = None
-    name: str | None = None
-    unit: str = ""
-    of: Where | None = None
-
-
-@dataclasses.dataclass(frozen=True)
-class Gain(Shared):
-    """A factor common to all trials: of an input, of a sensor, or of what is known of the starts.
-
-        Gain("steer_torque"), Gain("roll_rate", prior=(1.0, 0.02)), Gain("rear_wheel_rate", of="start")
-
-    - `what`: the name of an input (the system receives gain * samples + offset), of a channel (gain * simulated +
-        offset is compared with the measurement), or of a coordinate, speed or state.
-    - `of`: "input", "sensor" or "start", where every window begins with gain * (what its trial knows) + offset, as of a
-        speedometer that is wrong by a factor in all rides. By default an input where there is one of this name, else a
-        sensor.
-
-    The rest as in `Free`.
-    """
-
-    start: float = 1.0
-
-
-@dataclasses.dataclass(frozen=True)
-class Offset(Shared):
-    """A constant common to all trials, that is added to an input, to what a sensor says, or to what is known of starts.
-
-        Offset("roll", prior=(0.0, 0.02))                  # the zero of a sensor, the same in all rides
-
-    `what`, `of` and the rest as in `Gain`. The scale is by default 1, in the unit of what it is added to: give another
-    where one is much, since what is called undetermined is counted in it.
-    """
-
-
-@dataclasses.dataclass(frozen=True)
-class Delay(Shared):
-    """A delay [s] common to all trials, with which an input acts or a sensor reports.
-
-    - Of an input: the system receives samples(t - delay); earlier than `LONGEST_DELAY` the first one stands. Under a
-        zero-order hold the jumps move; where the steps of integration have one length, each is a ramp of two steps.
-    - Of a sensor: simulated(t - delay) is compared with the measurement, by cubics through what is simulated at the
-        samples; the motion before a window is continued as it begins, so a delay should be short beside a window.
-
-    `what`, `of` and the rest as in `Gain`.
-    """
-
-    scale: float | None = 0.02
-    unit: str = "s"
-
-
-@dataclasses.dataclass(frozen=True)
-class Intensity:
-    """The intensity of the process noise of a speed, a state or an input, common to all trials: see `noise` in `fit`.
-
-    `of`: the name of an independent speed or a state, [unit^2/s], or of an input, [unit^2 s], that stands in `noise`.
-    `start`: by default what stands there. It stays positive; the rest as in `Free`.
-    """
-
-    of: str
-    start: float | None = None
-    bounds: tuple[float | None, float | None] | None = None
-    scale: float | None = None
-    prior: Prior | None = None
-    name: str | None = None
-    unit: str = ""
-
-
-@dataclasses.dataclass(frozen=True)
-class Sigma:
-    """The factor by which `Trial.sigma` of a channel is to be multiplied, common to all trials, in a fit with `noise`.
-
-    `channel`: its name. Where `sigma` was given as 1, the factor is the standard deviation in the channel's unit. It
-    stays positive; the rest as in `Free`.
-    """
-
-    channel: str
-    start: float = 1.0
-    bounds: tuple[float | None, float | None] | None = None
-    scale: float | None = None
-    prior: Prior | None = None
-    name: str | None = None
-    unit: str = ""
-
-
-@dataclasses.dataclass(frozen=True)
-class Inertia:
-    """A rigid body's inertia, and with it mass and mass centre, that stays what a body can have.
-
-        Inertia(mass="mB", center=("xB", None, "zB"), moments=("IBxx", "IByy", "IBzz"), products=(None, "IBxz", None))
-
-    **Arguments:** names or paths of the system's parameters, as in `Free`.
-
-    - `moments`: Ixx, Iyy, Izz about the mass centre. Two equal names are a wheel's.
-    - `products`: Ixy, Ixz, Iyz as matrix entries; None for what symmetry makes zero: one alone is a body with a plane
-        of symmetry, none at all a body with principal axes.
-    - `matrix`: instead of these, a parameter of the shape (3, 3).
-    - `mass`, `center`: parameters, or None where the system has none that moves. `fixed`: those of them that stay.
-    - `prior`: (mean, standard deviation) by name.
-
-    The free numbers are logarithmic Cholesky factors of the pseudo-inertia (see `PossibleBody`).
-    """
-
-    moments: tuple[str, str, str] | None = None
-    products: tuple[str | None, str | None, str | None] = (None, None, None)
-    mass: str | None = None
-    center: tuple[str | None, str | None, str | None] = (None, None, None)
-    matrix: str | None = None
-    fixed: Sequence[str] = ()
-    prior: Mapping[str, Prior] = dataclasses.field(default_factory=dict, hash=False)
-    unit: str = "kg m^2"
+from .free import Delay, Free, Gain, Inertia, Intensity, Offset, Prior, Shared, Sigma, Where
+from .leaves import find_leaves, one_leaf
 
 
 @dataclasses.dataclass(frozen=True)
@@ -461,10 +308,10 @@ def _of_body(system: System, item: Inertia):
     if (item.matrix is None) == (item.moments is None):
         raise ValueError("Inertia: give `moments` (and `products`), or `matrix`.")
     names: list[str | None] = [item.mass, *item.center]
-    spots: list[Any] = [None if name is None else (_one(system, name), (0,)) for name in names]
+    spots: list[Any] = [None if name is None else (one_leaf(system, name), (0,)) for name in names]
     wheel = None
     if item.matrix is not None:
-        leaf = _one(system, item.matrix, (3, 3))
+        leaf = one_leaf(system, item.matrix, (3, 3))
         pairs = [(0, 0), (1, 1), (2, 2), *_PRODUCTS]
         names += [f"{item.matrix}[{a}, {b}]" for a, b in pairs]
         spots += [(leaf, tuple({3 * a + b, 3 * b + a})) for a, b in pairs]
@@ -480,7 +327,7 @@ def _of_body(system: System, item: Inertia):
             a, b = next((a, b) for a, b in _PRODUCTS if moments[a] == moments[b])
             wheel = (a, b)
         names += [*moments, *item.products]
-        spots += [None if name is None else (_one(system, name), (0,)) for name in (*moments, *item.products)]
+        spots += [None if name is None else (one_leaf(system, name), (0,)) for name in (*moments, *item.products)]
     leaves = jax.tree.leaves(system)
     values = [0.0 if s is None else float(np.ravel(leaves[s[0]])[s[1][0]]) for s in spots]
     values[0] = values[0] if spots[0] is not None else 1.0
@@ -502,41 +349,3 @@ def _of_body(system: System, item: Inertia):
         scale.append(abs(values[i]) or float(body.scale[i]) if i < 4 else abs(values[i]) or max(values[4:7]))
         priors.append(_checked_prior(name, item.prior[name]) if name in item.prior else None)
     return entries, body, start, scale, priors
-
-
-def _one(system: System, name: str, shape: tuple[int, ...] = ()) -> int:
-    """The leaf of this name, which has this shape."""
-    (chosen, leaves) = find_leaves(system, name)
-    if len(chosen) != 1 or leaves[chosen[0]][1].shape != shape:
-        raise ValueError(f"{type(system).__name__}.{name} must have the shape {shape}.")
-    return chosen[0]
-
-
-def find_leaves(system: System, where: str | Callable[[Any], Any]) -> tuple[list[int], list[Any]]:
-    """Numbers of the leaves that are meant, and all (path, leaf)."""
-    title = type(system).__name__
-    leaves, structure = jax.tree_util.tree_flatten_with_path(system)
-    numbered = jax.tree.unflatten(structure, range(len(leaves)))  # where a leaf stands, its place in the list
-    try:
-        chosen = jax.tree.leaves(_follow(numbered, where) if isinstance(where, str) else where(numbered))
-    except (AttributeError, IndexError, KeyError, TypeError):
-        chosen = []
-    if not chosen or not all(isinstance(i, int) and 0 <= i < len(leaves) for i in chosen):
-        known = [leaf_name(path) for path, _ in leaves]
-        raise ValueError(f"{title} has no parameter {where!r}; {hint(str(where), known, 'it has')}")
-    for i in chosen:
-        path, leaf = leaves[i]
-        if not (eqx.is_inexact_array(leaf) and not jnp.issubdtype(leaf.dtype, jnp.complexfloating)):
-            raise ValueError(f"{title}.{leaf_name(path)} is no real number and cannot be fitted.")
-    return chosen, leaves
-
-
-def leaf_names(system: System) -> tuple[str, ...]:
-    """The names of all parameters of a system, by which they can be freed."""
-    return tuple(leaf_name(path) for path, _ in jax.tree_util.tree_flatten_with_path(system)[0])
-
-
-def _follow(tree: Any, path: str) -> Any:
-    for part in path.split("."):
-        tree = tree[part] if isinstance(tree, Mapping) else tree[int(part)] if part.isdigit() else getattr(tree, part)
-    return tree

@@ -11,7 +11,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from .parameters import Parameters, Prior
+from .free import Prior
+from .parameters import Parameters
 
 
 class Part(eqx.Module):

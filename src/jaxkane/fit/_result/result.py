@@ -16,8 +16,9 @@ import numpy as np
 
 from ..._common.lookup import refuse_unknown
 from ..._description.system import System
+from .._problem.leaves import leaf_names
 from .._problem.model import Unknowns
-from .._problem.parameters import Parameters, leaf_names
+from .._problem.parameters import Parameters
 from .._problem.problem import STEP_TOLERANCE, Linearization, Problem, all_of
 from .._problem.state_file import described, write_state
 from . import covariance, notes, residuals
