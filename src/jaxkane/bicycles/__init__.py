@@ -2,6 +2,7 @@
 
 from ._bicycle import Bicycle as Bicycle
 from ._head import HeadTwist as HeadTwist
+from ._motorcycle import sharp_motorcycle as sharp_motorcycle
 from ._part import Part as Part
 from ._slip import LateralSlip as LateralSlip
 from ._slip import LongitudinalSlip as LongitudinalSlip

@@ -46,10 +46,9 @@ class Bicycle(WhippleBicycle):
 
     **Arguments** beside Meijaard's parameters:
 
-    - `rear_tyre`, `front_tyre`: `Tyre`, by default a knife edge that rolls. A tyre that slips makes independent speeds
-        of what rolling determined: of the rear one "rear_lateral_slip" and "rear_longitudinal_slip" [m/s], of the front
-        one "yaw_rate" and "front_wheel_rate"; with a relaxation length it has states, as "front_lateral_deflection"
-        [m].
+    - `rear_tyre`, `front_tyre`: `Tyre`, by default a knife edge that rolls. A tyre that slips has the velocity of its
+        contact as a speed of its own, "rear_lateral_slip" and "front_longitudinal_slip" [m/s], which is zero in ideal
+        rolling; with a relaxation length it has states, as "front_lateral_deflection" [m].
     - `head`: `HeadTwist`, a frame that gives way in torsion at the steering head.
     - `rider`, `control`, `steering`, `drive`: a `Part` each. `extra`: any more.
 
@@ -94,15 +93,11 @@ class Bicycle(WhippleBicycle):
 
     @property
     def speeds(self) -> tuple[str, ...]:
-        lateral, longitudinal = self.front_tyre.lateral is not None, self.front_tyre.longitudinal is not None
-        of_front = ("yaw_rate",) * lateral + ("front_wheel_rate",) * longitudinal
-        of_rear = tuple(f"rear_{name}_slip" for name, _ in self.rear_tyre.laws)
-        return (*WhippleBicycle.speeds, *of_front, *of_rear, *self._of_parts("speeds"))
+        return (*WhippleBicycle.speeds, *self._slips(), *self._of_parts("speeds"))
 
     @property
     def dependent_speeds(self) -> tuple[str, ...]:
-        rest = [name for name in WhippleBicycle.dependent_speeds if name not in self.speeds]
-        return (*rest, *self._of_parts("dependent_speeds"))
+        return (*WhippleBicycle.dependent_speeds, *self._of_parts("dependent_speeds"))
 
     @property
     def dependent_coordinates(self) -> tuple[str, ...]:
@@ -114,14 +109,12 @@ class Bicycle(WhippleBicycle):
 
     @property
     def states(self) -> tuple[str, ...]:
-        deflections = [f"{end}_{name}_deflection" for end, tyre in self._tyres() for name in tyre.deflects]
-        return (*deflections, *self._of_parts("states"))
+        return (*self._deflected(), *self._of_parts("states"))
 
     @property
     def units(self) -> Mapping[str, str]:
-        slips = [f"rear_{name}_slip" for name, _ in self.rear_tyre.laws]
-        found = {**WhippleBicycle.units, **dict.fromkeys(slips, "m/s")}
-        found |= {name: "m" for name in self.states if name.endswith("_deflection")}
+        found = {**WhippleBicycle.units, **dict.fromkeys(self._slips(), "m/s")}
+        found |= dict.fromkeys(self._deflected(), "m")
         for part in self.parts:
             found |= part.units
         return found
@@ -130,15 +123,42 @@ class Bicycle(WhippleBicycle):
     def lateral(self) -> tuple[str, ...]:
         """Names of what its linear model about straight riding holds: the coordinates, speeds and states that move to
         first order when it leaves the upright plane."""
-        of_tyres = [name for name in (*self.speeds, *self.states) if name == "yaw_rate" or name.endswith(_ASIDE)]
+        of_tyres = [name for name in (*self._slips(), *self._deflected()) if name.endswith(_ASIDE)]
         moving = {*WhippleBicycle.lateral, *of_tyres, *(name for part in self.parts for name in part.lateral())}
         return tuple(name for name in (*self.coordinates, *self.speeds, *self.states) if name in moving)
+
+    @property
+    def mode_groups(self) -> dict[str, tuple[str, ...]]:
+        """Those of `lateral` that it has beside the Whipple bicycle's, by the name of the modes that they bring.
+
+        The front end gives way in the tyre's relaxation or the frame's torsion: then it can wobble.
+        """
+        tyres = {end: [f"{end}_lateral_{what}" for what in ("slip", "deflection")] for end in (REAR, FRONT)}
+        found = {f"{end} tyre": tuple(name for name in names if name in self.lateral) for end, names in tyres.items()}
+        for field in dataclasses.fields(self):
+            held = [part for part in _as_tuple(getattr(self, field.name)) if isinstance(part, Part)]
+            found[field.name] = tuple(name for part in held for name in part.lateral())
+        elastic = [found.pop("head"), *([found.pop("front tyre")] if len(found["front tyre"]) == 2 else [])]
+        found |= dict(zip(("wobble", "front end"), [names for names in elastic if names], strict=False))
+        return {name: names for name, names in found.items() if names}
 
     def _of_parts(self, kind: str) -> tuple[str, ...]:
         return tuple(name for part in self.parts for name in getattr(part, kind))
 
     def _tyres(self) -> Iterator[tuple[str, Tyre]]:
         yield from ((REAR, self.rear_tyre), (FRONT, self.front_tyre))
+
+    def _slips(self) -> tuple[str, ...]:
+        return tuple(f"{end}_{name}_slip" for end, tyre in self._tyres() for name, _ in tyre.laws)
+
+    def _deflected(self) -> tuple[str, ...]:
+        return tuple(f"{end}_{name}_deflection" for end, tyre in self._tyres() for name in tyre.deflects)
+
+    def _slip(self, end: str, u: Any) -> tuple[Component, Component]:
+        """Velocities of a tyre's contact, along the heading and across it [m/s]; exactly zero where it rolls."""
+        tyre = self.rear_tyre if end == REAR else self.front_tyre
+        along = 0.0 if tyre.longitudinal is None else u[f"{end}_longitudinal_slip"]
+        return along, 0.0 if tyre.lateral is None else u[f"{end}_lateral_slip"]
 
     def q_dot(self, t, q, u):
         forward, aside = self._contact_rates(q, u)
@@ -152,15 +172,10 @@ class Bicycle(WhippleBicycle):
 
         Of a torus with the crown radius c, that rolls without slip: -(spin) (r - c + c cos(roll)) and c * roll_rate.
         """
-        tyre, (along, across) = self.rear_tyre, self._rear_slip(u)
+        tyre, (along, across) = self.rear_tyre, self._slip(REAR, u)
         spin = u["rear_wheel_rate"] + u["pitch_rate"]
         forward = rolling_speed(tyre, spin, jnp.cos(q["roll"]), self.rR, along)
         return forward, across if tyre.crown is None else add(across, tyre.crown * u["roll_rate"])
-
-    def _rear_slip(self, u: Any) -> tuple[Component, Component]:
-        """Velocities of the rear tyre's contact, along the heading and across it [m/s]."""
-        longitudinal, lateral = self.rear_tyre.longitudinal is not None, self.rear_tyre.lateral is not None
-        return u["rear_longitudinal_slip"] if longitudinal else 0.0, u["rear_lateral_slip"] if lateral else 0.0
 
     def motion(self, t, q, u):
         N, O = inertial()
@@ -175,7 +190,7 @@ class Bicycle(WhippleBicycle):
         zS = xS * sin / cos
 
         omega_A = B.angular_velocity + u["rear_wheel_rate"] * B.y
-        along, across = self._rear_slip(u)
+        along, across = self._slip(REAR, u)
         place = q["x"] * N.x + q["y"] * N.y
         r_P_A = -self.rear_tyre.reach(R.z, N.z, self.rR)
         P = Point(Y.vector(along, across, 0.0), O, place)  # of the tyre
@@ -211,7 +226,7 @@ class Bicycle(WhippleBicycle):
         frames = {"Y": Y, "B": B, "C": C, "H": H}
         motion = BicycleMotion(bodies, points={"P": P, "Q": Q, "S": S}, frames=frames)
         forward, _ = self._contact_rates(q, u)
-        motion.rear = Contact(P, Y.x, Y.y, N.z, q["roll"], forward)
+        motion.rear = Contact(P, Y.x, Y.y, N.z, q["roll"], forward, (along, across))
         motion.front = self._front_contact(Q, C, down, omega_D, u)
         motion = motion.extended((), self.front_tyre.residuals(motion.front))
         for part in self.parts:
@@ -219,17 +234,16 @@ class Bicycle(WhippleBicycle):
         return motion
 
     def _front_contact(self, Q: Point, C: Frame, down: Vector, omega_D: Vector, u: Any) -> Contact:
-        N = C.root
-        if self.front_tyre.rolls and self.front_tyre.rolling_resistance is None:  # what follows is not asked for
-            return Contact(Q, C.x, C.y, N.z, 0.0, 0.0)
+        N, tyre = C.root, self.front_tyre
+        if tyre.rolls and tyre.rolling_resistance is None:  # what follows is not asked for
+            return Contact(Q, C.x, C.y, N.z, 0.0, 0.0, (0.0, 0.0))
         heading = C.y.cross(N.z).normalize()
         sin_camber, cos_camber = C.y.dot(N.z), down.dot(N.z)
         turning = omega_D.dot(down) / cos_camber  # about the ground's normal; the rest of omega_D is spin and camber
         spin = omega_D.dot(C.y) - turning * sin_camber
-        speed = rolling_speed(self.front_tyre, spin, cos_camber, self.rF, 0.0)
-        if self.front_tyre.longitudinal is not None:
-            speed = speed + Q.velocity.dot(heading)
-        return Contact(Q, heading, N.z.cross(heading), N.z, jnp.arctan2(sin_camber, cos_camber), speed)
+        slip = self._slip(FRONT, u)
+        speed = rolling_speed(tyre, spin, cos_camber, self.rF, slip[0])
+        return Contact(Q, heading, N.z.cross(heading), N.z, jnp.arctan2(sin_camber, cos_camber), speed, slip)
 
     def _wheels(self, motion: Any) -> Iterator[tuple[str, Tyre, Contact, Body, Component]]:
         yield REAR, self.rear_tyre, motion.rear, motion["rear wheel"], self.rR

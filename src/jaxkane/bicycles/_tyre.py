@@ -23,6 +23,7 @@ class Contact(NamedTuple):
     - `point`: of the tyre, at the contact; its velocity is that of slip.
     - `heading`, `across`, `normal`: unit vectors; along the wheel's plane and across it in the ground, and downwards.
     - `camber` [rad]: the wheel's inclination, positive to the right. `speed` [m/s]: of the contact along `heading`.
+    - `slip` [m/s]: the velocity of `point` along `heading` and `across`.
     """
 
     point: Point
@@ -31,6 +32,7 @@ class Contact(NamedTuple):
     normal: Vector
     camber: Component
     speed: Component
+    slip: tuple[Component, Component]
 
 
 class Tyre(eqx.Module):
@@ -82,14 +84,11 @@ class Tyre(eqx.Module):
         return radius if self.crown is None else radius - self.crown + self.crown * cos_camber
 
     def residuals(self, contact: Contact) -> list[Any]:
-        """Velocities of the contact that are zero [m/s]."""
-        v = contact.point.velocity
+        """What is zero [m/s]: the velocity of the contact, less its slip."""
+        v, (along, across) = contact.point.velocity, contact.slip
         if self.rolls:
             return [v]
-        kept = [contact.normal]
-        kept += [contact.heading] if self.longitudinal is None else []
-        kept += [contact.across] if self.lateral is None else []
-        return [v.dot(direction) for direction in kept]
+        return [v.dot(contact.heading) - along, v.dot(contact.across) - across, v.dot(contact.normal)]
 
     def forces(self, contact: Contact, load: Component, deflection: dict[str, Component]) -> dict[str, Component]:
         """Of the ground on the tyre [N], by direction. `load` [N]; `deflection` [m] by direction."""
@@ -124,7 +123,7 @@ def _direction(name: str, contact: Contact) -> Vector:
 
 def _moving(name: str, contact: Contact) -> tuple[Component, Component, Component]:
     """Slip velocity [m/s], speed and camber, as a law asks for them."""
-    return contact.point.velocity.dot(_direction(name, contact)), contact.speed, contact.camber
+    return contact.slip[name == "lateral"], contact.speed, contact.camber
 
 
 def rolling_speed(tyre: Tyre, spin: Component, cos_camber: Component, radius: Component, slip: Component) -> Component:

@@ -15,11 +15,13 @@ from scipy.optimize import linear_sum_assignment
 from .._common.lookup import not_there
 from .._description.system import State, System
 from .._method.checks import is_concrete
+from .._scalars.nan import nan_where
 from .._scalars.reads import compiled
 from ..catalog import WhippleBicycle
-from ._bicycle import LATERAL, MODES, mode_order, straight_ahead
+from ._bicycle import LATERAL, straight_ahead
 from ._eig import MOST_CONDITION, Eig, eig
 from ._linearize import linearize
+from ._modes import OTHER, Groups, mode_names, named_order, participation
 from ._steady import SteadyMotion
 
 MotionAt = Callable[[Any, Any], Any] | State | SteadyMotion | None
@@ -88,25 +90,40 @@ def eigenvalues(
     - `motion`: (system, value) -> `State`, `SteadyMotion`, or a pair of another system and one of these, where the
         parameter belongs to the system. For a `WhippleBicycle` it is riding straight ahead at speeds [m/s] by default.
         Or one motion, without `values`: then m is 1.
-    - `states`: as for `linearize`; for the bicycle riding straight (roll, steer, roll_rate, steer_rate).
-    - `modes`: names of the modes, one for each column.
+    - `states`: as for `linearize`; for the bicycle riding straight (roll, steer, roll_rate, steer_rate), and those of
+        its parts.
+    - `modes`: names of the modes, one for each column. By default those of a bicycle that rides straight: weave,
+        capsize, castering, wobble, and those of its parts and tyres, told by how much their states take part; "mode 5"
+        where less than half of a mode is theirs. All others are numbered.
 
     **Returns:** `Eigenvalues`, differentiable in the system's parameters. A mode is followed by its eigenvalue, that
-    is extrapolated, and its eigenvector: the assignment with the least sum of both changes.
+    is extrapolated, and its eigenvector: the assignment with the least sum of both changes. Under a trace, where names
+    cannot depend on values, a mode whose name is not clear is NaN; give `modes` to have it.
 
     **Raises:** `ValueError` as `linearize`, and where there is no default motion.
     """
-    values, at, states, named = family_of(system, values, motion, states)
-    found, kept = _along(system, values, at, states, named)
+    values, at, states, groups = family_of(system, values, motion, states)
+    found, kept, clear = _along(system, values, at, states, groups)
     if modes is None:
-        modes = MODES if named else tuple(f"mode {i + 1}" for i in range(len(kept)))
+        modes, found = _named(found, kept, groups, clear, (system, values))
     if len(modes) != len(kept):
         raise ValueError(f"eigenvalues: {len(kept)} modes, but {len(modes)} names: {', '.join(modes)}.")
     return Eigenvalues(values, found.values, found.vectors, found.condition, tuple(modes), kept)
 
 
+def _named(found: Eig, states: tuple[str, ...], groups: Groups | None, clear: Any, origin: Any):
+    """Names of the modes, and the eigenvalues: NaN under a trace where a name is not clear."""
+    names = None if groups is None else mode_names(states, groups)
+    if names is None:
+        return tuple(OTHER.format(i + 1) for i in range(len(states))), found
+    if is_concrete(clear):
+        return tuple(k if c else OTHER.format(i + 1) for i, (k, c) in enumerate(zip(names, clear, strict=True))), found
+    roots = [nan_where(~clear[i], found.values[:, i], origin) for i in range(len(names))]
+    return names, found._replace(values=jnp.stack(roots, axis=1))
+
+
 def family_of(system: System, values: Any, motion: MotionAt, states: Sequence[str] | None):
-    """Values, (system, value) -> motion, states, and whether the modes have the bicycle's names."""
+    """Values, (system, value) -> motion, states, and the groups of states whose modes have names; None: none has."""
     is_straight = False
     if motion is None and isinstance(system, WhippleBicycle):
         is_straight, motion = True, straight_ahead
@@ -126,7 +143,15 @@ def family_of(system: System, values: Any, motion: MotionAt, states: Sequence[st
     if values is None:
         raise ValueError("Give the values of the parameter, e.g. speeds jnp.linspace(0.0, 10.0, 201).")
     values = jnp.atleast_1d(jnp.asarray(values, dtype=float))
-    return values, motion, None if states is None else tuple(states), is_straight and states == LATERAL
+    groups = _Groups(getattr(system, "mode_groups", {})) if is_straight else None
+    return values, motion, None if states is None else tuple(states), groups
+
+
+class _Groups(dict):
+    """Names of states by group, as a static argument."""
+
+    def __hash__(self):  # type: ignore[override]
+        return hash(tuple(self.items()))
 
 
 class _Fixed(eqx.Module):
@@ -146,7 +171,7 @@ def matrix(system: System, value: Any, motion: Any, states: tuple[str, ...] | No
 
 
 @compiled
-def _along(system, values, motion, states, named):
+def _along(system, values, motion, states, groups):
     names: list[tuple[str, ...]] = []
 
     def one(value):
@@ -155,11 +180,10 @@ def _along(system, values, motion, states, named):
         return A
 
     found = eig(jax.vmap(one)(values))
-    order = jax.pure_callback(
-        lambda x, X: track(x, X, named).astype(np.int32),
-        jax.ShapeDtypeStruct(found.values.shape, jnp.int32),
-        jax.lax.stop_gradient(found.values),
-        jax.lax.stop_gradient(found.vectors),
+    order, clear = jax.pure_callback(
+        lambda x, Y, X: _tracked(x, Y, X, names[0], groups),
+        (jax.ShapeDtypeStruct(found.values.shape, jnp.int32), jax.ShapeDtypeStruct(found.values.shape[-1:], jnp.bool_)),
+        *jax.lax.stop_gradient((found.values, found.left, found.vectors)),
         vmap_method="sequential",
     )
     rows = jnp.arange(len(values))[:, None]
@@ -169,10 +193,24 @@ def _along(system, values, motion, states, named):
         found.left[rows, :, order].swapaxes(1, 2),
         found.condition[rows, order],
     )
-    return picked, names[0]
+    return picked, names[0], clear
 
 
-def track(values: Any, vectors: Any, named: bool = False) -> np.ndarray:
+def _tracked(values: Any, left: Any, right: Any, states: tuple[str, ...], groups: Groups | None):
+    """Columns (m, n) that follow each mode, those with names in their order, and whether (n,) these are clear."""
+    values, left, right = map(np.asarray, (values, left, right))
+    order = track(values, right)
+    clear = np.ones(order.shape[1], bool)
+    rows = np.isfinite(values).all(axis=1)
+    if groups is not None and rows.any() and mode_names(states, groups) is not None:
+        followed = np.take_along_axis(values, order, axis=1)[rows]
+        shares = np.take_along_axis(participation(left, right), order[:, None, :], axis=2)[rows]
+        columns, clear = named_order(followed, shares, states, groups)
+        order = order[:, columns]
+    return order.astype(np.int32), clear
+
+
+def track(values: Any, vectors: Any) -> np.ndarray:
     """The order (m, n) in which each row's eigenvalues (m, n) and vectors (m, n, n) continue those of the row above."""
     values, vectors = np.asarray(values), np.asarray(vectors)
     m, n = values.shape
@@ -193,7 +231,4 @@ def track(values: Any, vectors: Any, named: bool = False) -> np.ndarray:
             alike = np.abs(X.conj().T @ vectors[k])
             order[k] = linear_sum_assignment(near + 0.1 * (1.0 - alike))[1]
         followed.append(k)
-    if named and followed:
-        tracked = np.take_along_axis(values[followed], order[followed], axis=1)
-        order = order[:, mode_order(tracked)]
     return order

@@ -1,0 +1,106 @@
+"""Tyres that slip: the limit of ideal rolling, Sharp's motorcycle, energy, forces in turns, rest, going backwards."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxkane import Scalar, parameter
+from jaxkane.bicycles import (
+    Bicycle,
+    HeadTwist,
+    LateralSlip,
+    Part,
+    Tyre,
+    sharp_motorcycle,
+)
+from jaxkane.stability import eigenvalues, linearize, straight_ahead
+
+SPEEDS = jnp.array([2.0, 4.6, 8.0])  # [m/s]
+
+
+def with_tyres(**law):
+    tyre = Tyre(lateral=LateralSlip(**law))
+    return Bicycle.benchmark().with_parts(rear_tyre=tyre, front_tyre=tyre)
+
+
+@jax.jit
+def slow_eigenvalues(bicycle):
+    """Those four at each speed that do not grow with the tyres' stiffness."""
+
+    def one(speed):
+        found = linearize(bicycle, straight_ahead(bicycle, speed), states=bicycle.lateral).eigenvalues
+        slow = found[jnp.argsort(jnp.abs(found))[:4]]
+        return jnp.sort(slow)
+
+    return jax.vmap(one)(SPEEDS)
+
+
+@pytest.mark.parametrize("relaxation", [None, pytest.param(0.1, marks=pytest.mark.slow)])
+def test_stiff_tyres_roll_ideally(relaxation):
+    """1e-6 by extrapolation from 1e7 and 1e8 N/rad; the difference itself falls as one over the stiffness."""
+    whipple = slow_eigenvalues(Bicycle.benchmark())
+    stiffness = [1e7, 1e8]
+    found = [
+        slow_eigenvalues(with_tyres(cornering_stiffness=k, relaxation_length=relaxation and relaxation * 1e5 / k))
+        for k in stiffness
+    ]
+    soft, stiff = (np.max(np.abs(x - whipple), axis=1) for x in found)
+    np.testing.assert_allclose(soft / stiff, 10.0, rtol=5e-3)  # of the first order
+    np.testing.assert_allclose((10.0 * found[1] - found[0]) / 9.0, whipple, atol=1e-6)
+
+
+# Sharp (1971), tables 1 to 3, model 1, as printed; read in the public transcription 0tmeF/MotoDynamics,
+# docs/research/sharp-1971-estabilidad-lineal.md. Real parts of capsize, weave, wobble [1/s]; imaginary parts [rad/s].
+SHARP = {
+    10: (-3.56, 2.01, 1.63, -5.20, 55.7),
+    20: (-2.83, -0.18, 2.09, -5.91, 55.8),
+    30: (-0.13, -3.36, 4.56, -6.42, 55.5),
+    50: (0.08, -6.59, 11.4, -6.52, 54.6),
+    70: (0.08, -3.97, 16.8, -5.70, 54.0),
+    100: (0.07, -1.82, 19.2, -3.94, 54.3),
+    130: (0.05, -1.13, 20.4, -2.24, 55.6),
+    160: (0.04, -0.96, 21.2, -0.82, 57.5),
+}
+FOOT, POUND = 0.3048, 4.4482216152605
+
+
+class RoundedLoad(Part):
+    """What a rounded load of the front wheel does to the moment about the steer axis, as Sharp's table has it."""
+
+    missing: Scalar = parameter(unit="N")
+    trail: Scalar = parameter(0.38 * FOOT, unit="m")  # square to the steer axis
+
+    def commands(self, bicycle, t, q, u, motion, values):
+        lean = q["roll"] + jnp.sin(bicycle.lam) * q["steer"]  # of the front wheel
+        return {"steer_torque": -self.missing * self.trail * lean}
+
+
+def test_sharps_motorcycle_has_the_eigenvalues_of_his_table():
+    """40 of 40 to the printed digits, with the load of the front wheel that he rounds to 226 lb."""
+    motorcycle = sharp_motorcycle()
+    moments = motorcycle.mB * motorcycle.xB + motorcycle.mH * motorcycle.xH + motorcycle.mF * motorcycle.w
+    load = motorcycle.g * moments / motorcycle.w
+    np.testing.assert_allclose(load / POUND, 226.0, atol=0.5)
+    rounded = motorcycle.with_parts(extra=[RoundedLoad(missing=load - 226.0 * POUND)])
+    found = eigenvalues(rounded, FOOT * jnp.array([*SHARP], float))
+    weave, wobble = (np.asarray(found[mode][:, 0]) for mode in ("weave", "wobble"))
+    capsize = np.asarray(found["capsize"][:, 0])
+    table = np.stack([capsize.real, weave.real, weave.imag, wobble.real, wobble.imag], axis=1)
+    known = np.array([*SHARP.values()])
+    last_digit = np.where(np.abs(known) < 10.0, 0.01, 0.1)
+    assert np.all(np.abs(table - known) <= 0.5 * last_digit)
+
+
+@pytest.mark.slow
+def test_modes_of_tyres_and_frame_have_names():
+    """What bounces on the tyres, the wobble of a frame that gives way, and the bicycle's own modes, under jit too."""
+    tyre = Tyre(lateral=LateralSlip(9000.0, 900.0, relaxation_length=0.1))
+    bicycle = Bicycle.benchmark().with_parts(rear_tyre=tyre, front_tyre=tyre, head=HeadTwist(3000.0, 1.0))
+    found = eigenvalues(bicycle, jnp.array([1.0, 3.0, 5.0]))
+    names = ("rear tyre", "rear tyre", "wobble", "wobble", "front end", "front end")
+    assert found.modes == ("weave", "weave", "capsize", "castering", *names)
+    frequency = {mode: float(jnp.abs(found[mode][-1, 0].imag)) for mode in found.modes}
+    assert frequency["capsize"] == frequency["castering"] == 0.0
+    assert frequency["weave"] < 6.0 < 40.0 < frequency["wobble"] < 50.0 < frequency["front end"]
+    np.testing.assert_allclose(jnp.max(found["wobble"].real), 3.25, atol=0.01)  # it grows
