@@ -71,11 +71,19 @@ class Now(Inputs):
         found = forces[name]
         return self._N.vector(*found) if isinstance(found, tuple) else found
 
+    @property
+    def multipliers(self) -> Row:
+        """Of the velocity residuals (k,): as `jaxkane.constraint_multipliers` gives them."""
+        return self._reactions.multipliers
+
+    @functools.cached_property
+    def _reactions(self) -> Reactions:
+        now = self._instant
+        return Reactions(now.system, now.t, now.q, now.u, dict(now.inputs), self.u_dot[: now.n])
+
     @functools.cached_property
     def _forces(self) -> dict[str, Any]:
-        now = self._instant
-        reactions = Reactions(now.system, now.t, now.q, now.u, dict(now.inputs), self.u_dot[: now.n])
-        return dict([*reactions.forces_of_parts(), *reactions.forces_of_auxiliary_speeds()])
+        return dict([*self._reactions.forces_of_parts(), *self._reactions.forces_of_auxiliary_speeds()])
 
     def _rate(self, vector: Vector) -> Vector:
         self._asked.append(vector)

@@ -50,7 +50,7 @@ class Bicycle(WhippleBicycle):
         contact as a speed of its own, "rear_lateral_slip" and "front_longitudinal_slip" [m/s], which is zero in ideal
         rolling; with a relaxation length it has states, as "front_lateral_deflection" [m].
     - `head`: `HeadTwist`, a frame that gives way in torsion at the steering head.
-    - `rider`, `control`, `steering`, `drive`: a `Part` each. `extra`: any more.
+    - `rider`, `control`, `steering`, `drive`: a `Part` each, or several in a tuple. `extra`: any more.
 
     Parts are asked in this order: `rider`, `control`, `steering`, `drive`, `extra`. A class that inherits from this one
     may have fields of its own that hold parts.
@@ -62,9 +62,9 @@ class Bicycle(WhippleBicycle):
     front_tyre: Tyre = eqx.field(default_factory=Tyre)
     head: HeadTwist | None = None
     rider: Part | None = None
-    control: Part | None = None
-    steering: Part | None = None
-    drive: Part | None = None
+    control: Part | tuple[Part, ...] | None = None
+    steering: Part | tuple[Part, ...] | None = None
+    drive: Part | tuple[Part, ...] | None = None
     extra: tuple[Part, ...] = eqx.field(default=(), converter=_as_tuple)
 
     def __check_init__(self) -> None:
@@ -93,7 +93,9 @@ class Bicycle(WhippleBicycle):
 
     @property
     def speeds(self) -> tuple[str, ...]:
-        return (*WhippleBicycle.speeds, *self._slips(), *self._of_parts("speeds"))
+        held = self._of_parts("dependent_speeds")  # a part may hold a speed of the bicycle
+        independent = (*WhippleBicycle.speeds, *self._slips(), *self._of_parts("speeds"))
+        return tuple(name for name in independent if name not in held)
 
     @property
     def dependent_speeds(self) -> tuple[str, ...]:
@@ -167,6 +169,14 @@ class Bicycle(WhippleBicycle):
         moving = [add(mul(forward, cos), mul(-1.0, mul(aside, sin))), add(mul(forward, sin), mul(aside, cos))]
         return (*turning, *moving, *(rate for part in self.parts for rate in part.q_dot(self, t, q, u)))
 
+    @property
+    def steer_point(self) -> tuple[Component, Component]:
+        """x, z of the point S [m], of the upright bicycle and from the rear contact: on the steer axis, nearest to the
+        rear wheel's centre (Example 7)."""
+        cos, sin = jnp.cos(self.lam), jnp.sin(self.lam)
+        x = (self.w + self.c) * cos * cos - self.rR * sin * cos
+        return x, -self.rR - x * sin / cos
+
     def _contact_rates(self, q: Any, u: Any) -> tuple[Component, Component]:
         """Velocities of the place of the rear contact on the ground, forward and to the right [m/s].
 
@@ -184,11 +194,7 @@ class Bicycle(WhippleBicycle):
         B = R.rotate(2, q["pitch"], u["pitch_rate"], "B")  # rear frame
         tilted = B.rotate(2, self.lam, 0.0, "tilt")
 
-        # S on the steer axis, and everything else, from the rear wheel's centre G_A (Example 7).
-        cos, sin = jnp.cos(self.lam), jnp.sin(self.lam)
-        xS = (self.w + self.c) * cos * cos - self.rR * sin * cos
-        zS = xS * sin / cos
-
+        xS, zS = self.steer_point
         omega_A = B.angular_velocity + u["rear_wheel_rate"] * B.y
         along, across = self._slip(REAR, u)
         place = q["x"] * N.x + q["y"] * N.y
@@ -196,14 +202,14 @@ class Bicycle(WhippleBicycle):
         P = Point(Y.vector(along, across, 0.0), O, place)  # of the tyre
         G_A = Point(P.velocity + omega_A.cross(r_P_A), P, r_P_A)
         G_B = G_A.fixed(self.xB * B.x + (self.zB + self.rR) * B.z)
-        S = G_A.fixed(xS * B.x - zS * B.z)
+        S = G_A.fixed(xS * B.x + (zS + self.rR) * B.z)
         if self.head is not None:
             tilted, S = self.head.turned(tilted, S, q, u)
         C = tilted.rotate(3, q["steer"], u["steer_rate"], "C")  # fork, 3 along the steer axis
         H = C.rotate(2, -self.lam, 0.0, "H")  # fork, aligned with B at zero steer
 
         def from_S(x, z):  # a place measured from P, upright, as a vector fixed in the fork
-            return ((x - xS) * H.x + (z + self.rR + zS) * H.z).express(C)
+            return ((x - xS) * H.x + (z - zS) * H.z).express(C)
 
         G_C = S.fixed(from_S(self.xH, self.zH))
         G_D = S.fixed(from_S(self.w, -self.rF))
@@ -273,7 +279,7 @@ class Bicycle(WhippleBicycle):
             found |= {f"{end}_{name}_force": force for name, force in forces.items()}
         return found
 
-    def _commanded(self, t: Any, q: Any, u: Any, motion: Motion, values: Mapping[str, Component]) -> dict[str, Any]:
+    def _commanded(self, t: Any, q: Any, u: Any, motion: Any, values: Mapping[str, Component]) -> dict[str, Any]:
         """Inputs and states by name, with what the parts add to the inputs."""
         values = Commanded(values)
         for part in self.parts:
@@ -295,7 +301,7 @@ class Bicycle(WhippleBicycle):
         found += [part.loads(self, t, q, u, motion, values) for part in self.parts]
         return found
 
-    def state_rates(self, t, q, u, x, motion, now):
+    def state_rates(self, t, q, u, x, motion: Any, now):
         now = now.with_values(self._commanded(t, q, u, motion, now))
         rates = []
         for end, tyre, contact, _, _ in self._wheels(motion):
@@ -304,7 +310,7 @@ class Bicycle(WhippleBicycle):
             rates += list(part.state_rates(self, t, q, u, x, motion, now))
         return rates
 
-    def outputs(self, t, q, u, motion, now):
+    def outputs(self, t, q, u, motion: Any, now):
         now = now.with_values(self._commanded(t, q, u, motion, now))
         found: dict[str, Any] = dict(self.tyre_forces(motion, now))
         for part in self.parts:

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import equinox as eqx
 
-from .._description.bodies import Motion
 from .._description.parameters import check_parameter, parameter_info
 from .._scalars.types import Component
 
 if TYPE_CHECKING:
-    from ._bicycle import Bicycle
+    from ._bicycle import Bicycle, BicycleMotion
 
 
 def check_parameters(part: Any) -> None:
@@ -54,7 +53,7 @@ class Part(eqx.Module):
         """Rates of the part's coordinates. By default those speeds that have the coordinates' names and "_rate"."""
         return [u[f"{name}_rate"] for name in self.coordinates]
 
-    def motion(self, bicycle: Bicycle, motion: Motion, t: Component, q: Any, u: Any) -> Motion:
+    def motion(self, bicycle: Bicycle, motion: BicycleMotion, t: Component, q: Any, u: Any) -> BicycleMotion:
         """The motion of the bicycle with what the part adds: bodies, velocity residuals, points and frames.
 
         `motion` is that of the bicycle and the parts before this one: `motion.extended([...])`.
@@ -62,7 +61,7 @@ class Part(eqx.Module):
         return motion
 
     def commands(
-        self, bicycle: Bicycle, t: Component, q: Any, u: Any, motion: Motion, values: Mapping[str, Component]
+        self, bicycle: Bicycle, t: Component, q: Any, u: Any, motion: BicycleMotion, values: Mapping[str, Component]
     ) -> Mapping[str, Component]:
         """What the part adds to inputs of the bicycle, by name: `{"steer_torque": -self.gain * q["roll"]}`.
 
@@ -71,23 +70,27 @@ class Part(eqx.Module):
         return {}
 
     def loads(
-        self, bicycle: Bicycle, t: Component, q: Any, u: Any, motion: Motion, values: Mapping[str, Component]
+        self, bicycle: Bicycle, t: Component, q: Any, u: Any, motion: BicycleMotion, values: Mapping[str, Component]
     ) -> Any:
         """Forces and torques; `values` holds inputs, with all that was added to them, and states by name."""
         return ()
 
     def state_rates(
-        self, bicycle: Bicycle, t: Component, q: Any, u: Any, x: Any, motion: Motion, now: Any
+        self, bicycle: Bicycle, t: Component, q: Any, u: Any, x: Any, motion: BicycleMotion, now: Any
     ) -> Sequence[Component]:
         """Rates of the part's states of the first order; `now` as in `System.state_rates`, its inputs with all that was
         added to them."""
         return ()
 
-    def outputs(self, bicycle: Bicycle, t: Component, q: Any, u: Any, motion: Motion, now: Any) -> Mapping[str, Any]:
+    def outputs(
+        self, bicycle: Bicycle, t: Component, q: Any, u: Any, motion: BicycleMotion, now: Any
+    ) -> Mapping[str, Any]:
         """What the part's sensors say, by name."""
         return {}
 
-    def configuration_constraints(self, bicycle: Bicycle, t: Component, q: Any, motion: Motion) -> Sequence[Component]:
+    def configuration_constraints(
+        self, bicycle: Bicycle, t: Component, q: Any, motion: BicycleMotion
+    ) -> Sequence[Component]:
         """Residuals that are zero in every possible configuration; `motion` is that of rest."""
         return ()
 

@@ -21,7 +21,15 @@ LATERAL = ("roll", "steer", "roll_rate", "steer_rate")
 
 
 def straight_ahead(bicycle: WhippleBicycle, speed: Component) -> State:
-    """A bicycle that rolls straight ahead and upright at `speed` [m/s]."""
+    """A bicycle that rolls straight ahead and upright at `speed` [m/s].
+
+    **Raises:** `ValueError` for a bicycle whose speed is prescribed.
+    """
+    if "rear_wheel_rate" not in bicycle.speeds:
+        raise ValueError(
+            f"{type(bicycle).__name__}: a part holds its speed, so that there is no family over speeds. Leave it out, "
+            "as in bicycle.with_parts(drive=None): straight riding needs no drive."
+        )
     v = jnp.asarray(speed, dtype=jnp.result_type(bicycle.rR))
     wheel = bicycle.speeds.index("rear_wheel_rate")
     u = jnp.zeros(len(bicycle.speeds), v.dtype).at[wheel].set(-v / bicycle.rR)
