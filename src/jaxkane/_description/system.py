@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._common.lookup import refuse_unknown
@@ -26,6 +27,18 @@ class State(eqx.Module):
     q: Float[Array, "*batch n_q"] = eqx.field(converter=to_float)
     u: Float[Array, "*batch n_u"] = eqx.field(converter=to_float)
     x: Float[Array, "*batch n_x"] | None = eqx.field(converter=lambda x: x if x is None else to_float(x), default=None)
+
+
+def packed(state: State) -> Float[Array, "*batch n"]:
+    """q, u and, where there are states of the first order, x in one array."""
+    return jnp.concatenate([part for part in (state.q, state.u, state.x) if part is not None], axis=-1)
+
+
+def unpacked(system: System, y: Float[Array, "*batch n"]) -> State:
+    """The state of which `packed` makes y."""
+    n_q = len(system.coordinates)
+    q, u, x = jnp.split(y, [n_q, n_q + len(system.speeds)], axis=-1)
+    return State(q, u, x if system.states else None)
 
 
 class System(eqx.Module, metaclass=Kind):

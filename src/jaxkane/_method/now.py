@@ -20,7 +20,7 @@ from jaxtyping import Array
 
 from .._common.lookup import not_there, refuse_unknown
 from .._description.bodies import Motion
-from .._description.system import State, System
+from .._description.system import State, System, packed, unpacked
 from .._description.values import Values
 from .._description.vectors import Frame, Point, Vector
 from .._scalars.components import add3, component, cross, is_exact
@@ -188,10 +188,20 @@ def rates(system: System, t: Array, q: Array, u: Array, values: dict[str, Array]
     arrays that are known to fit; `values` of inputs and states by name."""
     if not system.states:
         return State(*motion_rates(system, t, q, u, values))
+    x = as_vector([values[name] for name in system.states], q)
+    return unpacked(system, packed_rates(system, t, packed(State(q, u, x)), values))
+
+
+def packed_rates(system: System, t: Array, y: Array, inputs: Mapping[str, Any]) -> Array:
+    """The right-hand side as a solver asks for it: of a packed state (n_q + n_u + n_x,), packed, so that one array goes
+    through the steps."""
     if is_written_out(len(system.speeds)):
-        return State(*_all_rates(system, t, q, u, values))
-    q_dot, u_dot = motion_rates(system, t, q, u, values)
-    return State(q_dot, u_dot, first_order_rates(system, t, q, u, values, u_dot))
+        return _packed_rates(system, t, y, dict(inputs))
+    state = unpacked(system, y)
+    values = values_of(system, state.x, inputs)
+    q_dot, u_dot = motion_rates(system, t, state.q, state.u, values)
+    x_dot = first_order_rates(system, t, state.q, state.u, values, u_dot) if system.states else None
+    return packed(State(q_dot, u_dot, x_dot))
 
 
 def values_of(system: System, x: Array | None, inputs: Mapping[str, Any]) -> dict[str, Any]:
@@ -200,11 +210,12 @@ def values_of(system: System, x: Array | None, inputs: Mapping[str, Any]) -> dic
 
 
 @fused
-def _all_rates(system, t, q, u, inputs):
-    now = Instant(system, t, q, u, inputs)
+def _packed_rates(system, t, y, inputs):
+    state = unpacked(system, y)
+    now = Instant(system, t, state.q, state.u, values_of(system, state.x, inputs))
     u_dot = now.accelerations()
-    x_dot = read_at(now, u_dot, _state_rates)
-    return as_vector(now.q_dot, q), as_vector(u_dot, q), as_vector(x_dot, q)
+    x_dot = read_at(now, u_dot, _state_rates) if system.states else ()
+    return as_vector((*now.q_dot, *u_dot, *x_dot), y)
 
 
 @fused

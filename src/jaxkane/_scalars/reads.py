@@ -18,6 +18,7 @@ import dataclasses
 import dis
 import enum
 import functools
+import gc
 import hashlib
 import itertools
 import os
@@ -442,7 +443,8 @@ def settling(f: Callable[..., Any]) -> Callable[..., Any]:
         outer = _tracing.reads
         _tracing.reads = {id(reads.root): reads for reads in before} | outer
         try:
-            found = f(*args, **kwargs)
+            with _uncollected():
+                found = f(*args, **kwargs)
         finally:
             _tracing.reads = outer
         for reads in before:
@@ -454,6 +456,19 @@ def settling(f: Callable[..., Any]) -> Callable[..., Any]:
         return found
 
     return call
+
+
+@contextlib.contextmanager
+def _uncollected() -> Iterator[None]:
+    """Python's search for cycles of garbage waits: a trace makes a hundred thousand objects that stay, and to look
+    through them again and again takes a tenth of a first call."""
+    was_on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if was_on:
+            gc.enable()
 
 
 def compiled(f: Callable[..., Any]) -> Callable[..., Any]:

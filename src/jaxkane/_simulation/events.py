@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._description.system import State, System
+from .._description.system import State, System, unpacked
 from .._method.kane import Instant
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, determinant
@@ -70,13 +70,15 @@ class Watched(NamedTuple):
 
 
 @fused
-def watched(system: System, t: Component, q: Array, u: Array, u_dot: Array | None) -> Watched:
-    """What may end a motion. `u_dot`: None where no event reads speeds."""
-    now, like = Instant(system, t, q, u), q
+def watched(system: System, t: Component, y: Array, y_dot: Array | None) -> Watched:
+    """What may end a motion, of a packed state. `y_dot`: None where no event reads speeds."""
+    state, like = unpacked(system, y), y
+    now = Instant(system, t, state.q, state.u)
     det = determinant(now.C_dep) if now.k else 1.0
     u_all_dot: Any = (0.0,) * len(now.u_all)
-    if u_dot is not None:
-        u_all_dot = (*u_dot, *now.dependent_accelerations(tuple(u_dot)))
+    if y_dot is not None:
+        u_dot = tuple(unpacked(system, y_dot).u)
+        u_all_dot = (*u_dot, *now.dependent_accelerations(u_dot))
 
     def read(t: Component, q: Any, u_all: Any) -> Array:
         events = _events(system, t, q, u_all, like.dtype).values()
@@ -88,32 +90,31 @@ def watched(system: System, t: Component, q: Array, u: Array, u_dot: Array | Non
 
 
 class End(NamedTuple):
-    """Where a motion ended: `t` [s], `state`, and whether these move smoothly with what they follow from."""
+    """Where a motion ended: `t` [s], the packed state `y`, and whether both move smoothly with what they come from."""
 
     t: Array
-    state: State
+    y: Array
     smooth: Array
 
 
 def at_zero(
-    system: System, t: Array, state: State, which: Array, happened: Array, rates: Any, reach: Array, events: Events
+    system: System, t: Array, y: Array, which: Array, happened: Array, rates: Any, reach: Array, events: Events
 ) -> End:
     """The instant beside `t` at which the event `which` vanishes, with derivatives up to the second order.
 
         t_end = t - g / g_dot,   y_end = y + (t_end - t) y_dot,   twice
 
     To first order that is the implicit function theorem. Here `t` is a number, near enough (within `reach`) that two
-    steps of Newton's method are exact, and `state` is the motion at that time.
+    steps of Newton's method are exact, and the packed state `y` is the motion at that time.
 
-    **Arguments:** `rates`: (t, state) -> its rates, a State; `happened`: False where no event did: then it is `t`
-    itself.
+    **Arguments:** `rates`: (t, y) -> y_dot; `happened`: False where no event did: then it is `t` itself.
     """
     t = jax.lax.stop_gradient(t)
 
     def stage(carry: Any, k: Array):
         (t, y), step, smooth = carry
         y_dot = rates(t, y)
-        watching = watched(system, t, y.q, y.u, y_dot.u if events.read_speeds else None)
+        watching = watched(system, t, y, y_dot if events.read_speeds else None)
         g, g_dot = watching.values[which], watching.rates[which]
         # Beside the first point, where to go; there halfway, by the rates in the middle; and there again.
         is_small = jnp.abs(g) <= jnp.abs(g_dot) * reach
@@ -125,7 +126,7 @@ def at_zero(
         moved = jax.tree.map(lambda x, x_dot: x + ahead * x_dot, base, (jnp.ones_like(t), y_dot))
         return (moved, step, smooth & (is_small | (k == 1))), None
 
-    first = (t, state)
+    first = (t, y)
     start = (first, jnp.zeros_like(t), jnp.array(True))
-    ((t, state), _, smooth), _ = jax.lax.scan(stage, start, jnp.arange(3))
-    return End(t, state, smooth)
+    ((t, y), _, smooth), _ = jax.lax.scan(stage, start, jnp.arange(3))
+    return End(t, y, smooth)

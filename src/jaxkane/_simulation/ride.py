@@ -13,13 +13,13 @@ from jaxtyping import Array
 
 from .._common.lookup import not_there
 from .._description.parameters import parameter_info
-from .._description.system import State, System, names_of
+from .._description.system import State, System, names_of, packed, unpacked
 from .._description.units import units_of
 from .._method.checks import configuration_is_met
 from .._method.drift import correction, has_configuration_constraints, projected
 from .._method.equations import _dependent_speeds
 from .._method.kane import Instant, checked_inputs
-from .._method.now import outputs_at, rates, values_of
+from .._method.now import outputs_at, packed_rates, values_of
 from .._scalars.fuse import fused
 from .._scalars.nan import all_finite, derivative_free_where_not_finite, flat, nan_derivative_where, nan_where
 from .._scalars.reads import compiled
@@ -68,20 +68,23 @@ def solve(
     valid = _is_valid(system, state, ts, signals)
     # What is not finite must not enter the solver, where it would spoil the gradient of what is shared.
     system, state = _safe(valid, (system, state))
+    start = packed(state)
     ts = jnp.where(valid, ts, jnp.arange(ts.shape[0], dtype=ts.dtype))
     signals = without_nonsense(signals, valid)
     constrained = has_configuration_constraints(system, ts[0], state.q)
 
     def vector_field(t, y, args):
         system, signals, disturbance = args
-        inputs, more = inputs_at(system, signals, t, y), None
+        state = unpacked(system, y)
+        inputs, more = inputs_at(system, signals, t, state), None
         if disturbance is not None:
-            inputs, more = disturbance(t, inputs, y)
-        y_dot = rates(system, t, y.q, y.u, values_of(system, y.x, inputs))
-        y_dot = y_dot if more is None else jax.tree.map(jnp.add, y_dot, more)
+            inputs, more = disturbance(t, inputs, state)
+        y_dot = packed_rates(system, t, y, inputs)
+        if more is not None:
+            y_dot += packed(more)
         if constrained and settings.stabilize:
-            y_dot = State(y_dot.q + settings.stabilize * correction(system, t, y.q), y_dot.u, y_dot.x)
-        return jax.tree.map(lambda rate: jnp.where(valid, rate, jnp.zeros_like(rate)), y_dot)
+            y_dot = y_dot.at[: state.q.size].add(settings.stabilize * correction(system, t, state.q))
+        return jnp.where(valid, y_dot, jnp.zeros_like(y_dot))
 
     def trial_rates(t, y, args):
         # A step that is rejected since its rates are not finite must not spoil a derivative in reverse mode.
@@ -99,7 +102,7 @@ def solve(
         ts[0],
         ts[-1],
         step,
-        state,
+        start,
         (system, signals, disturbance),
         saveat=diffrax.SaveAt(subs=(diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)), controller_state=stops),
         stepsize_controller=controller,
@@ -110,7 +113,7 @@ def solve(
     )
     times, states = cast(Any, (solution.ts, solution.ys))
     (t_reached, t_last), (motion, last) = jax.lax.stop_gradient(times), states
-    reached, t_end, end = jnp.isfinite(t_reached) & valid, t_last[0], jax.tree.map(lambda y: y[0], last)
+    reached, t_end, end = jnp.isfinite(t_reached) & valid, t_last[0], last[0]
 
     which = cast(Any, solution.controller_state).which.astype(int) if stops else jnp.array(-1)
     status = jnp.where(valid, _status(solution, which, events), Status.INVALID).astype(jnp.int32)
@@ -118,29 +121,31 @@ def solve(
     t_end = jnp.where(smooth, ts[-1], jnp.where(valid, t_end, ts[0]))
     if events.names:
         happened = status >= Status.EVENT
-        beside = jax.tree.map(lambda x, first: jnp.where(happened, x, first), (t_end, end), (ts[0], state))
+        beside = jax.tree.map(lambda x, first: jnp.where(happened, x, first), (t_end, end), (ts[0], start))
         moving = lambda t, y: vector_field(t, y, (system, signals, disturbance))  # noqa: E731
         found = at_zero(system, beside[0], beside[1], jnp.maximum(which, 0), happened, moving, 4 * reach, events)
-        t_end, end = jax.tree.map(lambda x, y: jnp.where(happened, x, y), (found.t, found.state), (t_end, end))
+        t_end, end = jax.tree.map(lambda x, y: jnp.where(happened, x, y), (found.t, found.y), (t_end, end))
         smooth |= happened & found.smooth
         # The last step ends a little beside the event: samples from there to here are those of the event itself.
         here = 64 * jnp.finfo(ts.dtype).eps * jnp.max(jnp.abs(ts))
         late = happened & ~reached & (ts <= t_end + here)
         reached = jnp.where(happened, ts <= t_end + here, reached)
-        motion = jax.tree.map(lambda x, y: jnp.where(late[:, None], x[None], y), end, motion)
+        motion = jnp.where(late[:, None], end[None], motion)
 
     # What follows from the motion is found where there is one, and from the first state elsewhere: a value that is
     # not finite has derivatives that a mask behind it cannot take away.
-    motion = jax.tree.map(lambda y, first: jnp.where(reached[:, None], y, first[None]), motion, state)
-    end = jax.tree.map(lambda y, first: jnp.where(valid, y, first), end, state)
+    motion = jnp.where(reached[:, None], motion, start[None])
+    end = jnp.where(valid, end, start)
     if constrained and settings.project:
-        motion = State(jax.vmap(lambda t, q: projected(system, t, q))(ts, motion.q), motion.u, motion.x)
-        end = State(projected(system, t_end, end.q), end.u, end.x)
-    u_dep = jax.vmap(lambda t, y: _dependent_speeds(system, t, y.q, y.u, {}))(ts, motion)
-    inputs = jax.vmap(lambda t, y: inputs_at(system, signals, t, y, all_of_them=True))(ts, motion)
-    outputs = jax.vmap(lambda t, y, w: outputs_at(system, t, y.q, y.u, values_of(system, y.x, w)))(ts, motion, inputs)
+        onto = lambda t, y: y.at[: state.q.size].set(projected(system, t, y[: state.q.size]))  # noqa: E731
+        motion, end = jax.vmap(onto)(ts, motion), onto(t_end, end)
+    along = unpacked(system, motion)
+    u_dep = jax.vmap(lambda t, y: _dependent_speeds(system, t, y.q, y.u, {}))(ts, along)
+    inputs = jax.vmap(lambda t, y: inputs_at(system, signals, t, y, all_of_them=True))(ts, along)
+    outputs = jax.vmap(lambda t, y, w: outputs_at(system, t, y.q, y.u, values_of(system, y.x, w)))(ts, along, inputs)
     motion, u_dep, inputs, outputs = nan_where(~reached, (motion, u_dep, inputs, outputs), origin)
     t_end, end = nan_derivative_where(~smooth, (t_end, end), origin)
+    motion, end = unpacked(system, motion), unpacked(system, nan_where(~valid, end, origin))
     return Trajectory(
         t=ts,
         q=motion.q,
@@ -160,7 +165,7 @@ def solve(
         events=events.names,
         adjoint=type(settings.adjoint).__name__,
         units=tuple(units_of(system).items()),
-        end=nan_where(~valid, end, origin),
+        end=end,
     )
 
 
@@ -186,8 +191,7 @@ def _to_stops(controller: Any, vector_field: Any, events: Events, system: System
     """A controller that also ends the motion: at the events, and before the dependent speeds are singular."""
 
     def watch(t, y, args):
-        u_dot = vector_field(t, y, args).u if events.read_speeds else None
-        return Quantities(*watched(args[0], t, y.q, y.u, u_dot))
+        return Quantities(*watched(args[0], t, y, vector_field(t, y, args) if events.read_speeds else None))
 
     whole = jax.lax.stop_gradient(ts[-1] - ts[0])
     adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)

@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..._description.system import packed
 from .._data.windows import Windows
-from .._problem.model import Model, Unknowns, by_next, each, jacobian_of, joined, starts_of
+from .._problem.model import Model, Unknowns, by_next, each, jacobian_of, starts_of
 from .._problem.problem import Problem
 
 Goal = Callable[[Any, Model, Windows], tuple[Array, tuple[Array, Windows, Array]]]
@@ -57,7 +58,7 @@ def _one_motion(model: Model, windows: Windows, point: Unknowns) -> Windows:
 
     def go_on(start: Array, window: Windows) -> tuple[Array, Array]:
         ride = model.simulate(window, start, point.b[0], point.x)
-        return joined(ride.q[-1], ride.u[-1], ride.x[-1]), start
+        return packed(ride.state()), start
 
     end, starts = jax.lax.scan(go_on, model.consistent(first, point.z[0], point.x), windows)
     return eqx.tree_at(lambda w: (w.start, w.next_start), windows, (starts, jnp.append(starts[1:], end[None], axis=0)))

@@ -12,9 +12,10 @@ from jaxtyping import Array
 from scipy import stats
 
 from ..._common.lookup import not_there
+from ..._description.system import unpacked
 from ..._method.equations import _dependent_speeds
 from ..._scalars.reads import compiled
-from .._data.windows import parts_of, state_names
+from .._data.windows import state_names
 from .._problem import kalman
 from .._problem.filtered import brought_back, filtered
 from .._problem.model import Model, Unknowns, each, starts_of
@@ -130,8 +131,8 @@ def _smoothed(model: Model, windows: Any, point: Unknowns, starts: Array, begin:
         v, S = jax.vmap(lambda t, v, S: brought_back(system, t, v, S))(window.t, v, S)
 
         def whole(t: Array, v: Array) -> Array:
-            q, u, *_ = parts_of(system, v[:n])
-            u_dep = _dependent_speeds(system, t, q, u, {})
+            state = unpacked(system, v[:n])
+            u_dep = _dependent_speeds(system, t, state.q, state.u, {})
             return jnp.concatenate([v[:n], u_dep, v[n:]])
 
         def at(t: Array, v: Array, S: Array) -> tuple[Array, Array]:

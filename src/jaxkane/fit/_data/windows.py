@@ -113,17 +113,6 @@ def state_names(system: System) -> tuple[str, ...]:
     return (*system.coordinates, *system.speeds, *system.states)
 
 
-def parts_of(system: System, start: Array) -> list[Array]:
-    """q, u and, where there are states of the first order, x of a start (n,)."""
-    n_q, n = len(system.coordinates), len(system.coordinates) + len(system.speeds)
-    return [start[:n_q], start[n_q:n], *([start[n:]] if system.states else [])]
-
-
-def joined(q: Array, u: Array, x: Array | None) -> Array:
-    """The start (n,) of which `parts_of` gives the parts."""
-    return jnp.concatenate([q, u] if x is None else [q, u, x])
-
-
 def _pieces(t: np.ndarray, window: float | None, chained: bool) -> list[tuple[int, int]]:
     """First sample and number of samples of every window of a trial."""
     if window is None:

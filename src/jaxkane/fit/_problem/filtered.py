@@ -18,12 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..._description.system import State, System
+from ..._description.system import System, packed, unpacked
 from ..._method.checks import configuration_residual
 from ..._method.drift import has_configuration_constraints, projected
 from ..._simulation.ride import solve
 from ..._simulation.signals import with_one_times
-from .._data.windows import Windows, parts_of, state_names
+from .._data.windows import Windows, state_names
 from .kalman import Step, root, update
 from .noise import MODES, Disturbance, Noise
 
@@ -125,8 +125,8 @@ def _flow(model: Any, system: System, roles: Any, window: Windows, v: Array, dis
     if settings.step is not None:
         settings = dataclasses.replace(settings, step=ts[1] - ts[0])
     signals = with_one_times(model.signals(window, b, roles))
-    ride = solve(system, State(*parts_of(system, v[:n])), ts, signals, settings, disturbance)
-    return (jnp.concatenate([ride.q[1], ride.u[1], ride.x[1], b]), model.simulated(ride, b, roles)), ride.status
+    ride = solve(system, unpacked(system, v[:n]), ts, signals, settings, disturbance)
+    return (jnp.concatenate([packed(ride.state()), b]), model.simulated(ride, b, roles)), ride.status
 
 
 def brought_back(system: System, t: Array, v: Array, S: Array) -> tuple[Array, Array]:

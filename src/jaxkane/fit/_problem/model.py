@@ -16,14 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from ..._description.system import State, System
+from ..._description.system import System, packed, unpacked
 from ..._method.assembly import assemble
 from ..._scalars.reads import compiled
 from ..._simulation.ride import solve
 from ..._simulation.settings import Settings
 from ..._simulation.signals import Samples, with_one_times
 from ..._simulation.trajectory import Trajectory
-from .._data.windows import Windows, joined, parts_of, state_names
+from .._data.windows import Windows, state_names
 from .blocks import Blocks
 from .filtered import Filtered, filtered, information_of, minus_twice_log_likelihood
 from .noise import Noise
@@ -128,8 +128,8 @@ class Model(eqx.Module):
         if self.noise is not None:  # a start with a deviation is no unknown of a filter, but what it begins with
             z = jnp.where(jnp.isfinite(self.nuisance.start_deviation), 0.0, z)
         start = self.known(window.start, roles).at[self.unknown_places].add(z)
-        state = assemble(system, *parts_of(system, start), t=window.t[0], free=self.assembled)
-        return joined(state.q, state.u, state.x)
+        state = unpacked(system, start)
+        return packed(assemble(system, state.q, state.u, state.x, t=window.t[0], free=self.assembled))
 
     def known(self, start: Array, roles: Roles) -> Array:
         """What is known of a start (n_q + n_u + n_x,), with the gains and offsets that all trials have in common."""
@@ -144,7 +144,7 @@ class Model(eqx.Module):
         system, roles = self.parameters.apply(self.system, x)
         settings = self.settings if self.settings.step is None else dataclasses.replace(self.settings, step=window.step)
         signals = with_one_times(self.signals(window, b, roles))
-        return solve(system, State(*parts_of(system, start)), window.t, signals, settings)
+        return solve(system, unpacked(system, start), window.t, signals, settings)
 
     def signals(self, window: Windows, b: Array, roles: Roles) -> dict[str, Any]:
         """The inputs of one window by name."""
@@ -189,7 +189,7 @@ class Model(eqx.Module):
         roles = self.parameters.apply(self.system, x)[1]
         simulated, n = self.simulated(ride, b, roles), self.nuisance
         difference = jnp.where(window.weight > 0, (simulated - window.measured) * window.weight, 0.0)
-        end = joined(ride.q[-1], ride.u[-1], ride.x[-1])
+        end = packed(ride.state())
         following = self.known(window.next_start, roles)
         jump = jnp.where(window.linked > 0, (end - following)[self.unknown_places] / n.jump, 0.0)
         rows = [difference.ravel(), *([jump] if n.chained else []), self.priors(window, z, b, x)]
