@@ -9,6 +9,7 @@ import pytest
 from systems import Cart
 from test_transcriptions import GUESS, TRUTH, record
 
+import jaxkane as jk
 import jaxkane.fit._analysis.signs as signs
 from jaxkane.fit import (
     Fit,
@@ -20,6 +21,7 @@ from jaxkane.fit import (
     applied_to,
     contrary_signs,
     cross_validate,
+    identifiability,
     laplace,
     log_density,
     minimize,
@@ -278,6 +280,30 @@ def test_what_trades_off_is_told_in_units(trials):
     assert "trade off" in note
     assert "kg" in note
     assert "N/m" in note
+
+
+class Twice(Cart):
+    """Springs and dampers that act together."""
+
+    more_stiffness: jk.Scalar = jk.parameter(2.0, positive=True, unit="N/m")
+    more_damping: jk.Scalar = jk.parameter(0.1, unit="N s/m")
+
+    def loads(self, t, q, u, motion, inputs):
+        force = -self.more_stiffness * q["x"] - self.more_damping * u["x_dot"]
+        return (*super().loads(t, q, u, motion, inputs), jk.Force(force * motion.N.x, motion["cart"]))
+
+
+def test_of_what_changes_nothing_the_simplest_is_told(trials):
+    free = ("stiffness", "more_damping", "damping", "more_stiffness")
+    seen = identifiability(Problem.of(Twice(), trials, free, **UNKNOWN))
+    assert seen.count == 2
+    assert seen.how_many == "Of 4 parameters 2 combinations are determined."
+    pairs = {frozenset(name for name, _ in direction.parts) for direction in seen.undetermined}
+    assert pairs == {frozenset({"stiffness", "more_stiffness"}), frozenset({"damping", "more_damping"})}
+    for direction in seen.undetermined:  # as much of the one as less of the other
+        (one, a), (other, b) = direction.parts
+        assert a * seen.scales[seen.names.index(one)] == pytest.approx(-b * seen.scales[seen.names.index(other)])
+    assert seen.how_many in str(seen)
 
 
 # The report.

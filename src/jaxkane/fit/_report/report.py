@@ -36,9 +36,7 @@ def report(fit: Fit, truth: Mapping[str, float] | System | None = None) -> str:
         fit.title,
         _plain(*_parameters(fit, truth)),
         _ending(fit),
-        str(fit.identifiability).split("\n" + fit.identifiability.messages[0])[0]
-        if fit.identifiability.messages
-        else str(fit.identifiability),
+        fit.identifiability.table,
         _plain(*_correlations(fit)),
         _plain(*_channels(fit)),
         *([_plain(*_biases(fit, brief=True))] if fit.problem.model.nuisance.trial else []),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import math
 from collections.abc import Sequence
 
 import jax.numpy as jnp
@@ -37,7 +39,8 @@ class Identifiability:
     - `deviations` (p,): standard deviation along each row, in scaled units.
     - `without_influence`: names of the parameters that change no residual at all. `at_bound`: of those that went as far
         as their bounds let them.
-    - `undetermined`: the directions that the data do not determine, weakest first.
+    - `undetermined`: the directions that the data do not determine, weakest first. Where several change nothing at
+        all, so does every sum of them: those are taken in which the fewest parameters move.
     - `covariance` (p, p) of the parameters in their units, infinite for those without influence.
     - `covariance_of_x` (p, p) of the free numbers behind them.
     """
@@ -60,19 +63,36 @@ class Identifiability:
         return not self.undetermined
 
     @property
+    def count(self) -> int:
+        """How many numbers the data determine: parameters, or combinations of them."""
+        return len(self.names) - len(self.undetermined)
+
+    @property
     def messages(self) -> tuple[str, ...]:
         return tuple(direction.text for direction in self.undetermined)
+
+    @property
+    def how_many(self) -> str:
+        """In words, where combinations are determined and not the parameters themselves; else ""."""
+        if all(len(direction.parts) == 1 for direction in self.undetermined):
+            return ""
+        return f"Of {len(self.names)} parameters {self.count} combinations are determined."
 
     @property
     def information(self) -> np.ndarray:
         """Fisher information (p, p) of the scaled parameters, for residuals of variance one."""
         return (self.vectors.T * self.singular_values**2) @ self.vectors
 
-    def __str__(self) -> str:
+    @property
+    def table(self) -> str:
+        """Singular values, deviations and directions."""
         lines = ["singular value   deviation   direction (scaled parameters)"]
         for s, deviation, row in zip(self.singular_values, self.deviations, self.vectors, strict=True):
             lines.append(f"{s:14.4g}   {deviation:9.2g}   {combination(self.names, row)}")
-        return "\n".join([*lines, *self.messages])
+        return "\n".join(lines)
+
+    def __str__(self) -> str:
+        return "\n".join([self.table, *filter(None, [self.how_many]), *self.messages])
 
 
 def residual_variance(problem: Problem, cost: float) -> float:
@@ -129,7 +149,30 @@ def identifiability_at(problem: Problem, point: Unknowns, at: Linearization, fla
     # That the numbers of a learned function are not determined one by one is as it should be.
     physical = np.array([not part for part in parameters.learned])
     weak = [i for i in reversed(range(p)) if not deviations[i] <= flat and np.any(np.abs(V[i, physical]) > 0.1)]
-    return dataclasses.replace(found, undetermined=tuple(_direction(found, i) for i in weak))
+    rows = V.copy()
+    nothing = [i for i in weak if s[i] == 0 and names[int(np.abs(V[i]).argmax())] not in found.without_influence]
+    if len(nothing) > 1 and physical.all():
+        rows[nothing] = _with_fewest_parts(V[nothing])
+    return dataclasses.replace(found, undetermined=tuple(_direction(found, i, rows[i]) for i in weak))
+
+
+def _with_fewest_parts(V: np.ndarray, most: int = 20_000) -> np.ndarray:
+    """Rows (k, p) of length one that span what the rows of V span, with as many zeros as can be.
+
+    Reduced echelon forms, of which each is given by k places where all rows but one are zero: the one with the fewest
+    entries, of all if these are no more than `most`, else V.
+    """
+    k, p = V.shape
+    if math.comb(p, k) > most:
+        return V
+    places = np.array(list(itertools.combinations(range(p), k)))
+    parts = np.moveaxis(V[:, places], 1, 0)  # (c, k, k)
+    places = places[np.linalg.cond(parts) < 1e4]
+    rows = np.linalg.solve(np.moveaxis(V[:, places], 1, 0), V[None])  # (c, k, p)
+    rows /= np.linalg.norm(rows, axis=2, keepdims=True)
+    rows = np.where(np.abs(rows) > 1e-6, rows, 0.0)
+    best = rows[np.argmin(np.count_nonzero(rows, axis=(1, 2)))]
+    return best * np.sign(best[np.arange(k), np.abs(best).argmax(axis=1)])[:, None]
 
 
 def _by_singular_values(A: np.ndarray, no_influence: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
@@ -147,8 +190,8 @@ def _by_singular_values(A: np.ndarray, no_influence: np.ndarray, rounding: float
     return np.where(s <= rounding, 0.0, s), V * np.sign(V[np.arange(p), np.abs(V).argmax(axis=1)])[:, None]
 
 
-def _direction(seen: Identifiability, i: int) -> Direction:
-    s, deviation, row = seen.singular_values[i], seen.deviations[i], seen.vectors[i]
+def _direction(seen: Identifiability, i: int, row: np.ndarray) -> Direction:
+    s, deviation = seen.singular_values[i], seen.deviations[i]
     order = [j for j in np.argsort(-np.abs(row), kind="stable") if abs(row[j]) > 0.1]
     parts = tuple((seen.names[j], float(row[j])) for j in order)
     first = parts[0][0]

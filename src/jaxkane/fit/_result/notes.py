@@ -21,6 +21,7 @@ def notes_of(fit: Fit) -> tuple[str, ...]:
     """All of them, for a fit."""
     problem = fit.problem
     return (
+        *filter(None, [fit.identifiability.how_many]),
         *fit.identifiability.messages,
         *trade_offs(fit),
         *odd_trials(fit),

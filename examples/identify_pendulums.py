@@ -1,0 +1,157 @@
+"""What can free swings tell of a double and a triple pendulum, and what not?
+
+Two and three arms hang from a fixed clamp (Kaheman and co-workers, 2022): 26 swings of 2.7 s, and 22 of 1.5 s, each of
+which begins where it likes. Masses, mass centres, inertias and friction are free, but for one mass: 7 and 11
+parameters, of which 5 and 8 combinations can be told. The others change nothing: they are named. Then parameters are
+held until all that is free can be told, and what the model lacks is freed besides: zeros of the encoders, and the
+lengths between the joints, which are said to be 172.7 and 228.7 mm.
+
+    variable          meaning                                                                unit
+    angle1, ...       of each arm from the upright vertical (hanging is pi)                  rad
+    mass1, ...        of the arms; free swings tell only ratios: the first is held           kg
+    center1, ...      mass centre from the arm's upper joint                                 m
+    inertia1, ...     about the mass centre, across the plane                                kg m^2
+    viscous1, ...     torque in a joint by its rate                                          N m s/rad
+    length1, length2  between neighbouring joints                                            m
+    zero1, ...        where the encoders read the vertical                                   rad
+
+Run:      python examples/identify_pendulums.py [--out FOLDER]
+Appears:  which sums of parameters can be told, and by what name; tables of estimates; the medians of the windows' rms
+          errors; and identify_pendulums.png: the errors of all windows, and one window of each pendulum.
+Takes:    about a minute and a half.
+"""
+
+import argparse
+from pathlib import Path
+
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+
+import jaxkane as jk
+from jaxkane.fit import Free, LeastSquares
+
+jax.config.update("jax_enable_x64", True)
+
+GOLD, BLUE, INK = "#e8a33d", "#3d8fd1", "#2b2f36"
+
+
+class TwoArms(jk.System):
+    mass1: jk.Scalar = jk.parameter(0.1, positive=True, unit="kg")
+    mass2: jk.Scalar = jk.parameter(0.1, positive=True, unit="kg")
+    center1: jk.Scalar = jk.parameter(0.1, unit="m")
+    center2: jk.Scalar = jk.parameter(0.1, unit="m")
+    inertia1: jk.Scalar = jk.parameter(0.001, positive=True, unit="kg m^2")
+    inertia2: jk.Scalar = jk.parameter(0.001, positive=True, unit="kg m^2")
+    viscous1: jk.Scalar = jk.parameter(1e-4, unit="N m s/rad")
+    viscous2: jk.Scalar = jk.parameter(1e-4, unit="N m s/rad")
+    length1: jk.Scalar = jk.parameter(0.1727, positive=True, unit="m")
+    zero1: jk.Scalar = jk.parameter(0.0, unit="rad")
+    zero2: jk.Scalar = jk.parameter(0.0, unit="rad")
+
+    coordinates, speeds = ("angle1", "angle2"), ("rate1", "rate2")
+    units = {"angle1": "rad", "angle2": "rad"}
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, q["angle1"] - self.zero1, u["rate1"])
+        B = N.rotate(3, q["angle2"] - self.zero2, u["rate2"])
+        elbow = O.fixed(self.length1 * A.y)
+        first = jk.Body(self.mass1, (self.inertia1, 0.0, self.inertia1), O.fixed(self.center1 * A.y), A, name="arm1")
+        center = elbow.fixed(self.center2 * B.y)
+        return jk.Motion([first, jk.Body(self.mass2, (self.inertia2, 0.0, self.inertia2), center, B, name="arm2")])
+
+    def loads(self, t, q, u, motion, inputs):
+        first, second, axis = motion["arm1"], motion["arm2"], motion.N.z
+        shoulder = jk.loads.torsional_damper(first, None, axis, self.viscous1)
+        elbow = jk.loads.torsional_damper(second, first, axis, self.viscous2)
+        return jk.weight(motion, -9.81 * motion.N.y), shoulder, elbow
+
+
+class ThreeArms(TwoArms):
+    """The same with a third arm on the second."""
+
+    mass3: jk.Scalar = jk.parameter(0.1, positive=True, unit="kg")
+    center3: jk.Scalar = jk.parameter(0.1, unit="m")
+    inertia3: jk.Scalar = jk.parameter(0.001, positive=True, unit="kg m^2")
+    viscous3: jk.Scalar = jk.parameter(1e-4, unit="N m s/rad")
+    length2: jk.Scalar = jk.parameter(0.2287, positive=True, unit="m")
+    zero3: jk.Scalar = jk.parameter(0.0, unit="rad")
+
+    coordinates, speeds = ("angle1", "angle2", "angle3"), ("rate1", "rate2", "rate3")
+    units = {"angle1": "rad", "angle2": "rad", "angle3": "rad"}
+
+    def motion(self, t, q, u):
+        motion = super().motion(t, q, u)
+        second = motion["arm2"]
+        joint = second.center.fixed((self.length2 - self.center2) * second.frame.y)
+        C = motion.N.rotate(3, q["angle3"] - self.zero3, u["rate3"])
+        center = joint.fixed(self.center3 * C.y)
+        return motion.extended([jk.Body(self.mass3, (self.inertia3, 0.0, self.inertia3), center, C, name="arm3")])
+
+    def loads(self, t, q, u, motion, inputs):
+        knee = jk.loads.torsional_damper(motion["arm3"], motion["arm2"], motion.N.z, self.viscous3)
+        return (*super().loads(t, q, u, motion, inputs), knee)
+
+
+def fitted(system, recording, free):
+    """Parameters, and the angles and rates at the start of each swing; and the swings' rms errors [rad]."""
+    unknown = (*system.coordinates, *system.speeds)
+    fit = jk.fit.fit(system, recording.trials, free, unknown=unknown, optimizer=LeastSquares())
+    errors = [0.001 * np.array(list(channels.values())) for channels in fit.residuals.values()]
+    rms = np.array([np.sqrt(np.mean(error**2)) for error in errors])
+    print(f"{fit}\nrms errors of the swings: median {1e3 * np.median(rms):.2f}, largest {1e3 * rms.max():.2f} mrad\n")
+    return fit, rms
+
+
+def identified(system, recording):
+    """With all that is not known; then with what can be told, and zeros and lengths besides."""
+    numbers = range(1, len(system.coordinates) + 1)
+    bodies = {f"arm{i}": ("m", "my", "Izz") for i in numbers}
+    print(jk.fit.base_parameters(system, bodies=bodies, parameters=[f"viscous{i}" for i in numbers]), "\n")
+    masses = [f"mass{i}" for i in numbers if i > 1]
+    rest = [f"{what}{i}" for what in ("center", "inertia", "viscous") for i in numbers]
+    first = fitted(system, recording, [*masses, *rest])
+    # Masses, and the first mass centre with them, are held where the first fit left them: the others can be told.
+    lengths = [name for name in ("length1", "length2") if hasattr(system, name)]
+    zeros = [Free(f"zero{i}", scale=0.01) for i in numbers]
+    rest.remove("center1")
+    return {"as described": first, "zeros, lengths": fitted(first[0].system, recording, [*rest, *lengths, *zeros])}
+
+
+def picture(found, path):
+    figure, axes = plt.subplots(len(found), 2, figsize=(9, 6), width_ratios=[1.6, 1], layout="constrained")
+    for (swing, errors), (title, fits) in zip(axes, found.items(), strict=True):
+        fit, _ = fits["zeros, lengths"]
+        trial, name = fit.problem.trials[0], fit.trial_names[0]
+        for k, (channel, angle) in enumerate(trial.measured.items()):
+            label = ("measured", "fitted") if k == 0 else (None, None)
+            swing.plot(trial.t, angle, color=INK, linewidth=2.5, alpha=0.35, label=label[0])
+            swing.plot(trial.t, fit.fitted[name][channel], color=BLUE, linewidth=1.0, label=label[1])
+        swing.set(ylabel="angles [rad]", title=f"{title}: the first swing")
+        for color, (label, (_, rms)) in zip((GOLD, BLUE), fits.items(), strict=True):
+            errors.plot(1e3 * rms, "o-", color=color, markersize=3, linewidth=0.8, label=label)
+        errors.set(ylabel="rms error [mrad]", title="all swings", ylim=(0, None))
+    axes[-1][0].set_xlabel("time [s]")
+    axes[-1][1].set_xlabel("number of the swing")
+    axes[0][0].legend(loc="lower right")
+    axes[0][1].legend(loc="upper right")
+    figure.savefig(path, dpi=120)
+
+
+def main(folder: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    systems = {"two arms": TwoArms(), "three arms": ThreeArms()}
+    found = {}
+    for arms, (title, system) in enumerate(systems.items(), start=2):
+        recording = jk.data.multi_arm_pendulum(arms)
+        print(f"{title}: {recording}")
+        found[title] = identified(system, recording)
+    picture(found, folder / "identify_pendulums.png")
+    print("picture:", folder / "identify_pendulums.png")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--out", type=Path, default=Path("figures"), help="folder of the picture (default: figures)")
+    main(parser.parse_args().out)
