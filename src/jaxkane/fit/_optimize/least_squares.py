@@ -68,6 +68,8 @@ class LeastSquares(Optimizer):
         # What is left of a cost that vanishes is rounding: a millionth of a standard error.
         if gain <= max(self.rtol * at.squares, 1e-12) and damping <= 1e-2:
             return "converged"
+        if gain <= 0:  # all that a damped step promises is lost in rounding
+            return "stuck"
         tried = moved(now.point, x, eliminated)
         there = linearize(problem, tried)
         if there is not None and usable(there) and there.cost >= at.cost:
