@@ -3,11 +3,13 @@
 import dataclasses
 from typing import ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from systems import POSED, TRIAL, Track
 
+import jaxkane as jk
 from jaxkane.fit import (
     BFGS,
     GradientDescent,
@@ -15,12 +17,13 @@ from jaxkane.fit import (
     LeastSquares,
     Optimizer,
     Problem,
+    Trial,
     fit,
     minimize,
     multi_start,
     save_report,
 )
-from jaxkane.fit._optimize.steps import moved
+from jaxkane.fit._optimize.steps import moved, settled
 from jaxkane.fit._problem.blocks import eliminate
 from jaxkane.fit._problem.problem import linearize
 
@@ -93,3 +96,36 @@ def test_the_best_is_kept_where_the_last_is_worse():
     away = minimize(problem, Part(part=2.5))
     np.testing.assert_allclose(away.history[-1] / away.history[-2], 2.25, rtol=0.05)  # (1 - 2.5)^2
     assert away.cost == away.history[0] == min(away.history)
+
+
+class Dial(jk.System):
+    """A wheel that turns freely, seen by the sine of three times its angle."""
+
+    coordinates, speeds = ("angle",), ("rate",)
+    inertia: jk.Scalar = jk.parameter(1.0, positive=True)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        wheel = N.rotate(3, q["angle"], u["rate"])
+        return jk.Motion([jk.Body(1.0, (0.0, 0.0, self.inertia), O, wheel, name="wheel")])
+
+    def loads(self, t, q, u, motion, inputs):
+        return ()
+
+    def outputs(self, t, q, u, motion, now):
+        return {"needle": jnp.sin(3.0 * q["angle"])}
+
+
+def test_a_trial_in_which_a_step_leads_too_far_holds_up_no_other():
+    near, far = (Trial(TRIAL.t, {"needle": np.sin(3 * a + 0 * TRIAL.t)}, sigma=0.1) for a in (0.2, 0.25))
+    problem = Problem.of(Dial(), [near, far], "inertia", unknown=("angle",), simulation=POSED["simulation"])
+    # From here Gauss-Newton solves the first at once, and steps with the second beyond where it began.
+    begun = eqx.tree_at(lambda p: p.z, problem.start, jnp.array([[0.19], [0.48]]))
+    before = linearize(problem, begun)
+    whole = linearize(problem, moved(begun, jnp.zeros(1), eliminate(before.blocks, 0.0)))
+    assert whole.costs[0] < 1e-2 * before.costs[0] < before.costs[1] < whole.costs[1]
+    point, at = settled(problem, begun, before, steps=1, rtol=1e-2)
+    assert at.costs == pytest.approx([whole.costs[0], before.costs[1]])
+    point, at = settled(problem, begun, before, steps=20, rtol=1e-12)
+    assert at.cost < 1e-6 * before.cost
+    assert linearize(problem, point).cost == pytest.approx(at.cost, abs=1e-12)

@@ -15,7 +15,7 @@ from .._problem.model import Unknowns
 from .._problem.problem import Linearization, Problem, linearize
 from .minimize import minimize
 from .optimizer import Iterate, Optimizer
-from .steps import moved, usable
+from .steps import moved, settled, usable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -74,8 +74,7 @@ class LeastSquares(Optimizer):
         there = linearize(problem, tried)
         if there is not None and usable(there) and there.cost >= at.cost:
             # Often only the nuisance values, which went along a straight line, are not yet where they belong.
-            tried = moved(tried, jnp.zeros_like(x), eliminate(there.blocks, 0.0))
-            there = linearize(problem, tried)
+            tried, there = settled(problem, tried, there, 3, self.rtol, enough=at.cost - 0.5 * gain)
         if there is not None and usable(there) and there.cost < at.cost:
             ratio = (at.cost - there.cost) / gain
             # Nielsen's rule: trust more where the promise was kept.

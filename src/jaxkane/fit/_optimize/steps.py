@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -65,9 +66,7 @@ def _solved(problem: Problem, point: Unknowns, steps: int, rtol: float) -> tuple
         at = linearize(problem.shortened(samples), point)
     stuck = 0
     while True:
-        point, at = _nuisance_steps(
-            problem.shortened(samples), point, at, steps if np.all(samples == whole) else 2, rtol
-        )
+        point, at = settled(problem.shortened(samples), point, at, steps if np.all(samples == whole) else 2, rtol)
         if np.all(samples == whole):
             return point, at
         longer = (
@@ -84,22 +83,49 @@ def _solved(problem: Problem, point: Unknowns, steps: int, rtol: float) -> tuple
         assert at is not None
 
 
-def _nuisance_steps(problem: Problem, point: Unknowns, at: Linearization, steps: int, rtol: float):
-    still = jnp.zeros_like(point.x)
-    damping = 0.0
+def settled(
+    problem: Problem, point: Unknowns, at: Linearization, steps: int, rtol: float, enough: float = -np.inf
+) -> tuple[Unknowns, Linearization]:
+    """The nuisance values after a few Gauss-Newton steps with the parameters held, until these gain less than a part
+    `rtol`, or the cost is `enough`.
+
+    Trials then know nothing of one another: each has a damping of its own, and keeps a step only where its own cost
+    falls, so that one in which a step leads too far holds up no other.
+    """
+    still, owner = jnp.zeros_like(point.x), np.asarray(problem.windows.trial)
+    damping, before = np.zeros(len(problem.trials)), _by_owner(at, owner, len(problem.trials))
     for _ in range(steps):
         tried = moved(point, still, eliminate(at.blocks, damping))
         there = linearize(problem, tried)
-        if there is not None and usable(there) and there.cost <= at.cost:
-            gained = at.cost - there.cost
-            point, at, damping = tried, there, damping / 10
-            if gained <= rtol * at.squares:
-                break
-        elif there is not None and usable(there) and there.cost <= at.cost + 1e-9 * at.squares:
+        after = np.full_like(before, np.inf) if there is None else _by_owner(there, owner, len(before))
+        better = after <= before
+        damping = np.where(better, damping / 10, np.maximum(10 * damping, 1e-2))
+        gained = float(np.sum((before - after)[better]))
+        if there is not None and better.any():
+            point, at = _chosen(better, owner, (tried, there), (point, at))
+            before = np.where(better, after, before)
+        done = better | (after <= before + 1e-9 * at.squares)
+        if (done.all() and gained <= rtol * at.squares) or at.cost <= enough:
             break
-        else:
-            damping = max(10 * damping, 1e-2)
     return point, at
+
+
+def _by_owner(at: Linearization, owner: np.ndarray, n: int) -> np.ndarray:
+    """Costs of trials (T,)."""
+    return np.bincount(owner, weights=at.costs, minlength=n)
+
+
+def _chosen(better: np.ndarray, owner: np.ndarray, new: Any, old: Any) -> tuple[Unknowns, Linearization]:
+    """Of two points with the same parameters, and what they were linearized to, the first where a trial is better."""
+    (tried, there), (point, at) = new, old
+
+    def of(which: np.ndarray):
+        return lambda a, b: jnp.where(jnp.reshape(which, (-1,) + (1,) * (a.ndim - 1)), a, b)
+
+    of_windows = of(better[owner])
+    R, seen = of_windows(there.blocks.R, at.blocks.R), jax.tree.map(of_windows, there.seen, at.seen)
+    b, z = of(better)(tried.b, point.b), of_windows(tried.z, point.z)
+    return Unknowns(point.x, b, z), Linearization(eqx.tree_at(lambda blocks: blocks.R, at.blocks, R), seen)
 
 
 def _cannot_start(problem: Problem, at: Linearization | None, bad: np.ndarray) -> str:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Int
 
@@ -126,16 +127,24 @@ class Eliminated(eqx.Module):
         return _of_windows(z, self.blocks.windows, self.blocks.R.shape[0]), b
 
 
+def eliminate(blocks: Blocks, damping: Array | np.ndarray | float) -> Eliminated:
+    """z and b eliminated, each with `damping` * |column| * unknown added to the residuals (Levenberg-Marquardt).
+
+    `damping`: a number, or one for every trial (T,).
+    """
+    of_trials = jnp.broadcast_to(jnp.asarray(damping, blocks.R.dtype), blocks.windows.shape[:1])
+    return _eliminate(blocks, of_trials)
+
+
 @jax.jit
-def eliminate(blocks: Blocks, damping: Array | float) -> Eliminated:
-    """z and b eliminated, each with `damping` * |column| * unknown added to the residuals (Levenberg-Marquardt)."""
+def _eliminate(blocks: Blocks, damping: Float[Array, " T"]) -> Eliminated:
     R, n_z, n_next, n_b, n_x = blocks.R, blocks.n_z, blocks.n_next, blocks.n_b, blocks.n_x
     # What has no influence has rounding errors; a step along them would lead anywhere.
     none = jnp.zeros(R.shape[-1], bool).at[-1 - n_x : -1].set(blocks.without_influence)
     R = jnp.where(none[None, None, :], 0.0, R)
     of_z, of_b = _column_squares(blocks)
     # Never quite zero: an unknown without influence then stays where it is, instead of becoming NaN.
-    damping = jnp.maximum(jnp.asarray(damping, R.dtype), 1e3 * jnp.finfo(R.dtype).eps)
+    damping = jnp.maximum(damping, 1e3 * jnp.finfo(R.dtype).eps)[:, None]
     c = n_next + n_b + n_x + 1
 
     def of_trial(rows, z_damping):
@@ -149,7 +158,7 @@ def eliminate(blocks: Blocks, damping: Array | float) -> Eliminated:
         rest, z_rows = jax.lax.scan(of_window, jnp.zeros((c, c), R.dtype), (rows, z_damping))
         return rest[:, n_next:], z_rows  # after a trial's last window there is no next
 
-    rest, z_rows = jax.vmap(of_trial)(_by_trial(R, blocks.windows), damping * _safe(of_z))
+    rest, z_rows = jax.vmap(of_trial)(_by_trial(R, blocks.windows), damping[:, None] * _safe(of_z))
     b_rows, rest = jax.vmap(lambda rows, d: _triangle(rows, n_b, d))(rest, damping * _safe(of_b))
     scale = _safe(jnp.sum(R**2, axis=(0, 1))[-1 - n_x : -1])
     return Eliminated(rest, z_rows, b_rows, scale, blocks)

@@ -330,6 +330,12 @@ class Linearization(eqx.Module):
         return float(self.blocks.cost if self.seen.value is None else jnp.sum(self.seen.value))
 
     @property
+    def costs(self) -> np.ndarray:
+        """The share of every window (W,) in the cost, without a residual's derivatives; infinite where `good` fails."""
+        own = jnp.sum(self.blocks.R[:, :, -1] ** 2, axis=1) if self.seen.value is None else self.seen.value
+        return np.where(self.good, np.asarray(own), np.inf)
+
+    @property
     def squares(self) -> float:
         """The rows' sum of squares: what relative tolerances refer to, and what promises are counted from. It is the
         cost, but with process noise about twice the number of measurements, where the cost may have any sign."""

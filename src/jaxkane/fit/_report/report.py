@@ -113,7 +113,7 @@ def _all_notes(fit: Fit) -> tuple[str, ...]:
 
 def _parameters(fit: Fit, truth: Any) -> tuple[Row, Sequence[Row]]:
     known, errors, robust = known_values(fit, truth), fit.standard_errors, fit.clustered_errors
-    head = ["parameter", "unit", "start", "estimate", "std. error", "by trial", "95 % interval"]
+    head = ["parameter", "unit", "start", "estimate", "std. error", f"by {fit.clusters[0] or 'trial'}", "95 % interval"]
     rows, intervals = [], fit.intervals()
     for name, unit in zip(fit.names, fit.parameters.units, strict=True):
         low, high = intervals[name]
@@ -136,8 +136,9 @@ def _ending(fit: Fit) -> str:
 def _how_sure(fit: Fit) -> str:
     if fit.robust:
         return (
-            "Intervals are built on the cluster-robust errors (by trial), since the residuals are correlated in time "
-            f"(neighbours by {fit.autocorrelation:.2f}); the formal ones take every sample for independent."
+            "Intervals are built on the cluster-robust errors "
+            f"(by {fit.clusters[0]}), since the residuals are correlated "
+            f"in time (neighbours by {fit.autocorrelation:.2f}); the formal ones take every sample for independent."
         )
     return "Intervals are built on the formal errors, for independent residuals of equal size."
 

@@ -10,34 +10,100 @@ from jaxtyping import Array
 from scipy import stats
 
 from ..._scalars.reads import compiled
-from .._problem.blocks import eliminate
+from .._problem.blocks import Blocks, eliminate
 from .._problem.model import Unknowns
 from .._problem.parameters import Parameters
 from .._problem.problem import Linearization, Problem
 
 
-def clustered_covariance(problem: Problem, point: Unknowns, at: Linearization) -> np.ndarray:
-    """Cluster-robust covariance (p, p) of the parameters in their units, for residuals correlated within a trial.
+def clusters_of(problem: Problem) -> tuple[str, int]:
+    """Within what residuals are taken to be correlated, and how many there are: trials, where these are more than the
+    parameters by two; else windows, where these start freely and are more by two; ("", 0) where neither is.
 
-        B (T / (T - 1) sum_t (A_t^T r_t) (A_t^T r_t)^T + P) B,   B = (A^T A)^-1
+    Windows of one trial have its biases in common, and whatever else differs from trial to trial: errors by window do
+    not see that.
+    """
+    least = len(problem.parameters.names) + 2
+    if problem.clusters >= least:
+        return "trial", problem.clusters
+    windows, nuisance = int(problem.seen.sum()), problem.model.nuisance
+    if windows >= least and windows > problem.clusters and not nuisance.chained:
+        return "window", windows
+    return "", 0
+
+
+def clustered_covariance(problem: Problem, point: Unknowns, at: Linearization) -> np.ndarray:
+    """Cluster-robust covariance (p, p) of the parameters in their units, for residuals that are correlated within a
+    trial, or within a window where there are too few trials (`clusters_of`); NaN where there are too few of both, and
+    for parameters that the data do not determine."""
+    kind, _ = clusters_of(problem)
+    if not kind:
+        p = len(problem.parameters.names)
+        return np.full((p, p), np.nan)
+    slopes = np.asarray(slopes_of(problem.parameters, point.x), float)
+    of_x = (_by_trial if kind == "trial" else _by_window)(problem, point, at)
+    return slopes @ of_x @ slopes.T
+
+
+def _of_priors(problem: Problem, point: Unknowns) -> tuple[np.ndarray, np.ndarray]:
+    """Information (p, p) and score (p,) of the parameters' priors, by the free numbers."""
+    rows = np.asarray(slopes_of(problem.parameters, point.x), float)
+    rows = rows / np.asarray(problem.parameters.prior_deviation, float)[:, None]
+    return rows.T @ rows, rows.T @ np.asarray(problem.parameters.prior_residuals(point.x), float)
+
+
+def _by_trial(problem: Problem, point: Unknowns, at: Linearization) -> np.ndarray:
+    """B (T / (T - 1) sum_t (A_t^T r_t) (A_t^T r_t)^T + P) B,   B = (A^T A)^-1
 
     (Liang and Zeger 1986; White's sandwich with a trial as the unit.) The parameters' priors, of information P, are
-    measurements of their own with the deviations they were given, and no part of any trial. NaN with fewer trials than
-    parameters plus two, and for parameters that the data do not determine.
+    measurements of their own with the deviations they were given, and no part of any trial.
     """
-    blocks = np.asarray(eliminate(at.blocks, 0.0).R, float)  # (T, p+1, p+1)
-    T, p, parameters, x = problem.clusters, len(problem.parameters.names), problem.parameters, point.x
-    if p + 2 > T:
-        return np.full((p, p), np.nan)
+    blocks, T = np.asarray(eliminate(at.blocks, 0.0).R, float), problem.clusters  # (T, p+1, p+1)
     A, r = blocks[:, :, :-1], blocks[:, :, -1]
     information, scores = np.einsum("tmi,tmj->ij", A, A), np.einsum("tmi,tm->ti", A, r)
-    slopes = np.asarray(slopes_of(parameters, x), float)
-    of_prior = slopes / np.asarray(parameters.prior_deviation, float)[:, None]
+    of_prior, score = _of_priors(problem, point)
     # The rows of the priors stand among those of the first window's trial.
-    scores[int(problem.windows.trial[0])] -= of_prior.T @ np.asarray(parameters.prior_residuals(x), float)
+    scores[int(problem.windows.trial[0])] -= score
     bread = np.linalg.inv(information)
-    of_x = bread @ (T / (T - 1) * scores.T @ scores + of_prior.T @ of_prior) @ bread
-    return slopes @ of_x @ slopes.T
+    return bread @ (T / (T - 1) * scores.T @ scores + of_prior) @ bread
+
+
+def _by_window(problem: Problem, point: Unknowns, at: Linearization) -> np.ndarray:
+    """(W - 1) / W sum_w d_w d_w^T + B P B,   d_w = (N - N_w)^-1 g_w,   B = N^-1
+
+    d_w is what leaving out the window w moves, linearized (the jackknife; CR3 of Bell and McCaffrey 2002), N_w and g_w
+    are its information and score of the parameters and of its trial's own unknowns, and N is the sum with the priors of
+    both, of information P. Where unknowns are many, a window has much influence: a sandwich would be too small.
+    """
+    blocks, windows, p = at.blocks, problem.windows, point.x.shape[0]
+    alone = Blocks(blocks.R, jnp.arange(blocks.R.shape[0], dtype=jnp.int32)[:, None], blocks.n_z, 0, 0)
+    rows = np.asarray(eliminate(alone, 0.0).R, float)  # (W, n_b + p + 1, n_b + p + 1)
+    first, owner, n_b = np.asarray(windows.first), np.asarray(windows.trial), blocks.n_b
+    n = len(problem.trials) * n_b + p
+    deviation = np.asarray(problem.model.nuisance.trial_deviation, float)
+    P = np.zeros((n, n))
+    P[-p:, -p:], score_of_prior = _of_priors(problem, point)
+    N_w, g_w = np.zeros((len(owner), n, n)), np.zeros((len(owner), n))
+    for w, R in enumerate(rows):
+        own = owner[w] * n_b + np.arange(n_b)
+        places = np.append(own, n - p + np.arange(p))
+        N_w[w][np.ix_(places, places)], g_w[w][places] = R[:, :-1].T @ R[:, :-1], R[:, :-1].T @ R[:, -1]
+        if first[w]:  # among whose rows stand the priors of its trial
+            P[own, own] = deviation**-2.0
+            N_w[w][own, own] -= deviation**-2.0
+            g_w[w][own] -= np.asarray(point.b, float)[owner[w]] / deviation**2
+    N_w[0, -p:, -p:] -= P[-p:, -p:]
+    g_w[0, -p:] -= score_of_prior
+    N = N_w.sum(axis=0) + P
+    scale = np.sqrt(np.maximum(N.diagonal(), np.finfo(float).tiny))
+
+    def inverse(M: np.ndarray) -> np.ndarray:
+        # A trial's unknowns may be known by one window alone: without it they are nobody's, and stay.
+        return np.linalg.pinv(M / np.outer(scale, scale), rcond=1e-13, hermitian=True) / np.outer(scale, scale)
+
+    moved = np.array([(inverse(N - N_w[w]) @ g_w[w])[-p:] for w in np.flatnonzero(problem.seen)])
+    bread, W = inverse(N)[-p:], len(moved)
+    return (W - 1) / W * moved.T @ moved + bread @ P @ bread.T
 
 
 def intervals(parameters: Parameters, x: Array, half: np.ndarray) -> list[tuple[float, float]]:

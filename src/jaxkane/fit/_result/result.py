@@ -46,7 +46,8 @@ class Fit:
     - `standard_errors`: by name, formal: from the inverse of J^T J with the nuisance values eliminated, times the
         residuals' variance. They hold for independent residuals of equal scaled size, and a right model.
     - `clustered_errors`: by name, cluster-robust, for residuals that are correlated within a trial (sandwich, one
-        cluster a trial); NaN with fewer trials than parameters plus two.
+        cluster a trial). With fewer trials than parameters plus two: within a window that starts freely (jackknife,
+        one cluster a window); NaN with too few of both. `clusters` says which.
     - `intervals(level)`: by name. `correlation` (p, p) of the estimates, in the order of `names`.
     - `cost`: sum of squared residuals, with process noise minus twice the log likelihood; `history`: of the cost.
         `status`, `message`: how it ended, in a word and in words.
@@ -166,7 +167,8 @@ class Fit:
 
     @functools.cached_property
     def clustered_covariance(self) -> np.ndarray:
-        """(p, p), in the parameters' units, robust to residuals that are correlated within a trial."""
+        """(p, p), in the parameters' units, robust to residuals that are correlated within a trial, or a window: see
+        `clusters`."""
         if not np.all(np.isfinite(self.covariance)):
             return np.full_like(self.covariance, np.nan)
         return covariance.clustered_covariance(self.problem, self.point, self.linearization)
@@ -177,15 +179,23 @@ class Fit:
 
     @property
     def robust(self) -> bool:
-        """Whether `intervals` use the cluster-robust errors: the residuals are no noise, and the trials are enough."""
+        """Whether `intervals` use the cluster-robust errors: the residuals are no noise, and trials or windows are
+        enough."""
         known = np.all(np.isfinite(self.clustered_covariance.diagonal()))
         return bool(known and abs(self.autocorrelation) > 0.2)
 
     @property
+    def clusters(self) -> tuple[str, int]:
+        """Within what the cluster-robust errors take residuals to be correlated, "trial" or "window", and how many
+        there are; ("", 0) where there are too few."""
+        return covariance.clusters_of(self.problem)
+
+    @property
     def freedom(self) -> int:
-        """Degrees of freedom of all intervals: trials less one where `robust`, else residuals less unknowns."""
+        """Degrees of freedom of all intervals: trials (or windows) less one where `robust`, else residuals less
+        unknowns."""
         n_r, n_unknown = self.problem.size
-        return self.problem.clusters - 1 if self.robust else n_r - n_unknown
+        return self.clusters[1] - 1 if self.robust else n_r - n_unknown
 
     def quantile(self, level: float = 0.95) -> float:
         """Of Student's distribution, two-sided, with as many degrees of freedom as `freedom`."""
