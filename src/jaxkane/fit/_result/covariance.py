@@ -79,30 +79,42 @@ def _by_window(problem: Problem, point: Unknowns, at: Linearization) -> np.ndarr
     alone = Blocks(blocks.R, jnp.arange(blocks.R.shape[0], dtype=jnp.int32)[:, None], blocks.n_z, 0, 0)
     rows = np.asarray(eliminate(alone, 0.0).R, float)  # (W, n_b + p + 1, n_b + p + 1)
     first, owner, n_b = np.asarray(windows.first), np.asarray(windows.trial), blocks.n_b
+    deviation, b = np.asarray(problem.model.nuisance.trial_deviation, float), np.asarray(point.b, float)
     n = len(problem.trials) * n_b + p
-    deviation = np.asarray(problem.model.nuisance.trial_deviation, float)
-    P = np.zeros((n, n))
-    P[-p:, -p:], score_of_prior = _of_priors(problem, point)
-    N_w, g_w = np.zeros((len(owner), n, n)), np.zeros((len(owner), n))
-    for w, R in enumerate(rows):
-        own = owner[w] * n_b + np.arange(n_b)
-        places = np.append(own, n - p + np.arange(p))
-        N_w[w][np.ix_(places, places)], g_w[w][places] = R[:, :-1].T @ R[:, :-1], R[:, :-1].T @ R[:, -1]
-        if first[w]:  # among whose rows stand the priors of its trial
-            P[own, own] = deviation**-2.0
-            N_w[w][own, own] -= deviation**-2.0
-            g_w[w][own] -= np.asarray(point.b, float)[owner[w]] / deviation**2
-    N_w[0, -p:, -p:] -= P[-p:, -p:]
-    g_w[0, -p:] -= score_of_prior
-    N = N_w.sum(axis=0) + P
+    shared, (of_prior, score_of_prior) = n - p + np.arange(p), _of_priors(problem, point)
+
+    def of_window(w: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The unknowns of a window, its information about them and its score; without the priors in its rows."""
+        own, A, r = owner[w] * n_b + np.arange(n_b), rows[w, :, :-1], rows[w, :, -1]
+        information, score = A.T @ A, A.T @ r
+        if first[w]:
+            information[:n_b, :n_b] -= np.diag(deviation**-2.0)
+            score[:n_b] -= b[owner[w]] / deviation**2
+        if w == 0:
+            information[n_b:, n_b:] -= of_prior
+            score[n_b:] -= score_of_prior
+        return np.append(own, shared), information, score
+
+    P = np.diag(np.append(np.tile(deviation**-2.0, len(problem.trials)), np.zeros(p)))
+    P[np.ix_(shared, shared)] = of_prior
+    N = P.copy()
+    for w in range(len(owner)):
+        places, information, _ = of_window(w)
+        N[np.ix_(places, places)] += information
     scale = np.sqrt(np.maximum(N.diagonal(), np.finfo(float).tiny))
 
     def inverse(M: np.ndarray) -> np.ndarray:
         # A trial's unknowns may be known by one window alone: without it they are nobody's, and stay.
         return np.linalg.pinv(M / np.outer(scale, scale), rcond=1e-13, hermitian=True) / np.outer(scale, scale)
 
-    moved = np.array([(inverse(N - N_w[w]) @ g_w[w])[-p:] for w in np.flatnonzero(problem.seen)])
-    bread, W = inverse(N)[-p:], len(moved)
+    def moved_without(w: int) -> np.ndarray:
+        places, information, score = of_window(w)
+        rest = N.copy()
+        rest[np.ix_(places, places)] -= information
+        return inverse(rest)[np.ix_(shared, places)] @ score
+
+    moved = np.array([moved_without(w) for w in np.flatnonzero(problem.seen)])
+    bread, W = inverse(N)[shared], len(moved)
     return (W - 1) / W * moved.T @ moved + bread @ P @ bread.T
 
 
