@@ -50,8 +50,8 @@ CHANNELS = {  # of the recording, and what they are called in the description
     "acc_y": "imu.ay",
     "acc_z": "imu.az",
 }
-# Three to five times what a bicycle of rigid bodies leaves unexplained, since that is no noise: neighbouring samples are
-# alike, and each tells less than one of its own. Of the others it is nearly all: the frame's vibration.
+# Three to five times what a bicycle of rigid bodies leaves unexplained, since that is no noise: neighbouring samples
+# are alike, and each tells less than one of its own. Of the others it is nearly all: the frame's vibration.
 SIGMA = {"steer": 0.03, "steer_reading": 0.1, "wheel_reading": 0.1, "imu.gx": 0.03, "imu.gz": 0.05}
 # Offsets in every run: zeros of steering, motor and accelerometers; of gyroscopes about as large as what they read at
 # rest, up to 0.004, 0.007 and 0.001 rad/s.

@@ -113,7 +113,7 @@ def _by_window(problem: Problem, point: Unknowns, at: Linearization) -> np.ndarr
         rest[np.ix_(places, places)] -= information
         return inverse(rest)[np.ix_(shared, places)] @ score
 
-    moved = np.array([moved_without(w) for w in np.flatnonzero(problem.seen)])
+    moved = np.array([moved_without(w) for w in np.flatnonzero(problem.seen).tolist()])
     bread, W = inverse(N)[shared], len(moved)
     return (W - 1) / W * moved.T @ moved + bread @ P @ bread.T
 
