@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from .._description.bodies import Motion
+from .._description.bodies import Body, Motion
+from .._description.vectors import Frame, Vector
 from ..catalog import WhippleBicycle
 from ._record import Record
 from ._scene import Builder
@@ -28,23 +29,57 @@ def bicycle(system: Any, motion: Motion, s: Sketch) -> None:
     crank, seat = at(0.40, 0.9 * rR), at(0.22, rR + 0.55)
     head = S - (0.30 + system.rF) * 0.9 * C.z  # the top of the steering head, above the crossing of the axle's height
     low, top = head + 0.14 * C.z, head - 0.07 * C.z
-    grips = [top + 0.02 * C.x + side * 0.27 * C.y for side in (-1.0, 1.0)]
-    hips, shoulders = seat - 0.07 * B.z, at(0.50, rR + 1.02)
-    s.wheel("ink", rear_wheel, rR)
-    s.wheel("ink", front_wheel, system.rF)
+    _wheel(s, rear_wheel, rR, getattr(system, "rear_tyre", None))
+    _wheel(s, front_wheel, system.rF, getattr(system, "front_tyre", None))
     s.line("gold", rear, crank, low, head, seat, rear, width=3.0)
     s.line("gold", crank, seat, width=3.0)
     s.line("blue", front, low, top, width=3.0)
-    s.line("blue", grips[0], top, grips[1], width=3.5)
-    s.line("grey", crank, at(0.52, rR + 0.33), hips, shoulders, width=5.0)
-    s.line("grey", grips[0], shoulders, grips[1], width=3.0)
-    s.circle("grey", shoulders + B.vector(0.08, 0.0, -0.2), B.x, B.z, 0.11, width=2.5, fill=0.25)
-    s.line("grey", shoulders, shoulders + B.vector(0.04, 0.0, -0.1), width=5.0)
     s.line("ink", seat + 0.1 * B.x, seat - 0.14 * B.x, width=4.0)
+    hips = seat - 0.07 * B.z
+    s.line("grey", crank, at(0.52, rR + 0.33), hips, width=5.0)
+    grips = [top + 0.02 * C.x + side * 0.27 * C.y for side in (-1.0, 1.0)]
+    if "left_grip" in motion.points:
+        grips = [motion[f"{side}_grip"].position for side in ("left", "right")]
+    s.line("blue", grips[0], top, grips[1], width=3.5)
+    if "U" in motion.frames:  # of a rider with a body of his own
+        rider, U = system.rider, motion["U"]
+        shoulders = motion["rider"].center.position + U.vector(0.5 * w - rider.x, 0.0, -rR - 1.02 - rider.z)
+        s.mass_center("violet", motion["rider"], label="rider")
+    else:
+        U, shoulders = B, at(0.50, rR + 1.02)
+    _upper_body(s, motion, U, hips, shoulders, grips)
     s.mass_center("red", frame, label=frame.name)
     s.mass_center("blue", fork, 4.0, label=fork.name)
     s.trace("ink", motion["P"])
     s.trace("blue", motion["Q"])
+    for part in getattr(system, "parts", ()):
+        part.draw(system, motion, s)
+
+
+def _wheel(s: Sketch, body: Body, radius: Any, tyre: Any) -> None:
+    """A spoked wheel, and the sides of its tyre where that is round."""
+    s.wheel("ink", body, radius)
+    if getattr(tyre, "crown", None) is not None:
+        A = body.frame
+        for side in (-1.0, 1.0):
+            center = body.center.position + side * tyre.crown * A.y
+            s.circle("ink", center, A.z, A.x, radius - tyre.crown, width=1.2)
+
+
+def _upper_body(s: Sketch, motion: Motion, U: Frame, hips: Vector, shoulders: Vector, grips: list[Vector]) -> None:
+    """Trunk, head and arms; the arms by their joints where the motion knows them."""
+    if "left_shoulder" in motion.points:
+        left, right = (motion[f"{side}_shoulder"].position for side in ("left", "right"))
+        shoulders = 0.5 * (left + right)
+        s.line("grey", left, right, width=5.0)
+    s.line("grey", hips, shoulders, width=5.0)
+    if "left_elbow" in motion.points:
+        for side in ("left", "right"):
+            s.line("violet", *(motion[f"{side}_{joint}"] for joint in ("shoulder", "elbow", "hand")), width=4.0)
+    else:
+        s.line("grey", grips[0], shoulders, grips[1], width=3.0)
+    s.circle("grey", shoulders + U.vector(0.08, 0.0, -0.2), U.x, U.z, 0.11, width=2.5, fill=0.25)
+    s.line("grey", shoulders, shoulders + U.vector(0.04, 0.0, -0.1), width=5.0)
 
 
 FIGURES: dict[type, Figure] = {WhippleBicycle: bicycle}

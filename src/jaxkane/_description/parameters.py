@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -109,9 +110,47 @@ def parameter_info(system: System | type[System]) -> dict[str, ParameterInfo]:
     return {f.name: f.metadata["jaxkane"] for f in fields if "jaxkane" in f.metadata}
 
 
+def parameters_in(part: Any, prefix: str = "") -> Iterator[tuple[str, Any, ParameterInfo]]:
+    """Name, value and what was declared of every parameter, those of parts that the system holds too: "mass",
+    "frame.mass", "links[2].mass". A parameter that is None is not there."""
+    for field in dataclasses.fields(part):
+        value, info = getattr(part, field.name), field.metadata.get("jaxkane")
+        if value is None:
+            continue
+        if info is not None:
+            yield prefix + field.name, value, info
+        elif isinstance(value, (list, tuple)):
+            for i, each in enumerate(value):
+                if isinstance(each, eqx.Module):
+                    yield from parameters_in(each, f"{prefix}{field.name}[{i}].")
+        elif isinstance(value, eqx.Module):
+            yield from parameters_in(value, f"{prefix}{field.name}.")
+
+
 def in_batches(system: System) -> list[str]:
     """Parameters that have leading axes more than they were declared with."""
-    return [n for n, info in parameter_info(system).items() if np.ndim(getattr(system, n)) > len(info.shape)]
+    return [name for name, value, info in parameters_in(system) if np.ndim(value) > len(info.shape)]
+
+
+def with_parameters(system: Any, values: Mapping[str, Any]) -> Any:
+    """The system with other values of some parameters, by the names of `parameters_in`; each part is made anew, and
+    checked as any other."""
+    own: dict[str, Any] = {name: value for name, value in values.items() if "." not in name}
+    inner: dict[str, dict[str, Any]] = {}
+    for name, value in values.items():
+        if "." in name:
+            field, _, rest = name.partition(".")
+            inner.setdefault(field, {})[rest] = value
+    for field, its in inner.items():
+        name, _, place = field.partition("[")
+        held = own.get(name, getattr(system, name))
+        if not place:
+            own[name] = with_parameters(held, its)
+            continue
+        parts = list(held)
+        parts[int(place[:-1])] = with_parameters(parts[int(place[:-1])], its)
+        own[name] = type(held)(parts)
+    return dataclasses.replace(system, **own)
 
 
 def to_float(value: Any) -> Any:

@@ -472,8 +472,24 @@ class Point:
         return point
 
     def position_from(self, other: Point) -> Vector:
-        """The vector from `other` to this point [m]."""
-        return self.position - other.position
+        """The vector from `other` to this point [m], by way of the last point that both were made from."""
+        mine, others = self._origins(), other._origins()
+        common = next((point for point in mine if any(point is each for each in others)), None)
+        if common is None:
+            return self.position - other.position
+        return self._from(common) - other._from(common)
+
+    def _origins(self) -> list[Point]:
+        """This point, the one it was made from, and so on."""
+        return [self, *([] if self._base is None else self._base._origins())]
+
+    def _from(self, origin: Point) -> Vector:
+        """The vector to this point from one of those that it was made from."""
+        if self is origin:
+            return Vector(self.velocity.frame.root, ZERO3)
+        if self._offset is None or self._base is None or self._base is origin:
+            return self.position if self._offset is None else self._offset
+        return self._base._from(origin) + self._offset
 
 
 def _own_frame(r: Vector, verb: str) -> Frame:

@@ -1,11 +1,13 @@
 """Linear systems of a few scalars, solved without leaving the scalars. Knows no mechanics.
 
 Small systems are written out (Cramer's rule up to three unknowns, L D L^T without pivoting for positive definite
-ones), which keeps exact zeros and lets a batch stay component-major; larger ones go to LAPACK.
+ones), which keeps exact zeros and lets a batch stay component-major; so are larger ones whose exact zeros let them fall
+apart into such, one after the other, as closed loops that hang on a bicycle. What is left goes to LAPACK.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -13,6 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import jax.scipy.linalg as jsl
+import numpy as np
 
 from .components import cross, dot, is_exact, is_zero, mul, sub
 from .types import Component
@@ -29,9 +32,8 @@ def solve(A: Rows, *rights: Sequence[Component]) -> list[tuple[Component, ...]]:
     if n == 0:
         return [() for _ in rights]
     if n > _CRAMER_UP_TO:
-        matrix = stack(A)
-        solution = _solved_by_lapack(matrix, jnp.stack([stack([b])[0] for b in rights], axis=-1))
-        return [tuple(solution[i, j] for i in range(n)) for j in range(len(rights))]
+        blocks = _blocks(A)
+        return _solved_by_lapack_rows(A, rights) if blocks is None else _solved_by_blocks(A, rights, blocks)
     adjugate, det = _adjugate(A)
     if is_zero(det):  # an unknown that no equation holds: no number is right, and a zero must not hide it
         return [(math.nan,) * n for _ in rights]
@@ -41,7 +43,15 @@ def solve(A: Rows, *rights: Sequence[Component]) -> list[tuple[Component, ...]]:
 
 def determinant(A: Rows) -> Component:
     """det A."""
-    return _adjugate(A)[1] if len(A) <= _CRAMER_UP_TO else _det_by_lapack(stack(A))
+    if len(A) <= _CRAMER_UP_TO:
+        return _adjugate(A)[1]
+    blocks = _blocks(A)
+    if blocks is None:
+        return _det_by_lapack(stack(A))
+    rows, columns = ([i for block in blocks for i in block[side]] for side in (0, 1))
+    sign = np.linalg.det(np.eye(len(A))[rows]) * np.linalg.det(np.eye(len(A))[columns])
+    factors = [_adjugate(_part(A, *block))[1] for block in blocks]
+    return functools.reduce(mul, factors, float(round(sign)))
 
 
 # By these names `fuse` knows that it is not the description that calls a library.
@@ -55,6 +65,66 @@ def _solved_by_lapack(matrix, rights):
 @jax.jit
 def _det_by_lapack(matrix):
     return jnp.linalg.det(matrix)
+
+
+Block = tuple[list[int], list[int]]
+
+
+def _blocks(A: Rows) -> list[Block] | None:
+    """Rows and columns of the blocks on the diagonal, where rows and columns of A can be ordered so that all entries
+    above these are exact zeros. None where a block is larger than what is written out, or A is singular by its zeros.
+    """
+    reads = np.array([[not is_zero(a) for a in row] for row in A])
+    column_of = _matched(reads)
+    if column_of is None:
+        return None
+    # Row i follows row j where it reads what j is solved for; rows that follow each other are one block.
+    follows = reads[:, column_of] | np.eye(len(A), dtype=bool)
+    for _ in range(len(A).bit_length()):
+        follows = (follows.astype(int) @ follows) > 0
+    together = follows & follows.T
+    order = sorted({tuple(np.flatnonzero(row)) for row in together}, key=lambda rows: (follows[rows[0]].sum(), rows))
+    if max(map(len, order)) > _CRAMER_UP_TO:
+        return None
+    return [([int(i) for i in rows], sorted(int(column_of[i]) for i in rows)) for rows in order]
+
+
+def _matched(reads: np.ndarray) -> list[int] | None:
+    """For every row a column of its own that it reads; None where there are not so many."""
+    owner: dict[int, int] = {}
+
+    def find(row: int, tried: set[int]) -> bool:
+        for column in map(int, np.flatnonzero(reads[row])):
+            if column not in tried:
+                tried.add(column)
+                if column not in owner or find(owner[column], tried):
+                    owner[column] = row
+                    return True
+        return False
+
+    if not all(find(row, set()) for row in range(len(reads))):
+        return None
+    return sorted(owner, key=owner.__getitem__)
+
+
+def _part(A: Rows, rows: list[int], columns: list[int]) -> Rows:
+    return [[A[i][j] for j in columns] for i in rows]
+
+
+def _solved_by_blocks(A: Rows, rights: Sequence[Sequence[Component]], blocks: list[Block]) -> list:
+    found: list[dict[int, Component]] = [{} for _ in rights]
+    for rows, columns in blocks:
+        remaining = []
+        for b, x in zip(rights, found, strict=True):
+            remaining.append([functools.reduce(sub, (mul(A[i][j], x[j]) for j in x), b[i]) for i in rows])
+        for x, solved in zip(found, solve(_part(A, rows, columns), *remaining), strict=True):
+            x.update(zip(columns, solved, strict=True))
+    return [tuple(x[j] for j in range(len(A))) for x in found]
+
+
+def _solved_by_lapack_rows(A: Rows, rights: Sequence[Sequence[Component]]) -> list:
+    solution = _solved_by_lapack(stack(A), jnp.stack([stack([b])[0] for b in rights], axis=-1))
+    return [tuple(solution[i, j] for i in range(len(A))) for j in range(len(rights))]
 
 
 def _adjugate(A: Rows) -> tuple[Rows, Component]:

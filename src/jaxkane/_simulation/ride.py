@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._common.lookup import not_there
-from .._description.parameters import parameter_info
+from .._description.parameters import parameters_in
 from .._description.system import State, System, names_of, packed, unpacked
 from .._description.units import units_of
 from .._method.checks import configuration_is_met
@@ -222,9 +222,9 @@ def _is_valid(system: System, state: State, ts: Array, signals: Any) -> Array:
     rising = jnp.all(ts[1:] >= ts[:-1]) & (ts[-1] > ts[0])
     many = eqx.filter((system, state), _is_few, inverse=True)
     others = all_finite((many, ts)) & rising & signals_are_sound(signals)
-    for name, info in parameter_info(system).items():
-        if info.positive and not _is_few(getattr(system, name)):
-            others &= jnp.all(getattr(system, name) > 0)
+    for value in _positive(system):
+        if not _is_few(value):
+            others &= jnp.all(value > 0)
     numbers, static = eqx.partition((system, state, ts[0]), eqx.is_array)
     return _is_sound(*eqx.combine(jax.lax.stop_gradient(numbers), static), others)
 
@@ -234,8 +234,12 @@ def _is_sound(system: System, state: State, t: Array, others: Array) -> Array:
     """Whether a motion can begin there, one answer from all the numbers; `others`: from those that are too many."""
     facts = [others, configuration_is_met(system, t, state.q)]
     facts += [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((system, state)) if _is_few(x)]
-    positive = [getattr(system, name) for name, info in parameter_info(system).items() if info.positive]
-    return functools.reduce(jnp.logical_and, [*facts, *(jnp.all(x > 0) for x in positive if _is_few(x))])
+    return functools.reduce(jnp.logical_and, [*facts, *(jnp.all(x > 0) for x in _positive(system) if _is_few(x))])
+
+
+def _positive(system: System) -> list[Array]:
+    """Values of the parameters that must be positive."""
+    return [value for _, value, info in parameters_in(system) if info.positive]
 
 
 def _safe(valid: Array, values: Any) -> Any:

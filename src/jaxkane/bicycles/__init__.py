@@ -1,7 +1,10 @@
 """Bicycles put together from parts: tyres, riders, steering, frames, drives, and who steers them."""
 
+from ._arms import Arms as Arms
 from ._bicycle import Bicycle as Bicycle
 from ._by_wire import SteerByWire as SteerByWire
+from ._catalogue import browser_jason as browser_jason
+from ._catalogue import toroidal as toroidal
 from ._drive import ConstantSpeed as ConstantSpeed
 from ._drive import Drag as Drag
 from ._gains import LeanSteerGains as LeanSteerGains
@@ -13,6 +16,10 @@ from ._motorcycle import sharp_motorcycle as sharp_motorcycle
 from ._part import Part as Part
 from ._path import LaneChange as LaneChange
 from ._path import PathFollower as PathFollower
+from ._rider import LeaningRider as LeaningRider
+from ._rider import Rider as Rider
+from ._rider import RigidRider as RigidRider
+from ._rider import separate_rider as separate_rider
 from ._rider_model import SequentialLoopRider as SequentialLoopRider
 from ._slip import LateralSlip as LateralSlip
 from ._slip import LongitudinalSlip as LongitudinalSlip
@@ -20,5 +27,6 @@ from ._slip import MagicFormula as MagicFormula
 from ._slip import Slip as Slip
 from ._steering import SteeringFriction as SteeringFriction
 from ._steering import SteeringMotor as SteeringMotor
+from ._trailer import Trailer as Trailer
 from ._tyre import Contact as Contact
 from ._tyre import Tyre as Tyre

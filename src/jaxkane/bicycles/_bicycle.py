@@ -7,7 +7,9 @@ rolling makes zero are speeds, and forces of the tyre stand in the place of thos
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from typing import Any, Self
 
 import equinox as eqx
@@ -19,8 +21,10 @@ from .._description.vectors import Frame, Point, Vector, inertial
 from .._scalars.components import add, mul
 from .._scalars.types import Component
 from ..catalog.bicycle import WhippleBicycle
+from ._files import as_meijaard, read_yaml
 from ._head import HeadTwist
 from ._part import Part
+from ._rider import rider_of
 from ._tyre import Contact, Tyre, rolling_speed
 
 REAR, FRONT = "rear", "front"
@@ -75,11 +79,31 @@ class Bicycle(WhippleBicycle):
             for part in _as_tuple(getattr(self, name)):
                 if not isinstance(part, Part):
                     raise TypeError(f"{type(self).__name__}: `{name}` holds a Part of jaxkane.bicycles, got {part!r}.")
+        for part in self.parts:
+            part.check(self)
 
     def with_parts(self, **parts: Any) -> Self:
         """A copy with other parts, or parameters, by the names of the fields."""
         refuse_unknown(parts, [f.name for f in dataclasses.fields(self)], f"{type(self).__name__} has no field")
         return dataclasses.replace(self, **parts)
+
+    @classmethod
+    def from_file(cls, path: str | os.PathLike[str]) -> Self:
+        """A bicycle from a file of BicycleParameters: a text file (`NAME = value+/-deviation`), or YAML by its suffix.
+
+        A YAML file may also hold a rider: a rigid one ("Moore2019", "principal"), or one who leans
+        ("MooreRiderLean2012"). The speed `v` is passed over.
+
+        **Raises:** `ValueError` that names the lines that are unknown, repeated or malformed, and what is missing.
+        """
+        if Path(path).suffix.lower() not in (".yml", ".yaml"):
+            return super().from_file(path)
+        kind, values = read_yaml(path)
+        try:
+            found, rider = as_meijaard(kind, values)
+            return cls.from_parameters(found | ({} if rider is None else {"rider": rider_of(rider)}))
+        except ValueError as error:
+            raise ValueError(f"{os.fspath(path)}: {error}") from None
 
     @property
     def parts(self) -> tuple[Part, ...]:
@@ -254,6 +278,15 @@ class Bicycle(WhippleBicycle):
     def _wheels(self, motion: Any) -> Iterator[tuple[str, Tyre, Contact, Body, Component]]:
         yield REAR, self.rear_tyre, motion.rear, motion["rear wheel"], self.rR
         yield FRONT, self.front_tyre, motion.front, motion["front wheel"], self.rF
+
+    def on_frame(self, motion: Motion, x: Component, y: Component, z: Component) -> Point:
+        """A point that is fixed in the frame B, in Meijaard's measures: from the rear contact of the upright bicycle,
+        x forward, y to the right, z down [m]."""
+        return motion["rear wheel"].center.fixed(motion["B"].vector(x, y, add(z, self.rR)))
+
+    def on_fork(self, motion: Motion, x: Component, y: Component, z: Component) -> Point:
+        """A point that is fixed in the fork, in the same measures, at zero steer."""
+        return motion["fork"].center.fixed(motion["H"].vector(x - self.xH, y, z - self.zH))
 
     def tyre_loads(self, motion: Motion) -> dict[str, Component]:
         """What the ground carries under each wheel [N], "rear" and "front", if nothing accelerated: from the moments of

@@ -49,6 +49,9 @@ class Part(eqx.Module):
     def __check_init__(self) -> None:
         check_parameters(self)
 
+    def check(self, bicycle: Bicycle) -> None:
+        """Refuse, by an error, a bicycle that this part does not fit."""
+
     def q_dot(self, bicycle: Bicycle, t: Component, q: Any, u: Any) -> Sequence[Component]:
         """Rates of the part's coordinates. By default those speeds that have the coordinates' names and "_rate"."""
         return [u[f"{name}_rate"] for name in self.coordinates]
@@ -94,7 +97,12 @@ class Part(eqx.Module):
         """Residuals that are zero in every possible configuration; `motion` is that of rest."""
         return ()
 
+    def draw(self, bicycle: Bicycle, motion: BicycleMotion, sketch: Any) -> None:
+        """Add the part to the picture of the bicycle: `sketch.line("green", motion["O"], motion["A"])`, see
+        `jaxkane.animate`."""
+
     def lateral(self) -> tuple[str, ...]:
         """Names of the part's coordinates, speeds and states that move when the bicycle leaves the upright plane: those
-        of its linear models. By default all."""
-        return (*self.coordinates, *self.speeds, *self.states)
+        of its linear models. By default all but the dependent ones."""
+        coordinates = [name for name in self.coordinates if name not in self.dependent_coordinates]
+        return (*coordinates, *self.speeds, *self.states)

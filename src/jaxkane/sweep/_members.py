@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -12,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._common.lookup import not_there
-from .._description.parameters import parameter_info
+from .._description.parameters import in_batches, parameters_in, with_parameters
 from .._description.system import State, System
 from .._method.assembly import assemble
 from .._method.checks import check_system, is_concrete
@@ -90,8 +89,8 @@ def _system(system: Any, row: Row) -> tuple[System, dict[str, Any]]:
     """The system of a row, and the parameters that were set by name."""
     if not isinstance(system, System):
         system = system(row)
-    given = {name: dict.__getitem__(row, name) for name in parameter_info(system) if name in row}
-    return replace(system, **given), given
+    given = {name: dict.__getitem__(row, name) for name, _, _ in parameters_in(system) if name in row}
+    return with_parameters(system, given), given
 
 
 def _start(system: Any, state: Any, row: Row, t: Any) -> State:
@@ -126,7 +125,8 @@ def _check(members: Tree, shared: Tree, t: Any) -> None:
     seen: list[Any] = []
     jax.eval_shape(trial, jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), members))
     system, signals, row = seen[0]
-    applied = set(row) & {*parameter_info(system), *system.coordinates, *system.speeds, *system.inputs}
+    parameters = (name for name, _, _ in parameters_in(system))
+    applied = set(row) & {*parameters, *system.coordinates, *system.speeds, *system.inputs}
     applied |= set(row) & {*system.states}
     applied -= set(system.dependent_coordinates)
     name = type(system).__name__
@@ -184,8 +184,8 @@ def _refuse_twice(columns: dict[str, Any], system: Any, inputs: Inputs) -> None:
     """A column takes the place of the one value that all members have, but not of values of their own."""
     twice = {name: "`inputs`" for name in columns if isinstance(inputs, Mapping) and name in inputs}
     if isinstance(system, System):
-        for name, info in parameter_info(system).items():
-            if name in columns and np.ndim(getattr(system, name)) > len(info.shape):
+        for name in in_batches(system):
+            if name in columns:
                 twice[name] = f"a batch of {type(system).__name__}"
     if twice:
         listed = ", ".join(f"{name} (a column of the table, and in {where})" for name, where in twice.items())
@@ -197,8 +197,7 @@ def _batches(tree: Tree) -> dict[int, str]:
     system, state, signals, columns = tree
     found = {id(column): name for name, column in columns.items()}
     if isinstance(system, System):
-        for name, info in parameter_info(system).items():
-            value = getattr(system, name)
+        for name, value, info in parameters_in(system):
             if np.ndim(value) == len(info.shape) + 1:
                 found[id(value)] = name
     if isinstance(state, State):

@@ -1,0 +1,203 @@
+"""Parameter files of the package BicycleParameters, as what a bicycle and its rider are made of. Knows numbers only.
+
+Its YAML files hold a header and `values`, or names and numbers alone. They are read strictly, without a library of
+YAML: a line that is neither is an error. Sets of names ("parameterizations") that are read:
+
+| name | holds |
+|---|---|
+| Meijaard2007, benchmark | Meijaard's names; the rider, if there is one, counted in B |
+| Moore2019, principal | a frame D and a rigid rider P, with radii of gyration about their principal axes |
+| Moore2012 | Moore (2012), *Human control of a bicycle*: the rear frame C with the rider in it |
+| MooreRiderLean2012 | the same with legs in C and a leaning upper body G |
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from .._common.lookup import hint
+
+_HEADER = ("parameterization", "parameters", "rider", "description", "values")
+
+# What a set of names is called, and one of its names that no other set has, or only a larger one before it.
+_SETS = {"MooreRiderLean2012": "ig11", "Moore2012": "ic11", "Moore2019": "kDaa", "Meijaard2007": "IBxx"}
+_CALLED = {"benchmark": "Meijaard2007", "principal": "Moore2019"}
+
+Values = dict[str, float]
+
+
+def read_yaml(path: str | os.PathLike[str]) -> tuple[str, Values]:
+    """The name of the set of parameters, and values by name, from a YAML file of BicycleParameters.
+
+    **Raises:** `ValueError` with one line for every entry that is malformed or repeated, and for a set of names that is
+    none of those above.
+    """
+    header: dict[str, str] = {}
+    values: Values = {}
+    lines: dict[str, int] = {}
+    faults: list[str] = []
+    section = ""
+    for number, line in enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1):
+        text = line if line.lstrip()[:1] != "#" else ""
+        text = text.partition(" #")[0].rstrip()
+        indented = text[:1].isspace()
+        if not text or (indented and section not in ("", "values")):  # as the lines of a description
+            continue
+        name, colon, entry = (part.strip() for part in text.partition(":"))
+        if not indented and name in _HEADER and colon:
+            section, header[name] = name, entry
+            continue
+        if not indented:
+            section = ""
+        try:
+            value = float(entry)
+        except ValueError:
+            value = math.nan
+        if not (colon and name and math.isfinite(value)):
+            faults.append(f"line {number}: {line.strip()!r} is not of the form NAME: number")
+        elif name in lines:
+            faults.append(f"line {number}: {name} was given before, on line {lines[name]}")
+        else:
+            lines[name], values[name] = number, value
+    if faults:
+        raise ValueError(f"{os.fspath(path)}: " + "; ".join(faults) + ".")
+    return _set_of(os.fspath(path), header.get("parameterization", ""), values), values
+
+
+def _set_of(path: str, given: str, values: Values) -> str:
+    kind = _CALLED.get(given, given) or next((kind for kind, name in _SETS.items() if name in values), "")
+    if kind not in _SETS:
+        said = f"the parameterization {given!r}" if given else "no parameterization, and no names of one,"
+        raise ValueError(f"{path}: {said} cannot be read; {hint([given], list(_SETS), 'those that can')}")
+    return kind
+
+
+def as_meijaard(kind: str, values: Mapping[str, float]) -> tuple[Values, Values | None]:
+    """Meijaard's parameters, and those of a rider with a body of its own, with the names of `RigidRider`, or of
+    `LeaningRider` where they hold a hinge. The speed `v` is none of either.
+
+    **Raises:** `ValueError` that names what is missing and what is unknown.
+    """
+    found = _Read(kind, values)
+    found.pop("v", 0.0)
+    converted = _CONVERSIONS[kind](found)
+    found.refuse_rest()
+    return converted
+
+
+class _Read(dict[str, float]):
+    """Parameters by name that are taken out one by one, so that what is missing or left over is told together."""
+
+    def __init__(self, kind: str, values: Mapping[str, float]):
+        super().__init__(values)
+        self.kind = kind
+        self.missing: list[str] = []
+
+    def take(self, *names: str) -> list[float]:
+        self.missing += [name for name in names if name not in self]
+        return [self.pop(name, math.nan) for name in names]
+
+    def named(self, *names: str) -> Values:
+        return dict(zip(names, self.take(*names), strict=True))
+
+    def refuse_rest(self) -> None:
+        faults = [f"missing: {', '.join(self.missing)}"] * bool(self.missing) + [f"unknown: {', '.join(self)}"] * bool(
+            self
+        )
+        if faults:
+            raise ValueError(f"the parameters of {self.kind}: {'; '.join(faults)}.")
+
+
+def _meijaard(p: _Read) -> tuple[Values, None]:
+    values = dict(p)  # whose names `WhippleBicycle.from_parameters` looks at
+    p.clear()
+    return values, None
+
+
+def _principal(p: _Read) -> tuple[Values, Values]:
+    """Moore and Hubbard (2019): radii of gyration k about principal axes a and b, a turned by alpha about y."""
+    found = p.named("w", "c", "lam", "g", "rR", "rF", "mR", "mF", "mH", "xH", "zH")
+    implied = {}  # what follows from the rest, or is zero by symmetry, and may be written out
+    for wheel in "RF":
+        implied[f"k{wheel}bb"], about_axle = p.take(f"k{wheel}aa", f"k{wheel}yy")
+        found[f"I{wheel}xx"] = found[f"m{wheel}"] * implied[f"k{wheel}bb"] ** 2
+        found[f"I{wheel}yy"] = found[f"m{wheel}"] * about_axle**2
+    found |= _named(_of_radii(p, "H", found["mH"]), "IH")
+    frame = p.named("mD", "xD", "zD")
+    found |= {f"{name[0]}B": value for name, value in frame.items()}
+    found |= _named(_of_radii(p, "D", found["mB"]), "IB")
+    mass, x, z = p.take("mP", "xP", "zP")
+    rider = {"mass": mass, "x": x, "z": z} | _named(_of_radii(p, "P", mass), "I")
+    p.take("lP", "wP")  # length and width of the rider's outline
+    implied |= {"xR": 0.0, "xF": found["w"], "zR": -found["rR"], "zF": -found["rF"], "alphaR": 0.0, "alphaF": 0.0}
+    implied |= dict.fromkeys(("yD", "yF", "yH", "yP", "yR"), 0.0)
+    for name, value in implied.items():
+        if abs(p.pop(name, value) - value) > 1e-9 * max(1.0, abs(value)):
+            raise ValueError(f"the parameters of {p.kind}: the model has {name} = {value:.6g}.")
+    return found, rider
+
+
+def _moore(p: _Read) -> tuple[Values, None]:
+    """Moore (2012): places and inertias of rear and front frame in axes of which the third is the steer axis."""
+    d1, d2, d3, rR, rF = p.take("d1", "d2", "d3", "rr", "rf")
+    # The wheels stand on one level: (d1 + d3) sin(lam) - d2 cos(lam) = rF - rR.
+    apart = math.hypot(d1 + d3, d2)
+    if abs(rF - rR) >= apart:
+        raise ValueError(f"the parameters of {p.kind}: the wheels are too near to each other to stand on the ground.")
+    lam = math.atan2(d2, d1 + d3) + math.asin((rF - rR) / apart)
+    found = {"lam": lam, "rR": rR, "rF": rF, "g": p.take("g")[0]}
+    found["w"], _ = _level(lam, d1 + d3, d2)
+    found["c"] = (rF * math.sin(lam) - d3) / math.cos(lam)
+    # C is measured from the rear wheel's centre, E from the front wheel's.
+    frames = (("c", "B", ("l1", "l2"), 0.0, -rR), ("e", "H", ("l3", "l4"), found["w"], -rF))
+    for body, letter, along, from_x, from_z in frames:
+        x, z = _level(lam, *p.take(*along))
+        found |= {f"x{letter}": from_x + x, f"z{letter}": from_z + z, f"m{letter}": p.take(f"m{body}")[0]}
+        moments = p.take(*(f"i{body}{axes}" for axes in ("11", "22", "33", "31")))
+        found |= _named(_turned(lam, *moments), f"I{letter}")
+    for body, letter in (("d", "R"), ("f", "F")):
+        taken = p.take(f"m{body}", f"i{body}11", f"i{body}22")
+        found |= dict(zip((f"m{letter}", f"I{letter}xx", f"I{letter}yy"), taken, strict=True))
+    return found, None
+
+
+def _moore_lean(p: _Read) -> tuple[Values, Values]:
+    """The same with an upper body G: its hinge is level, `d4` below the rear wheel's centre; its mass centre is `l5`
+    before that centre and `l6` below the hinge."""
+    found, _ = _moore(p)
+    d4, l5, l6 = p.take("d4", "l5", "l6")
+    hinge = d4 - found["rR"]
+    rider = {"x": l5, "z": hinge + l6, "hinge_x": 0.0, "hinge_z": hinge}
+    taken = p.take("mg", "ig11", "ig22", "ig33", "ig31", "k9", "c9")
+    return found, rider | dict(zip(("mass", "Ixx", "Iyy", "Izz", "Ixz", "stiffness", "damping"), taken, strict=True))
+
+
+def _level(lam: float, x: float, z: float) -> tuple[float, float]:
+    """Components in level axes of what has these along the axes of a frame that is tilted by `lam`."""
+    cos, sin = math.cos(lam), math.sin(lam)
+    return cos * x + sin * z, cos * z - sin * x
+
+
+def _turned(lam: float, Ixx: float, Iyy: float, Izz: float, Ixz: float) -> tuple[float, float, float, float]:
+    """Moments and product in level axes, of an inertia that is known in axes that are tilted by `lam`."""
+    cos, sin = math.cos(lam), math.sin(lam)
+    xx = cos * cos * Ixx + 2 * cos * sin * Ixz + sin * sin * Izz
+    zz = sin * sin * Ixx - 2 * cos * sin * Ixz + cos * cos * Izz
+    return xx, Iyy, zz, cos * sin * (Izz - Ixx) + (cos * cos - sin * sin) * Ixz
+
+
+def _of_radii(p: _Read, body: str, mass: float) -> tuple[float, float, float, float]:
+    aa, bb, yy, alpha = p.take(f"k{body}aa", f"k{body}bb", f"k{body}yy", f"alpha{body}")
+    return _turned(alpha, mass * aa**2, mass * yy**2, mass * bb**2, 0.0)
+
+
+def _named(moments: tuple[float, ...], prefix: str) -> Values:
+    return {prefix + axes: value for axes, value in zip(("xx", "yy", "zz", "xz"), moments, strict=True)}
+
+
+_CONVERSIONS = {
+    "Meijaard2007": _meijaard, "Moore2019": _principal, "Moore2012": _moore, "MooreRiderLean2012": _moore_lean,
+}  # fmt: skip
