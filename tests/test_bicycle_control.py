@@ -156,6 +156,16 @@ def test_a_held_speed_tells_the_torque_that_drag_takes():
 # Control
 
 
+def test_what_was_commanded_is_an_output():
+    """With what came from outside, and what each part has added: exactly."""
+    bicycle = BENCHMARK.with_parts(control=LeanSteerGains(roll=2.0), steering=SteeringMotor(limit=1e9))
+    still = straight_ahead(BENCHMARK, 3.0)
+    told = jk.outputs(bicycle, 0.0, still.q.at[0].set(0.5), still.u, {"steer_torque": 4.0, "steer_command": 3.0})
+    np.testing.assert_allclose(told["applied_steer_torque"], 4.0 - 1.0 + 3.0, rtol=1e-12)
+    assert dict(bicycle.units)["applied_steer_torque"] == "N m"
+    assert "applied_drive_torque" not in told
+
+
 def test_gains_are_those_of_the_feedback():
     """A - B K, 1e-12."""
     plain = straight(BENCHMARK, 3.0)

@@ -59,7 +59,8 @@ class Bicycle(WhippleBicycle):
     Parts are asked in this order: `rider`, `control`, `steering`, `drive`, `extra`. A class that inherits from this one
     may have fields of its own that hold parts.
 
-    The motion names what that of `WhippleBicycle` names, and the frame "H" of the fork at zero steer.
+    The motion names what that of `WhippleBicycle` names, and the frame "H" of the fork at zero steer. Inputs that parts
+    command are outputs too, with what came from outside: "applied_steer_torque".
     """
 
     rear_tyre: Tyre = eqx.field(default_factory=Tyre)
@@ -143,7 +144,7 @@ class Bicycle(WhippleBicycle):
         found |= dict.fromkeys(self._deflected(), "m")
         for part in self.parts:
             found |= part.units
-        return found
+        return found | {f"applied_{name}": found[name] for name in self.inputs if name in found}
 
     @property
     def lateral(self) -> tuple[str, ...]:
@@ -312,7 +313,7 @@ class Bicycle(WhippleBicycle):
             found |= {f"{end}_{name}_force": force for name, force in forces.items()}
         return found
 
-    def _commanded(self, t: Any, q: Any, u: Any, motion: Any, values: Mapping[str, Component]) -> dict[str, Any]:
+    def _commanded(self, t: Any, q: Any, u: Any, motion: Any, values: Mapping[str, Component]) -> Commanded:
         """Inputs and states by name, with what the parts add to the inputs."""
         values = Commanded(values)
         for part in self.parts:
@@ -321,6 +322,7 @@ class Bicycle(WhippleBicycle):
                     label = f"the inputs of {type(self).__name__}, of which {type(part).__name__} adds to this one"
                     raise not_there(name, self.inputs, label)
                 values[name] = add(values[name], command)
+                values.commanded[name] = None
         return values
 
     def loads(self, t, q, u, motion, inputs):
@@ -344,8 +346,10 @@ class Bicycle(WhippleBicycle):
         return rates
 
     def outputs(self, t, q, u, motion: Any, now):
-        now = now.with_values(self._commanded(t, q, u, motion, now))
+        given = self._commanded(t, q, u, motion, now)
+        now = now.with_values(given)
         found: dict[str, Any] = dict(self.tyre_forces(motion, now))
+        found |= {f"applied_{name}": now[name] for name in given.commanded}
         for part in self.parts:
             found |= part.outputs(self, t, q, u, motion, now)
         return found
@@ -366,7 +370,11 @@ class BicycleMotion(Motion):
 
 
 class Commanded(dict[str, Any]):
-    """Inputs and states by name, as parts receive them."""
+    """Inputs and states by name, as parts receive them; `commanded`: names of those inputs that parts add to."""
+
+    def __init__(self, values: Mapping[str, Component]):
+        super().__init__(values)
+        self.commanded: dict[str, None] = {}
 
     def __missing__(self, name: str) -> Component:
         raise not_there(name, self, "the inputs and states of this bicycle")
