@@ -46,7 +46,7 @@ def in_numbers(f: Callable[..., Any], *args: Any) -> Any:
     numbers = found and _numbers_of(found[0])
     if not numbers:
         return jax.device_get(f(*jax.tree.map(jnp.asarray, args)))
-    return jax.tree.unflatten(found[1], numbers(jax.device_get(leaves)))
+    return jax.tree.unflatten(found[1], numbers(leaves))
 
 
 def derivative_in_numbers(f: Callable[..., Any], args: Sequence[Any], directions: Sequence[Any]) -> Any:
@@ -66,7 +66,7 @@ def derivative_in_numbers(f: Callable[..., Any], args: Sequence[Any], directions
     moving = [np.asarray(dx) for dx in along if dx is not None]
     if not numbers:
         return jax.device_get(_by_jax(f, leaves, treedef, moves, moving))
-    return jax.tree.unflatten(found[1], numbers([*jax.device_get(leaves), *moving], moving[0].shape[-1:]))
+    return jax.tree.unflatten(found[1], numbers([*leaves, *moving], moving[0].shape[-1:]))
 
 
 def is_in_numbers(f: Callable[..., Any], *args: Any) -> bool:
