@@ -23,7 +23,7 @@ Run:      python examples/find_an_imu.py [--out FOLDER]
           The runs are shipped with the library (`jaxkane.data.robot_bicycle`).
 Appears:  both tables of estimates, the IMU's place with its deviation, the ratio of damping and gain with its own; and
           find_an_imu.png: the place on the bicycle, and a run.
-Takes:    about a minute and a half, half of it compilation.
+Takes:    about two minutes, half of it compilation.
 """
 
 import argparse

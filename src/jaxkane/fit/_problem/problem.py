@@ -331,7 +331,7 @@ class Linearization(eqx.Module):
 
     @property
     def costs(self) -> np.ndarray:
-        """The share of every window (W,) in the cost, without a residual's derivatives; infinite where `good` fails."""
+        """The part of every window (W,) in the cost; infinite where it is not `good`."""
         own = jnp.sum(self.blocks.R[:, :, -1] ** 2, axis=1) if self.seen.value is None else self.seen.value
         return np.where(self.good, np.asarray(own), np.inf)
 
