@@ -30,7 +30,8 @@ class LeastSquares(Optimizer):
 
     **Arguments:**
 
-    - `rtol`: stop when a step promises to lower the cost by less than this part.
+    - `rtol`: stop when a step promises to lower the cost by less than this part; or where no step lowers it, and what
+        is promised is less than a tenth of a standard error is worth.
     - `damping`: at the start; it falls where the promise is kept, and rises where it is not. Gauss-Newton is the
         fastest where the initial guess is near; a step that fails is damped until it does not.
     - `horizons`: shares of every window, such as (0.25, 0.5), that are fitted before the whole: for initial guesses
@@ -80,8 +81,19 @@ class LeastSquares(Optimizer):
             # Nielsen's rule: trust more where the promise was kept.
             damping *= max(0.1, 1 - (2 * ratio - 1) ** 3)
             return Iterate(tried, there.cost, there, jnp.asarray(damping, x.dtype))
+        if _is_settled(problem, at):
+            return "converged"
         damping = max(5 * damping, 1e-3)
         return dataclasses.replace(now, memory=jnp.asarray(damping, x.dtype)) if damping <= 1e8 else "stuck"
+
+
+def _is_settled(problem: Problem, at: Linearization) -> bool:
+    """Whether an undamped step promises no more than a tenth of a standard error is worth. Where such a step is
+    refused, errors of integration, which are no smooth function of the unknowns, hide what is left to gain."""
+    n_r, n_unknown = problem.size
+    known = problem.model.noise is not None or n_r <= n_unknown
+    variance = 1.0 if known else at.squares / (n_r - n_unknown)
+    return at.squares - float(eliminate(at.blocks, 0.0).step(0.0)[1]) <= 0.01 * variance
 
 
 def _part(problem: Problem, share: float) -> Problem:
