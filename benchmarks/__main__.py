@@ -1,6 +1,7 @@
 """How fast is jaxkane, against its peers, on this machine? One command measures all of it.
 
     right_hand_side   one evaluation for the bicycle, in a batch: SymPy's lambdify, PyDy's Cython, generated C
+    assemblies        the same for bicycles with parts, by the operation
     exported          the same as exported C: generated C
     rides             a thousand rides, and one: scipy's odeint and DOP853 around Cython and C; one and two devices
     sensitivities     all derivatives of a ride: finite differences with C
@@ -42,6 +43,7 @@ XLA, NATIVE = Setting(), Setting(native=True)
 TWO = (XLA._replace(devices=2), NATIVE._replace(devices=2))
 SETTINGS = {
     "right_hand_side": (XLA, NATIVE),
+    "assemblies": (NATIVE,),
     "exported": (NATIVE,),
     "rides": (XLA, NATIVE, *TWO),
     "sensitivities": (XLA, NATIVE),

@@ -11,6 +11,7 @@ from ._figures import Figure
 
 TITLES = {
     "right_hand_side": "One evaluation of the right-hand side",
+    "assemblies": "Bicycles with parts",
     "exported": "The right-hand side as exported C",
     "rides": "Rides of 5 s",
     "sensitivities": "Derivatives of a ride",
