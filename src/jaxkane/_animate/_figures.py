@@ -28,18 +28,22 @@ def bicycle(system: Any, motion: Motion, s: Sketch) -> None:
 
     crank, seat = at(0.40, 0.9 * rR), at(0.22, rR + 0.55)
     head = S - (0.30 + system.rF) * 0.9 * C.z  # the top of the steering head, above the crossing of the axle's height
-    low, top = head + 0.14 * C.z, head - 0.07 * C.z
+    low = head + 0.14 * C.z
     _wheel(s, rear_wheel, rR, getattr(system, "rear_tyre", None))
     _wheel(s, front_wheel, system.rF, getattr(system, "front_tyre", None))
     s.line("gold", rear, crank, low, head, seat, rear, width=3.0)
     s.line("gold", crank, seat, width=3.0)
-    s.line("blue", front, low, top, width=3.0)
+    s.line("blue", front, low, head, width=3.0)
     s.line("ink", seat + 0.1 * B.x, seat - 0.14 * B.x, width=4.0)
     hips = seat - 0.07 * B.z
     s.line("grey", crank, at(0.52, rR + 0.33), hips, width=5.0)
-    grips = [top + 0.02 * C.x + side * 0.27 * C.y for side in (-1.0, 1.0)]
     if "left_grip" in motion.points:
         grips = [motion[f"{side}_grip"].position for side in ("left", "right")]
+        top = head + (0.5 * (grips[0] + grips[1]) - head).dot(C.z) * C.z
+    else:
+        top = head - 0.07 * C.z
+        grips = [top + 0.02 * C.x + side * 0.27 * C.y for side in (-1.0, 1.0)]
+    s.line("blue", head, top, width=3.0)
     s.line("blue", grips[0], top, grips[1], width=3.5)
     if "U" in motion.frames:  # of a rider with a body of his own
         rider, U = system.rider, motion["U"]

@@ -44,7 +44,7 @@ def read_yaml(path: str | os.PathLike[str]) -> tuple[str, Values]:
         text = line if line.lstrip()[:1] != "#" else ""
         text = text.partition(" #")[0].rstrip()
         indented = text[:1].isspace()
-        if not text or (indented and section not in ("", "values")):  # as the lines of a description
+        if text in ("", "---") or (indented and section not in ("", "values")):  # as the lines of a description
             continue
         name, colon, entry = (part.strip() for part in text.partition(":"))
         if not indented and name in _HEADER and colon:
