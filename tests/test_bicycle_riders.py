@@ -244,6 +244,22 @@ def test_parameters_of_parts_are_swept_and_refused_as_those_of_the_bicycle():
         sweep(batch, start, ts, table={"rider.stiffness": stiffness})
 
 
+def test_batches_of_riders_are_left_to_their_members():
+    """A heavier and an impossible rider; arms that reach and that do not."""
+    whole = Bicycle.benchmark()
+    light = {**UPPER_BODY, "mass": 5.0, "z": -0.9, "Ixx": 0.5, "Iyy": 0.5, "Izz": 0.3}
+    riders = RigidRider(**{**light, "mass": jnp.array([5.0, 6.0, 90.0])})
+    bicycles = separate_rider(whole, riders)
+    np.testing.assert_allclose(bicycles.mB, [80.0, 79.0, -5.0], rtol=1e-15)
+    one = separate_rider(whole, RigidRider(**light))
+    np.testing.assert_allclose(bicycles.IBxx[0], one.IBxx, rtol=1e-15)
+    arms = Arms(**ARMS | {"fore_length": jnp.array([0.32, 0.02])})
+    rider = LeaningRider(**UPPER_BODY, **HINGE, shoulder=SHOULDER)
+    held = whole.with_parts(rider=rider, extra=[arms])
+    elbows = np.array(held.extra[0].posture(rider.shoulder)[2])
+    assert np.isfinite(elbows).tolist() == [True, False]
+
+
 def test_riders_that_are_none_are_refused():
     with pytest.raises(TypeError, match="hinge_z"):
         LeaningRider(**UPPER_BODY, hinge_x=0.2)

@@ -164,3 +164,13 @@ def test_a_fixed_rotation_takes_euler_parameters_of_any_norm():
     np.testing.assert_allclose(along, 0.0, atol=1e-14)
     with pytest.raises(ValueError, match="all zero"):
         N.rotate_euler((0.0, 0.0, 0.0, 0.0))
+
+
+def test_places_near_each_other_are_exact_far_from_the_origin():
+    """1e-15, a million kilometres away: from the last point that both were made from."""
+    N, O = jk.inertial()
+    away = O.fixed(1e9 * N.x)
+    A, B = away.fixed(0.1 * N.y), away.fixed(0.3 * N.x).fixed(0.2 * N.z)
+    np.testing.assert_allclose([float(x) for x in B.position_from(A).to(N)], [0.3, -0.1, 0.2], rtol=1e-15)
+    np.testing.assert_allclose([float(x) for x in away.position_from(B).to(N)], [-0.3, 0.0, -0.2], rtol=1e-15)
+    assert [float(x) for x in A.position_from(A).to(N)] == [0.0, 0.0, 0.0]

@@ -127,8 +127,8 @@ def parameters_in(part: Any, prefix: str = "") -> Iterator[tuple[str, Any, Param
             yield from parameters_in(value, f"{prefix}{field.name}.")
 
 
-def in_batches(system: System) -> list[str]:
-    """Parameters that have leading axes more than they were declared with."""
+def in_batches(system: Any) -> list[str]:
+    """Parameters of a system, or of a part of one, that have leading axes more than they were declared with."""
     return [name for name, value, info in parameters_in(system) if np.ndim(value) > len(info.shape)]
 
 

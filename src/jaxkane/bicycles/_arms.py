@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._description.bodies import Body, Torque
-from .._description.parameters import parameter
+from .._description.parameters import in_batches, parameter
 from .._description.vectors import Frame, Point
 from .._method.checks import is_concrete
 from .._scalars.components import add
@@ -88,16 +88,16 @@ class Arms(Part):
                 f"Arms need a rider with shoulders, and the rider of this {type(bicycle).__name__} is {rider!r}: "
                 "with_parts(rider=LeaningRider(..., shoulder=(x, y, z))) or RigidRider."
             )
-        if not is_concrete(bicycle):
-            return
+        if not is_concrete(self, rider) or in_batches(self) or in_batches(rider):
+            return  # members that cannot be have NaN
         reach, longest = self._reach(rider.right_shoulder), self.upper_length + self.fore_length
         distance, shortest = jnp.sqrt(reach @ reach), abs(self.upper_length - self.fore_length)
-        if np.ndim(distance) == 0 and not shortest < distance < longest:
+        if not shortest < distance < longest:
             raise ValueError(
                 f"Arms: from the shoulder to the grip it is {float(distance):.4g} m, and these arms reach from "
                 f"{float(shortest):.4g} to {float(longest):.4g} m. Change their lengths, the grips or the shoulders."
             )
-        if np.ndim(distance) == 0 and not np.all(np.isfinite(self.posture(rider.right_shoulder))):
+        if not np.all(np.isfinite(self.posture(rider.right_shoulder))):
             raise ValueError(
                 "Arms: a hand is too far aside for an elbow that bends forwards: bring `grip` and the rider's "
                 "`shoulder` closer to each other across the bicycle, or lengthen the forearm."

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._description.bodies import Body, Torque
-from .._description.parameters import parameter
+from .._description.parameters import in_batches, parameter
 from .._description.vectors import Frame, Point
 from .._method.checks import is_concrete
 from .._scalars.types import Scalar
@@ -164,7 +164,7 @@ def separate_rider(bicycle: Bicycle, rider: Rider) -> Bicycle:
     taken = _about(rider.mass, rider.x, rider.z, rider.Ixx, rider.Iyy, rider.Izz, rider.Ixz)
     rest = [a - b for a, b in zip(left, taken, strict=True)]  # about the rear contact
     Ixx, Iyy, Izz, Ixz = (a - b for a, b in zip(rest, _about(m, x, z, 0.0, 0.0, 0.0, 0.0), strict=True))
-    if is_concrete(bicycle, rider):
+    if is_concrete(bicycle, rider) and not (in_batches(bicycle) or in_batches(rider)):
         _refuse_impossible(np.array([m, Ixx, Iyy, Izz, Ixz]))
     B = {"mB": m, "xB": x, "zB": z, "IBxx": Ixx, "IByy": Iyy, "IBzz": Izz, "IBxz": Ixz}
     return bicycle.with_parts(**B, rider=rider)
