@@ -84,7 +84,8 @@ def solve(
         if more is not None:
             y_dot += packed(more)
         if constrained and settings.stabilize:
-            y_dot = y_dot.at[: state.q.size].add(settings.stabilize * correction(system, t, state.q))
+            back = settings.stabilize * correction(system, t, state.q)
+            y_dot += jnp.concatenate([back, jnp.zeros_like(y_dot[back.size :])])
         return jnp.where(valid, y_dot, jnp.zeros_like(y_dot))
 
     def trial_rates(t, y, args):
@@ -139,7 +140,10 @@ def solve(
     motion = jnp.where(reached[:, None], motion, start[None])
     end = jnp.where(valid, end, start)
     if constrained and settings.project:
-        onto = lambda t, y: y.at[: state.q.size].set(projected(system, t, y[: state.q.size]))  # noqa: E731
+
+        def onto(t: Array, y: Array) -> Array:
+            return jnp.concatenate([projected(system, t, y[: state.q.size]), y[state.q.size :]])
+
         motion, end = jax.vmap(onto)(ts, motion), onto(t_end, end)
     along = unpacked(system, motion)
     u_dep = jax.vmap(lambda t, y: _dependent_speeds(system, t, y.q, y.u, {}))(ts, along)
