@@ -13,6 +13,7 @@ import jaxkane as jk
 from jaxkane import Status
 from jaxkane._animate._figures import figure_of
 from jaxkane._animate._sketch import Sketch
+from jaxkane._description.parameters import with_parameters
 from jaxkane._method.rates import _motion_rates
 from jaxkane._scalars.fuse import _Program
 from jaxkane.bicycles import (
@@ -65,6 +66,7 @@ def linear_models(bicycle, speeds, states):
     return np.array([model.A for model in models]), np.array([model.B for model in models])
 
 
+@pytest.mark.slow
 def test_a_leaning_rider_is_that_of_bicycle_parameters(tmp_path):
     """1e-9 asked."""
     bicycle, known = leaning(tmp_path), LITERATURE["lean"]
@@ -227,21 +229,36 @@ def test_arms_need_shoulders_and_reach():
             bicycle.with_parts(**parts)
 
 
-def test_parameters_of_parts_are_swept_and_refused_as_those_of_the_bicycle():
+def small_ride():
     bicycle = Bicycle.benchmark().with_parts(rider=LeaningRider(**UPPER_BODY, **HINGE))
-    start, ts = straight_ahead(bicycle, 6.0), jnp.linspace(0.0, 0.2, 3)
-    start = jk.State(start.q.at[0].set(0.05), start.u)
-    stiffness = jnp.array([0.0, 500.0, 500.0])
-    rides = sweep(bicycle, start, ts, table={"rider.stiffness": stiffness, "rider.mass": [48.0, 48.0, -1.0]})
+    start = straight_ahead(bicycle, 6.0)
+    return bicycle, jk.State(start.q.at[0].set(0.05), start.u), jnp.linspace(0.0, 0.2, 3)
+
+
+@pytest.mark.slow
+def test_parameters_of_parts_are_swept():
+    bicycle, start, ts = small_ride()
+    table = {"rider.stiffness": [0.0, 500.0, 500.0], "rider.mass": [48.0, 48.0, -1.0]}
+    rides = sweep(bicycle, start, ts, table=table)
     assert [Status(s).name for s in rides.status] == ["COMPLETED", "COMPLETED", "INVALID"]
     lean = rides["rider_lean"][:, -1]
     assert lean[0] < 1.5 * lean[1] < 0  # to the other side, as the frame falls under him; a spring holds him
     assert np.isnan(lean[2])
+
+
+def test_parameters_of_parts_are_refused_as_those_of_the_bicycle():
+    bicycle, start, ts = small_ride()
+    stiffness = jnp.array([0.0, 500.0, 500.0])
     batch = bicycle.with_parts(rider=dataclasses.replace(bicycle.rider, stiffness=stiffness))
     with pytest.raises(ValueError, match=r"rider\.stiffness has more axes"):
         jk.accelerations(batch, 0.0, start.q, start.u)
     with pytest.raises(ValueError, match=r"rider\.stiffness \(a column of the table, and in a batch of Bicycle"):
         sweep(batch, start, ts, table={"rider.stiffness": stiffness})
+    arms = with_arms()
+    longer = with_parameters(arms, {"extra[0].fore_length": 0.35, "rider.mass": 40.0, "mB": 50.0})
+    assert [float(x) for x in (longer.extra[0].fore_length, longer.rider.mass, longer.mB)] == [0.35, 40.0, 50.0]
+    with pytest.raises(ValueError, match="these arms reach"):
+        with_parameters(arms, {"extra[0].fore_length": 0.01})
 
 
 def test_batches_of_riders_are_left_to_their_members():
