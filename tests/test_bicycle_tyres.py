@@ -5,12 +5,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import jaxkane as jk
 from jaxkane import Scalar, parameter
 from jaxkane.bicycles import (
     Bicycle,
     HeadTwist,
     LateralSlip,
+    LongitudinalSlip,
     Part,
+    Road,
+    Slope,
     Tyre,
     sharp_motorcycle,
 )
@@ -104,3 +108,62 @@ def test_modes_of_tyres_and_frame_have_names():
     assert frequency["capsize"] == frequency["castering"] == 0.0
     assert frequency["weave"] < 6.0 < 40.0 < frequency["wobble"] < 50.0 < frequency["front end"]
     np.testing.assert_allclose(jnp.max(found["wobble"].real), 3.25, atol=0.01)  # it grows
+
+
+LEANING = {"roll": 0.2, "steer": 0.15, "yaw": 0.3, "x": 0.5, "y": -0.2}
+MOVING = {"roll_rate": 0.3, "rear_wheel_rate": -16.0, "steer_rate": -0.4}
+
+
+def test_a_road_that_rises_evenly_is_a_slope():
+    """1e-12. Its normal is the same everywhere; gravity is tilted against it."""
+    slope = Bicycle.benchmark().with_parts(road=Slope(jnp.arctan(0.1)))
+    road = Bicycle.benchmark().with_parts(road=Road(lambda x, y: 0.1 * x))
+    along = np.sqrt(1.01)  # x of the road is horizontal
+
+    def found(bicycle, **place):
+        start = jk.assemble(bicycle, LEANING | place, MOVING)
+        return jk.accelerations(bicycle, 0.0, start.q, start.u)
+
+    np.testing.assert_allclose(found(road, x=0.5 / along), found(slope), rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_flat_road_is_level_ground():
+    """1e-12, a torus that slips behind, a knife edge that rolls before."""
+    tyre = Tyre(crown=0.03, lateral=LateralSlip(9000.0, 900.0), longitudinal=LongitudinalSlip(2e4))
+    level = Bicycle.benchmark().with_parts(rear_tyre=tyre, front_tyre=tyre)
+    flat = level.with_parts(road=Road(lambda x, y: 0.0))
+
+    def found(bicycle):
+        start = jk.assemble(bicycle, LEANING, MOVING | {"front_lateral_slip": 0.02, "rear_longitudinal_slip": -0.1})
+        return jk.accelerations(bicycle, 0.0, start.q, start.u), jk.dependent_speeds(bicycle, 0.0, start.q, start.u)
+
+    (a, u), (a_level, u_level) = found(flat), found(level)
+    np.testing.assert_allclose(a, a_level, rtol=1e-12, atol=1e-11)
+    np.testing.assert_allclose(u[:3], u_level, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_energy_is_kept_over_a_bump_and_the_wheels_stay_on_it():
+    """1e-8 of the energy, 1e-8 m; 5 cm high, half a metre long, crossed at an angle with toroidal tyres."""
+    bump = Road(lambda x, y: 0.05 * jnp.exp(-(((x - 2.0) / 0.5) ** 2)) * (1.0 + 0.2 * jnp.sin(y)))
+    bicycle = Bicycle.benchmark().with_parts(road=bump, rear_tyre=Tyre(crown=0.03), front_tyre=Tyre(crown=0.02))
+    start = jk.assemble(bicycle, {"roll": 0.05, "steer": 0.02}, {"rear_wheel_rate": -5.0 / 0.3})
+    ride = jk.simulate(bicycle, start, jnp.linspace(0.0, 0.6, 41), rtol=1e-10, atol=1e-11)
+    kept = jk.audit(bicycle, ride)
+    assert float(jnp.max(ride["pitch"]) - jnp.min(ride["pitch"])) > 0.05
+    assert kept.reason == "completed"
+    assert kept.energy_balance < 1e-8
+    assert kept.drift < 1e-8
+
+
+@pytest.mark.slow
+def test_a_step_in_the_road_ends_the_ride():
+    """A kerb of 20 cm that is narrower than the solver's steps, and a start from where the wheel is in it."""
+    kerb = Bicycle.benchmark().with_parts(road=Road(lambda x, y: 0.1 * (1.0 + jnp.tanh((x - 2.5) / 0.02))))
+    start = jk.assemble(kerb, {}, {"rear_wheel_rate": -5.0 / 0.3})
+    ride = jk.simulate(kerb, start, jnp.linspace(0.0, 1.0, 21))
+    assert ride.reason == "wheel touches twice"
+    assert 2.0 < float(jnp.nanmax(ride["front_x"])) < 2.3  # a third of a metre before the kerb
+    with pytest.raises(ValueError, match="satisfies the configuration constraints"):
+        jk.assemble(kerb, {"x": 2.3 - 1.02})

@@ -11,6 +11,9 @@ from ._gains import LeanSteerGains as LeanSteerGains
 from ._gains import ScheduledGains as ScheduledGains
 from ._gains import follow_gain as follow_gain
 from ._gains import lqr as lqr
+from ._ground import Ground as Ground
+from ._ground import Road as Road
+from ._ground import Slope as Slope
 from ._head import HeadTwist as HeadTwist
 from ._motorcycle import sharp_motorcycle as sharp_motorcycle
 from ._part import Part as Part

@@ -18,16 +18,19 @@ import jax.numpy as jnp
 from .._common.lookup import not_there, refuse_unknown
 from .._description.bodies import Body, Motion
 from .._description.vectors import Frame, Point, Vector, inertial
-from .._scalars.components import add, mul
+from .._scalars.components import add
 from .._scalars.types import Component
 from ..catalog.bicycle import WhippleBicycle
 from ._files import as_meijaard, read_yaml
+from ._ground import Ground
 from ._head import HeadTwist
 from ._part import Part
 from ._rider import rider_of
 from ._tyre import Contact, Tyre, rolling_speed
 
 REAR, FRONT = "rear", "front"
+OFF_ROAD = 1e-3
+"""[m]: a motion over a `Road` ends where a contact is further from it than that."""
 _ASIDE = ("_lateral_slip", "_lateral_deflection")
 
 
@@ -56,6 +59,10 @@ class Bicycle(WhippleBicycle):
     - `head`: `HeadTwist`, a frame that gives way in torsion at the steering head.
     - `rider`, `control`, `steering`, `drive`: a `Part` each, or several in a tuple. `extra`: any more.
 
+    - `road`: a `Slope`, or a `Road` of given height; by default level ground. On a `Road` the place of the front
+        contact and the height of the rear one are coordinates too, "front_x", "front_y" and "rear_height" [m]; yaw,
+        roll and pitch begin at its tangent plane.
+
     Parts are asked in this order: `rider`, `control`, `steering`, `drive`, `extra`. A class that inherits from this one
     may have fields of its own that hold parts.
 
@@ -71,9 +78,11 @@ class Bicycle(WhippleBicycle):
     steering: Part | tuple[Part, ...] | None = None
     drive: Part | tuple[Part, ...] | None = None
     extra: tuple[Part, ...] = eqx.field(default=(), converter=_as_tuple)
+    road: Ground = eqx.field(default_factory=Ground)
 
     def __check_init__(self) -> None:
-        for name, kind in (("rear_tyre", Tyre), ("front_tyre", Tyre), ("head", HeadTwist | None)):
+        kinds = (("rear_tyre", Tyre), ("front_tyre", Tyre), ("head", HeadTwist | None), ("road", Ground))
+        for name, kind in kinds:
             if not isinstance(getattr(self, name), kind):
                 raise TypeError(f"{type(self).__name__}: `{name}` is a {_called(kind)}, got {getattr(self, name)!r}.")
         for name in ("rider", "control", "steering", "drive", "extra"):
@@ -114,7 +123,7 @@ class Bicycle(WhippleBicycle):
 
     @property
     def coordinates(self) -> tuple[str, ...]:
-        return (*WhippleBicycle.coordinates, *self._of_parts("coordinates"))
+        return (*WhippleBicycle.coordinates, *self._of_road(), *self._of_parts("coordinates"))
 
     @property
     def speeds(self) -> tuple[str, ...]:
@@ -124,11 +133,11 @@ class Bicycle(WhippleBicycle):
 
     @property
     def dependent_speeds(self) -> tuple[str, ...]:
-        return (*WhippleBicycle.dependent_speeds, *self._of_parts("dependent_speeds"))
+        return (*WhippleBicycle.dependent_speeds, *self._of_front(), *self._of_parts("dependent_speeds"))
 
     @property
     def dependent_coordinates(self) -> tuple[str, ...]:
-        return (*WhippleBicycle.dependent_coordinates, *self._of_parts("dependent_coordinates"))
+        return (*WhippleBicycle.dependent_coordinates, *self._of_road(), *self._of_parts("dependent_coordinates"))
 
     @property
     def inputs(self) -> tuple[str, ...]:
@@ -141,7 +150,7 @@ class Bicycle(WhippleBicycle):
     @property
     def units(self) -> Mapping[str, str]:
         found = {**WhippleBicycle.units, **dict.fromkeys(self._slips(), "m/s")}
-        found |= dict.fromkeys(self._deflected(), "m")
+        found |= dict.fromkeys((*self._deflected(), *self._of_road()), "m") | dict.fromkeys(self._of_front(), "m/s")
         for part in self.parts:
             found |= part.units
         return found | {f"applied_{name}": found[name] for name in self.inputs if name in found}
@@ -169,6 +178,17 @@ class Bicycle(WhippleBicycle):
         found |= dict(zip(("wobble", "front end"), [names for names in elastic if names], strict=False))
         return {name: names for name, names in found.items() if names}
 
+    def _of_road(self) -> tuple[str, ...]:
+        """Names of the coordinates that a road of given height brings."""
+        return ("front_x", "front_y", "rear_height") if self.road.curved else ()
+
+    def _of_front(self) -> tuple[str, ...]:
+        """Names of the speeds of the front contact's place."""
+        return ("front_x_rate", "front_y_rate") if self.road.curved else ()
+
+    def _front_place(self, q: Any) -> tuple[Component, Component]:
+        return (q["front_x"], q["front_y"]) if self.road.curved else (0.0, 0.0)
+
     def _of_parts(self, kind: str) -> tuple[str, ...]:
         return tuple(name for part in self.parts for name in getattr(part, kind))
 
@@ -188,10 +208,11 @@ class Bicycle(WhippleBicycle):
         return along, 0.0 if tyre.lateral is None else u[f"{end}_lateral_slip"]
 
     def q_dot(self, t, q, u):
-        forward, aside = self._contact_rates(q, u)
         turning = [u[f"{part}_rate"] for part in ("roll", "rear_wheel", "steer", "yaw", "pitch", "front_wheel")]
-        cos, sin = jnp.cos(q["yaw"]), jnp.sin(q["yaw"])
-        moving = [add(mul(forward, cos), mul(-1.0, mul(aside, sin))), add(mul(forward, sin), mul(aside, cos))]
+        moving = list(self._place_rates(q, u))
+        if self.road.curved:
+            climbing = self.road.climbing(q["x"], q["y"], self._place_rates(q, u))
+            moving += [*(u[name] for name in self._of_front()), climbing]
         return (*turning, *moving, *(rate for part in self.parts for rate in part.q_dot(self, t, q, u)))
 
     @property
@@ -201,6 +222,9 @@ class Bicycle(WhippleBicycle):
         cos, sin = jnp.cos(self.lam), jnp.sin(self.lam)
         x = (self.w + self.c) * cos * cos - self.rR * sin * cos
         return x, -self.rR - x * sin / cos
+
+    def _place_rates(self, q: Any, u: Any) -> tuple[Component, Component]:
+        return self.road.rates(q["x"], q["y"], q["yaw"], *self._contact_rates(q, u))
 
     def _contact_rates(self, q: Any, u: Any) -> tuple[Component, Component]:
         """Velocities of the place of the rear contact on the ground, forward and to the right [m/s].
@@ -214,7 +238,8 @@ class Bicycle(WhippleBicycle):
 
     def motion(self, t, q, u):
         N, O = inertial()
-        Y = N.rotate(3, q["yaw"], u["yaw_rate"], "Y")
+        T = self.road.tangent(N, q["x"], q["y"], lambda: self._place_rates(q, u))
+        Y = T.rotate(3, q["yaw"], u["yaw_rate"], "Y")
         R = Y.rotate(1, q["roll"], u["roll_rate"], "R")
         B = R.rotate(2, q["pitch"], u["pitch_rate"], "B")  # rear frame
         tilted = B.rotate(2, self.lam, 0.0, "tilt")
@@ -223,7 +248,9 @@ class Bicycle(WhippleBicycle):
         omega_A = B.angular_velocity + u["rear_wheel_rate"] * B.y
         along, across = self._slip(REAR, u)
         place = q["x"] * N.x + q["y"] * N.y
-        r_P_A = -self.rear_tyre.reach(R.z, N.z, self.rR)
+        if self.road.curved:
+            place = place - q["rear_height"] * N.z
+        r_P_A = -self.rear_tyre.reach(R.z, T.z, self.rR)
         P = Point(Y.vector(along, across, 0.0), O, place)  # of the tyre
         G_A = Point(P.velocity + omega_A.cross(r_P_A), P, r_P_A)
         G_B = G_A.fixed(self.xB * B.x + (self.zB + self.rR) * B.z)
@@ -239,9 +266,10 @@ class Bicycle(WhippleBicycle):
         G_C = S.fixed(from_S(self.xH, self.zH))
         G_D = S.fixed(from_S(self.w, -self.rF))
         omega_D = C.angular_velocity + u["front_wheel_rate"] * C.y
-        n1, _, n3 = N.z.components_in(C)
+        normal = self.road.normal(N, *self._front_place(q))
+        n1, _, n3 = normal.components_in(C)
         down = C.vector(n1, 0.0, n3).normalize()  # in the plane of the front wheel
-        r_D_Q = self.front_tyre.reach(down, N.z, self.rF)
+        r_D_Q = self.front_tyre.reach(down, normal, self.rF)
         Q = Point(G_D.velocity + omega_D.cross(r_D_Q), G_D, r_D_Q)
 
         A_inertia = (self.IRxx, self.IRyy, self.IRxx)
@@ -257,24 +285,43 @@ class Bicycle(WhippleBicycle):
         frames = {"Y": Y, "B": B, "C": C, "H": H}
         motion = BicycleMotion(bodies, points={"P": P, "Q": Q, "S": S}, frames=frames)
         forward, _ = self._contact_rates(q, u)
-        motion.rear = Contact(P, Y.x, Y.y, N.z, q["roll"], forward, (along, across))
-        motion.front = self._front_contact(Q, C, down, omega_D, u)
-        motion = motion.extended((), self.front_tyre.residuals(motion.front))
+        motion.rear = Contact(P, Y.x, Y.y, T.z, R.z, q["roll"], forward, (along, across))
+        motion.front, residuals = self._front_contact(Q, C, down, normal, q, u)
+        motion = motion.extended((), residuals)
         for part in self.parts:
             motion = part.motion(self, motion, t, q, u)
         return motion
 
-    def _front_contact(self, Q: Point, C: Frame, down: Vector, omega_D: Vector, u: Any) -> Contact:
-        N, tyre = C.root, self.front_tyre
-        if tyre.rolls and tyre.rolling_resistance is None:  # what follows is not asked for
-            return Contact(Q, C.x, C.y, N.z, 0.0, 0.0, (0.0, 0.0))
-        heading = C.y.cross(N.z).normalize()
-        sin_camber, cos_camber = C.y.dot(N.z), down.dot(N.z)
-        turning = omega_D.dot(down) / cos_camber  # about the ground's normal; the rest of omega_D is spin and camber
-        spin = omega_D.dot(C.y) - turning * sin_camber
-        slip = self._slip(FRONT, u)
-        speed = rolling_speed(tyre, spin, cos_camber, self.rF, slip[0])
-        return Contact(Q, heading, N.z.cross(heading), N.z, jnp.arctan2(sin_camber, cos_camber), speed, slip)
+    def _front_contact(
+        self, Q: Point, C: Frame, down: Vector, normal: Vector, q: Any, u: Any
+    ) -> tuple[Contact, list[Any]]:
+        """The front contact, and what is zero there [m/s].
+
+        The wheel's plane and the ground meet along the heading. As its normal n turns, and the fork with omega, the
+        wheel spins against its contact with the front wheel's rate + (omega . across - heading . n_dot) / cos(camber),
+        and the camber grows with omega . heading + (axle . n_dot) / cos(camber).
+        """
+        tyre, slip = self.front_tyre, self._slip(FRONT, u)
+        if tyre.rolls and tyre.rolling_resistance is None and not self.road.curved:  # what follows is not asked for
+            contact = Contact(Q, C.x, C.y, normal, down, 0.0, 0.0, slip)
+            return contact, tyre.residuals(contact)
+        heading = C.y.cross(normal).normalize()
+        across = normal.cross(heading)
+        sin_camber, cos_camber = C.y.dot(normal), down.dot(normal)
+        spin = u["front_wheel_rate"] + C.angular_velocity.dot(across) / cos_camber
+        if not self.road.curved:
+            speed = rolling_speed(tyre, spin, cos_camber, self.rF, slip[0])
+            contact = Contact(Q, heading, across, normal, down, jnp.arctan2(sin_camber, cos_camber), speed, slip)
+            return contact, tyre.residuals(contact)
+        at = (u["front_x_rate"], u["front_y_rate"])
+        turning = self.road.normal_rate(C.root, q["front_x"], q["front_y"], at)
+        speed = rolling_speed(tyre, spin - turning.dot(heading) / cos_camber, cos_camber, self.rF, slip[0])
+        aside = slip[1]
+        if tyre.crown is not None:
+            aside = aside + tyre.crown * (C.angular_velocity.dot(heading) + turning.dot(C.y) / cos_camber)
+        contact = Contact(Q, heading, across, normal, down, jnp.arctan2(sin_camber, cos_camber), speed, slip)
+        moved = self.road.velocity(C.root, q["front_x"], q["front_y"], at)
+        return contact, [*tyre.residuals(contact), moved.dot(heading) - speed, moved.dot(across) - aside]
 
     def _wheels(self, motion: Any) -> Iterator[tuple[str, Tyre, Contact, Body, Component]]:
         yield REAR, self.rear_tyre, motion.rear, motion["rear wheel"], self.rR
@@ -289,17 +336,18 @@ class Bicycle(WhippleBicycle):
         """A point that is fixed in the fork, in the same measures, at zero steer."""
         return motion["fork"].center.fixed(motion["H"].vector(x - self.xH, y, z - self.zH))
 
-    def tyre_loads(self, motion: Motion) -> dict[str, Component]:
+    def gravity(self, N: Frame) -> Vector:
+        return self.road.gravity(self.g, N)
+
+    def tyre_loads(self, motion: Any) -> dict[str, Component]:
         """What the ground carries under each wheel [N], "rear" and "front", if nothing accelerated: from the moments of
         all weights about the contacts."""
-        gravity, N, Y = self.g * motion.N.z, motion.N, motion["Y"]
-        P = motion["P"]
+        gravity, Y, P = self.gravity(motion.N), motion["Y"], motion["P"]
         moments = [body.center.position_from(P).cross(body.mass * gravity).dot(Y.y) for body in motion.bodies]
-        apart = motion["Q"].position_from(P).cross(N.z).dot(Y.y)
-        front = sum(moments[1:], moments[0]) / apart
+        front = sum(moments[1:], moments[0]) / motion["Q"].position_from(P).cross(motion.front.normal).dot(Y.y)
         masses = [body.mass for body in motion.bodies]
-        total = sum(masses[1:], masses[0]) * gravity.dot(N.z)
-        return {REAR: total - front, FRONT: front}
+        total = sum(masses[1:], masses[0]) * gravity.dot(motion.rear.normal)
+        return {REAR: total - front * motion.front.normal.dot(motion.rear.normal), FRONT: front}
 
     def _deflections(self, end: str, tyre: Tyre, values: Any) -> dict[str, Component]:
         return {name: values[f"{end}_{name}_deflection"] for name in tyre.deflects}
@@ -356,8 +404,37 @@ class Bicycle(WhippleBicycle):
 
     def configuration_constraints(self, t, q):
         motion = self.motion(t, q, (0.0,) * (len(self.speeds) + len(self.dependent_speeds)))
-        height = motion["Q"].position.dot(motion.N.z)  # of the front contact, downwards
-        return [height, *(x for part in self.parts for x in part.configuration_constraints(self, t, q, motion))]
+        held = self._off_road(motion, q)
+        if self.road.curved:
+            there = sum(x * x for x in held) < (1e-3 * OFF_ROAD) ** 2  # not on the way of a solver
+            refused = there & (self._clearance(motion) <= 0.0)
+            held = [jnp.where(refused, jnp.nan, x) for x in held]
+        return [*held, *(x for part in self.parts for x in part.configuration_constraints(self, t, q, motion))]
+
+    def _off_road(self, motion: Motion, q: Any) -> list[Component]:
+        """How far the contacts are from the ground [m]."""
+        Q, N = motion["Q"].position, motion.N
+        if not self.road.curved:
+            return [Q.dot(N.z)]
+        front = Q - self.road.place(N, *self._front_place(q))
+        return [*(front.dot(axis) for axis in (N.x, N.y, N.z)), q["rear_height"] - self.road.at(q["x"], q["y"])]
+
+    def _clearance(self, motion: Any) -> Component:
+        """Of both wheels, see `Road.clearance`."""
+        room = [
+            self.road.clearance(motion.N, contact, wheel.center, radius, tyre.crown)
+            for _, tyre, contact, wheel, radius in self._wheels(motion)
+        ]
+        return jnp.minimum(*room)
+
+    def events(self, t, q, u):
+        found = super().events(t, q, u)
+        if not self.road.curved:
+            return found
+        at_rest = self.motion(t, q, (0.0,) * (len(self.speeds) + len(self.dependent_speeds)))
+        # An edge that is narrower than a step of the solver shows by what is off the road after it.
+        on_road = 1.0 - sum(x * x for x in self._off_road(at_rest, q)) / OFF_ROAD**2
+        return {**found, "wheel_touches_twice": self._clearance(at_rest), "wheel_off_the_road": on_road}
 
 
 class BicycleMotion(Motion):

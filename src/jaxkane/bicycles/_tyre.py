@@ -22,6 +22,7 @@ class Contact(NamedTuple):
 
     - `point`: of the tyre, at the contact; its velocity is that of slip.
     - `heading`, `across`, `normal`: unit vectors; along the wheel's plane and across it in the ground, and downwards.
+        `down`: in the wheel's plane, from its centre towards the ground.
     - `camber` [rad]: the wheel's inclination, positive to the right. `speed` [m/s]: of the contact along `heading`.
     - `slip` [m/s]: the velocity of `point` along `heading` and `across`.
     """
@@ -30,6 +31,7 @@ class Contact(NamedTuple):
     heading: Vector
     across: Vector
     normal: Vector
+    down: Vector
     camber: Component
     speed: Component
     slip: tuple[Component, Component]

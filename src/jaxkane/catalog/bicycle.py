@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from .._description.bodies import Body, Motion, Torque, weight
 from .._description.parameters import parameter, parameter_info
 from .._description.system import System
-from .._description.vectors import Point, inertial
+from .._description.vectors import Frame, Point, Vector, inertial
 from .._scalars.types import Scalar
 from ._bicycle_file import read_bicycle_file
 from ._entry import entry
@@ -207,11 +207,15 @@ class WhippleBicycle(System):
         wheel, frame, fork = (motion[name] for name in ("rear wheel", "rear frame", "fork"))
         steer_torque = inputs["steer_torque"] - self.steer_damping * u["steer_rate"]
         return (
-            weight(motion, self.g * motion.N.z),
+            weight(motion, self.gravity(motion.N)),
             Torque(inputs["roll_torque"] * motion["Y"].x, frame),
             Torque(inputs["drive_torque"] * motion["B"].y, wheel, reaction_on=frame),
             Torque(steer_torque * motion["C"].z, fork, reaction_on=frame),
         )
+
+    def gravity(self, N: Frame) -> Vector:
+        """[m/s^2]; `N` is the inertial frame, its z square to the ground."""
+        return self.g * N.z
 
     def configuration_constraints(self, t, q):
         motion = self.motion(t, q, (0.0,) * (len(self.speeds) + len(self.dependent_speeds)))

@@ -1,0 +1,182 @@
+"""What a bicycle rides on: the level, a slope, a road given by its height. Knows surfaces; knows no wheel.
+
+The inertial frame N has x and y along the ground and z downwards. On a slope it belongs to the plane of the road, so
+that gravity is tilted; on a road of given height N.z is vertical.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._description.parameters import learned, parameter
+from .._description.vectors import Frame, Point, Vector
+from .._scalars.components import add, mul
+from .._scalars.types import Component, Scalar
+from ._part import check_parameters
+
+if TYPE_CHECKING:
+    from ._tyre import Contact
+
+Pair = tuple[Component, Component]
+_LOOK = np.outer([-1.0, 1.0], np.linspace(0.05, 1.5, 30)).ravel()  # [rad] from the contact
+
+
+class Ground(eqx.Module):
+    """Level ground, which is the base of all others."""
+
+    curved = False
+    """Whether its normal depends on the place. Then the place of the front contact is a coordinate of its own."""
+
+    def __check_init__(self) -> None:
+        check_parameters(self)
+
+    def gravity(self, g: Component, N: Frame) -> Vector:
+        """[m/s^2]"""
+        return g * N.z
+
+    def place(self, N: Frame, x: Component, y: Component) -> Vector:
+        """From the origin to the point of the ground at x, y [m]."""
+        return x * N.x + y * N.y
+
+    def normal(self, N: Frame, x: Component, y: Component) -> Vector:
+        """The unit vector square to the ground, downwards."""
+        return N.z
+
+    def rates(self, x: Component, y: Component, yaw: Component, forward: Component, aside: Component) -> Pair:
+        """Rates of x and y of a point that moves on the ground along the heading `yaw` and to its right [m/s]."""
+        cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+        return add(mul(forward, cos), mul(-1.0, mul(aside, sin))), add(mul(forward, sin), mul(aside, cos))
+
+    def tangent(self, N: Frame, x: Component, y: Component, rates: Callable[[], Pair]) -> Frame:
+        """A frame with z square to the ground at a point, its x in a plane with N.x and N.z, as that point moves."""
+        return N
+
+    # What follows is asked of a curved road only.
+
+    def at(self, x: Component, y: Component) -> Any:
+        """The height [m]."""
+        raise NotImplementedError
+
+    def climbing(self, x: Component, y: Component, rates: Pair) -> Component:
+        """The rate of the height of a point that moves on the road [m/s]."""
+        raise NotImplementedError
+
+    def velocity(self, N: Frame, x: Component, y: Component, rates: Pair) -> Vector:
+        """Of a point that stays on the road [m/s]."""
+        raise NotImplementedError
+
+    def normal_rate(self, N: Frame, x: Component, y: Component, rates: Pair) -> Vector:
+        """How the normal turns as its point moves [1/s]."""
+        raise NotImplementedError
+
+    def clearance(self, N: Frame, contact: Contact, center: Point, radius: Any, crown: Any) -> Component:
+        """How high a wheel is above the road beside its contact, over what it would be above its tangent plane.
+
+        The least of some places along its tread; not positive where it does not fit.
+        """
+        raise NotImplementedError
+
+
+class Slope(Ground):
+    """A plane that rises.
+
+    **Arguments:** `angle` [rad] by which it rises, `towards` the direction in it [rad] in which it does, as a yaw: 0
+    along x, pi/2 along y.
+    """
+
+    angle: Scalar = parameter(unit="rad")
+    towards: Scalar = parameter(0.0, unit="rad")
+
+    def gravity(self, g, N):
+        uphill = N.vector(jnp.cos(self.towards), jnp.sin(self.towards), 0.0)
+        return g * (jnp.cos(self.angle) * N.z - jnp.sin(self.angle) * uphill)
+
+
+class Road(Ground):
+    """A road whose height is a smooth function of the place.
+
+        Road(lambda x, y: 0.05 * jnp.exp(-(((x - 3.0) / 0.5) ** 2)))
+
+    A wheel touches it at one point, where it is tangent to it. Where a wheel does not fit, before an edge or in a
+    hollow that is sharper than itself, a motion ends with the reason "wheel touches twice", or "wheel off the road"
+    where a step of the solver went over an edge; a state there is refused.
+
+    **Arguments:** `height`: x, y [m] -> upwards [m], by jax.numpy; or a pytree that can be called, whose arrays are
+    parameters, such as an equinox module.
+    """
+
+    height: Any = learned()
+
+    curved = True
+
+    def at(self, x: Component, y: Component) -> Any:
+        """The height [m], an array of no dimensions."""
+        z = jnp.asarray(self.height(x, y), float)
+        if z.shape != ():
+            raise ValueError(f"Road: `height` gives one number [m] for a place x, y; got an array of shape {z.shape}.")
+        return z
+
+    def slopes(self, x: Any, y: Any) -> tuple[Any, Any]:
+        """dh/dx and dh/dy."""
+        x, y = jnp.asarray(x, float), jnp.asarray(y, float)
+        one = jnp.ones((), x.dtype)
+        along_x, along_y = ((one, 0.0 * one), (0.0 * one, one))
+        return jax.jvp(self.at, (x, y), along_x)[1], jax.jvp(self.at, (x, y), along_y)[1]
+
+    def place(self, N, x, y):
+        return x * N.x + y * N.y - self.at(x, y) * N.z
+
+    def climbing(self, x: Component, y: Component, rates: Pair) -> Component:
+        """The rate of the height of a point that moves on the road [m/s]."""
+        a, b = self.slopes(x, y)
+        return a * rates[0] + b * rates[1]
+
+    def velocity(self, N, x, y, rates):
+        return N.vector(rates[0], rates[1], -self.climbing(x, y, rates))
+
+    def normal(self, N, x, y):
+        a, b = self.slopes(x, y)
+        return N.vector(a, b, 1.0).normalize()
+
+    def normal_rate(self, N, x, y, rates):
+        (a, b), (a_dot, b_dot) = self._along(self.slopes, x, y, rates)
+        length = jnp.sqrt(a * a + b * b + 1.0)
+        n, change = N.vector(a, b, 1.0) / length, N.vector(a_dot, b_dot, 0.0) / length
+        return change - n.dot(change) * n
+
+    def rates(self, x, y, yaw, forward, aside):
+        a, b = self.slopes(x, y)
+        length, of_x = jnp.sqrt(a * a + b * b + 1.0), jnp.sqrt(a * a + 1.0)
+        cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+        along = (forward * cos - aside * sin) / of_x  # along x of the tangent frame, seen from above
+        across = (forward * sin + aside * cos) / (length * of_x)
+        return along - across * a * b, across * of_x**2
+
+    def tangent(self, N, x, y, rates):
+        (turn, tilt), (turn_rate, tilt_rate) = self._along(self._angles, x, y, rates())
+        return N.rotate(2, turn, turn_rate).rotate(1, tilt, tilt_rate, "tangent")
+
+    def clearance(self, N, contact, center, radius, crown):
+        inner = radius if crown is None else radius - crown
+        middle = center.position if crown is None else center.position + crown * contact.normal
+        cos, sin = jnp.cos(_LOOK), jnp.sin(_LOOK)
+        places = [
+            m + inner * (cos * d + sin * h)
+            for m, d, h in zip(*(v.components_in(N) for v in (middle, contact.down, contact.heading)), strict=True)
+        ]
+        above = -(places[2] + jax.vmap(self.at)(*places[:2]))
+        return jnp.min(above / (inner * (1.0 - cos)))
+
+    def _angles(self, x: Any, y: Any) -> tuple[Any, Any]:
+        a, b = self.slopes(x, y)
+        return jnp.arctan(a), -jnp.arctan(b / jnp.sqrt(1.0 + a * a))
+
+    def _along(self, f: Callable[..., Any], x: Any, y: Any, rates: Pair) -> Any:
+        at, moving = ([jnp.asarray(each, float) for each in pair] for pair in ((x, y), rates))
+        return jax.jvp(f, at, moving)
