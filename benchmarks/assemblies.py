@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import functools
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,12 +15,15 @@ import jaxkane as jk
 from jaxkane._method.now import _packed_rates, packed_rates
 from jaxkane.bicycles import Bicycle, LateralSlip, LeaningRider, SteeringMotor, Tyre, separate_rider
 
+from ._bicycle import agree
 from ._figures import Figure
+from ._peers import here
 from ._process import Setting
 from ._timing import in_turns
 
 N = 4096
 SPEED = 5.0  # [m/s]
+WHIPPLE, FULL, SYMPY = "the Whipple bicycle", "rider, tyres and motor", "the same, SymPy's C"
 
 
 def assemblies() -> dict[str, jk.System]:
@@ -34,11 +40,11 @@ def assemblies() -> dict[str, jk.System]:
     slipping = plain.with_parts(front_tyre=front, rear_tyre=rear)
     full = leaning.with_parts(front_tyre=front, rear_tyre=rear, steering=motor)
     return {
-        "the Whipple bicycle": jk.catalog.WhippleBicycle.benchmark(),
+        WHIPPLE: jk.catalog.WhippleBicycle.benchmark(),
         "a bicycle without parts": plain,
         "a leaning rider": leaning,
         "tyres that slip": slipping,
-        "rider, tyres and motor": full,
+        FULL: full,
     }
 
 
@@ -62,6 +68,43 @@ def operations(bicycle: jk.System, y: jnp.ndarray) -> int:
     return len(jax.make_jaxpr(lambda *x: plain(*jax.tree.unflatten(structure, x)))(*leaves).jaxpr.eqns)
 
 
+def in_c(setting: Setting, bicycle: jk.System, y: jnp.ndarray) -> tuple[Callable[[], Any], int] | None:
+    """SymPy's equations of the same bicycle as C, in a loop over the states `y`, and the number of its operations.
+
+    None where SymPy or a C compiler is missing, and in a quick run: the derivation takes half a minute.
+    """
+    if setting.quick or not here("SymPy + C"):
+        return None
+    from .bicycle_in_c import build
+    from .bicycle_in_sympy import PARAMETERS
+    from .parts_in_sympy import MORE, derive
+
+    n_q, n_y = len(bicycle.coordinates), len(bicycle.coordinates) + len(bicycle.speeds)
+    q, u, x = np.split(np.asarray(y), (n_q, n_y), axis=1)
+    dependent = jax.jit(jax.vmap(lambda q, u: jk.dependent_speeds(bicycle, 0.0, q, u)))
+    # our order of speeds ends with the slips and the rider, and has the dependent ones behind them
+    speeds = (
+        "roll_rate",
+        "rear_wheel_rate",
+        "steer_rate",
+        "rear_lateral_slip",
+        "front_lateral_slip",
+        "rider_lean_rate",
+    )
+    assert bicycle.speeds == speeds, bicycle.speeds
+    assert bicycle.states == ("rear_lateral_deflection", "front_lateral_deflection", "steer_motor_torque")
+    together = np.ascontiguousarray(np.concatenate([q, u, dependent(q, u), x], axis=1))
+    named = [*PARAMETERS, *MORE.values()]
+    p = np.array([float(functools.reduce(getattr, name.split("."), bicycle)) for name in named])
+    built, dy = build(derive(), Path(setting.folder) / "generated" / "parts"), np.empty_like(together)
+    built.module.batch(p, together, dy)
+    found = np.concatenate([dy[:, :n_y], dy[:, -x.shape[1] :]], axis=1)
+    inputs = dict.fromkeys(bicycle.inputs, jnp.zeros(()))
+    known = jax.jit(jax.vmap(lambda y: packed_rates(bicycle, jnp.zeros(()), y, inputs)))(y)
+    agree("SymPy + C", found, known, 1e-9)
+    return lambda: built.module.batch(p, together, dy), built.operations
+
+
 def measure(setting: Setting) -> Iterator[Figure]:
     rivals, counted, n = {}, {}, 64 if setting.quick else N
     for name, bicycle in assemblies().items():
@@ -71,10 +114,16 @@ def measure(setting: Setting) -> Iterator[Figure]:
         assert np.isfinite(np.asarray(of_all(y))).all(), name
         rivals[name] = lambda of_all=of_all, y=y: of_all(y).block_until_ready()
         counted[name] = operations(bicycle, y[0])
+    peer = in_c(setting, bicycle, y)  # of the last, with all parts
+    if peer:
+        rivals[SYMPY], counted[SYMPY] = peer
     best = in_turns(rivals, 0.1 if setting.quick else 5.0)
     for name, seconds in best.items():
         yield Figure("assemblies", f"a state, {name}", 1e9 * seconds / n, "ns", setting.column)
         yield Figure("assemblies", f"operations, {name}", counted[name], "", setting.column)
-    whipple, *_, full = ((best[name] / counted[name], name) for name in best)
-    what = "rider, tyres and motor: time of an operation against the Whipple bicycle's"
-    yield Figure("assemblies", what, full[0] / whipple[0], column=setting.column, at_most=1.1)
+    an_operation = {name: best[name] / counted[name] for name in best}
+    what = "all parts, time of an operation against the Whipple bicycle's"
+    yield Figure("assemblies", what, an_operation[FULL] / an_operation[WHIPPLE], column=setting.column, at_most=1.1)
+    if peer:
+        what = "all parts, time against SymPy's C, scalar loop"
+        yield Figure("assemblies", what, best[FULL] / best[SYMPY], column=setting.column, at_most=0.3)

@@ -4,10 +4,11 @@ The generated file is a small extension module of Python, so that a call costs s
 
     rhs(y, t, p, dy)      one evaluation; the argument order of scipy's odeint
     rhs_ty(t, y, p, dy)   the same in the order of scipy's other solvers
-    batch(p, y, dy)       a loop over the rows of y (b, 14)
+    batch(p, y, dy)       a loop over the rows of y (b, n_y)
     rhs_c                 the first as a C function, which `by_ctypes` calls
 
-y holds the 8 coordinates and the 6 speeds of `bicycle_in_sympy`, p its 26 parameters; each writes dy and returns it.
+y holds the coordinates, all speeds and the states of what was derived, as the 14 of `bicycle_in_sympy`, p its
+parameters; each writes dy and returns it.
 """
 
 from __future__ import annotations
@@ -26,9 +27,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .bicycle_in_sympy import COORDINATES, PARAMETERS, SPEEDS, Derived
+from .bicycle_in_sympy import Derived
 
-N_Y = len(COORDINATES) + len(SPEEDS)
 FLAGS = ("-O3", "-march=native", "-fno-math-errno", "-shared", "-fPIC")
 
 
@@ -84,11 +84,13 @@ def written(derived: Derived) -> tuple[str, int]:
     from sympy.codegen.rewriting import ReplaceOptim, create_expand_pow_optimization
     from sympy.physics.mechanics import msubs
 
-    y = sm.symbols([f"y_{name}" for name in (*COORDINATES, *SPEEDS)], real=True)
-    plain = dict(zip((*derived.q, *derived.u), y))
-    exact = [msubs(m, plain) for m in (derived.M, derived.f, sm.Matrix(derived.q_dot))]
-    steps, (M, f, q_dot) = sm.cse(exact, sm.numbered_symbols("x"), order="none")
-    operations = sum(map(sm.count_ops, [e for _, e in steps] + [e for m in (M, f, q_dot) for e in m]))
+    together = (*derived.q, *derived.u, *derived.x)
+    y = sm.symbols(f"s:{len(together)}", real=True)
+    plain = dict(zip(together, y))
+    rates = sm.Matrix([*derived.q_dot, *derived.x_dot])
+    exact = [msubs(m, plain) for m in (derived.M, derived.f, rates)]
+    steps, (M, f, rates) = sm.cse(exact, sm.numbered_symbols("x"), order="none")
+    operations = sum(map(sm.count_ops, [e for _, e in steps] + [e for m in (M, f, rates) for e in m]))
     # pow(x, 3) and pow(x, -1.5) are calls, x*x*x and 1/(x*sqrt(x)) are not.
     roots = ReplaceOptim(
         lambda e: e.is_Pow and e.exp.is_Rational and e.exp.q == 2,
@@ -96,17 +98,18 @@ def written(derived: Derived) -> tuple[str, int]:
     )
     products = create_expand_pow_optimization(4)
     c = lambda e: sm.ccode(products(roots(e)))  # noqa: E731
-    n = len(SPEEDS)
+    n_q, n = len(derived.q), len(derived.u)
+    first = n - 3  # three constraints
     # Constraints before Kane's equations and dependent speeds before independent ones: no pivots need be looked for.
-    order = [*range(n // 2, n), *range(n // 2)]
-    lines = [f"const double {name} = p[{i}];" for i, name in enumerate(PARAMETERS)]
+    order = [*range(first, n), *range(first)]
+    lines = [f"const double {name} = p[{i}];" for i, name in enumerate(derived.p)]
     lines += [f"const double {name} = y[{i}];" for i, name in enumerate(y)]
     lines += [f"const double {name} = {c(e)};" for name, e in steps]
     lines += [f"A[{i}][{j}] = {c(M[r, s])};" for i, r in enumerate(order) for j, s in enumerate(order)]
     lines += [f"A[{i}][{n}] = {c(f[r])};" for i, r in enumerate(order)]
-    lines += [f"dy[{i}] = {c(e)};" for i, e in enumerate(q_dot)]
-    places = ", ".join(str(len(COORDINATES) + s) for s in order)
-    values = {"EQUATIONS": "\n    ".join(lines), "N_Y": N_Y, "N": n, "PLACES": places}
+    lines += [f"dy[{i if i < n_q else i + n}] = {c(e)};" for i, e in enumerate(rates)]
+    places = ", ".join(str(n_q + s) for s in order)
+    values = {"EQUATIONS": "\n    ".join(lines), "N_Y": len(together), "N": n, "PLACES": places}
     source = _TEMPLATE
     for name, value in values.items():
         source = source.replace(f"@{name}@", str(value))

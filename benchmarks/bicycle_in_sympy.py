@@ -26,7 +26,8 @@ PARAMETERS = tuple(
 
 class Derived(NamedTuple):
     """M (6, 6) and f (6,) of M u_dot = f for all speeds, three of Kane's equations and three constraints; rates of
-    the coordinates (8,); symbols of coordinates, speeds and parameters in their order; seconds that it took."""
+    the coordinates (8,); symbols of coordinates, speeds and parameters in their order; seconds that it took; states of
+    the first order and their rates, where there are such."""
 
     kane: me.KanesMethod
     M: sm.Matrix
@@ -36,6 +37,8 @@ class Derived(NamedTuple):
     u: list[Any]
     p: list[sm.Symbol]
     seconds: float
+    x: tuple[Any, ...] = ()
+    x_dot: tuple[sm.Expr, ...] = ()
 
 
 @functools.cache

@@ -15,6 +15,7 @@ from jaxkane.bicycles import (
     ConstantSpeed,
     Drag,
     LaneChange,
+    LateralSlip,
     LeanSteerGains,
     Part,
     PathFollower,
@@ -23,6 +24,7 @@ from jaxkane.bicycles import (
     SteerByWire,
     SteeringFriction,
     SteeringMotor,
+    Tyre,
     follow_gain,
     lqr,
 )
@@ -281,6 +283,20 @@ def test_everything_goes_into_one_program():
         assert shape.shape == (len(bicycle.speeds),)
         rates = jax.eval_shape(lambda b, q, u, values=inputs: jk.state_rates(b, 0.0, q, u, values), bicycle, q, u)
         assert set(rates) == set(bicycle.states)
+
+
+@pytest.mark.slow
+def test_the_power_of_all_parts_is_accounted_for():
+    """1e-9: of a motor with its rotor, friction, drag and tyres that slip, beside the gains that steer."""
+    tyre = Tyre(lateral=LateralSlip(6000.0, 500.0, relaxation_length=0.1))
+    motor = SteeringMotor(lag=0.02, delay=0.03, limit=20.0, rotor_inertia=1e-4, ratio=5.0)
+    gains = LeanSteerGains(roll=-50.0, steer=35.0, roll_rate=-13.0, steer_rate=3.5, command="steer_command")
+    steered = {"control": gains, "steering": (SteeringFriction(0.1), motor), "drive": Drag()}
+    bicycle = BENCHMARK.with_parts(front_tyre=tyre, rear_tyre=tyre, **steered)
+    start = jk.assemble(bicycle, {"roll": 0.05}, {"rear_wheel_rate": -5.0 / bicycle.rR})
+    ride = jk.simulate(bicycle, start, jnp.linspace(0.0, 1.0, 2001), rtol=1e-11, atol=1e-12)
+    assert ride.ok
+    assert abs(float(jk.audit(bicycle, ride).energy_balance)) < 1e-9
 
 
 # What does not fit
