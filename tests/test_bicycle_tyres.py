@@ -12,13 +12,14 @@ from jaxkane.bicycles import (
     HeadTwist,
     LateralSlip,
     LongitudinalSlip,
+    MagicFormula,
     Part,
     Road,
     Slope,
     Tyre,
     sharp_motorcycle,
 )
-from jaxkane.stability import eigenvalues, linearize, straight_ahead
+from jaxkane.stability import eigenvalues, linearize, steady_turn, straight_ahead
 
 SPEEDS = jnp.array([2.0, 4.6, 8.0])  # [m/s]
 
@@ -167,3 +168,97 @@ def test_a_step_in_the_road_ends_the_ride():
     assert 2.0 < float(jnp.nanmax(ride["front_x"])) < 2.3  # a third of a metre before the kerb
     with pytest.raises(ValueError, match="satisfies the configuration constraints"):
         jk.assemble(kerb, {"x": 2.3 - 1.02})
+
+
+@pytest.mark.slow
+def test_energy_of_tyres_and_frame_is_accounted_for():
+    """1e-9: lateral slip with relaxation and moments, longitudinal slip, rolling resistance, a frame that gives way."""
+    rear = Tyre(0.02, MagicFormula(12.0, 1.1, camber_ratio=0.1, relaxation_length=0.1), rolling_resistance=0.005)
+    front = Tyre(
+        lateral=LateralSlip(9000.0, 900.0, relaxation_length=0.1, pneumatic_trail=0.02, twisting_stiffness=5.0),
+        longitudinal=LongitudinalSlip(2e4),
+    )
+    bicycle = Bicycle.benchmark().with_parts(rear_tyre=rear, front_tyre=front, head=HeadTwist(3000.0, 3.0))
+    start = jk.assemble(bicycle, {"roll": 0.1}, {"rear_wheel_rate": -4.6 / 0.3, "roll_rate": 0.2})
+    ride = jk.simulate(bicycle, start, jnp.linspace(0.0, 0.2, 601), rtol=1e-11, atol=1e-12)
+    kept = jk.audit(bicycle, ride)
+    assert kept.reason == "completed"
+    assert float(np.abs(kept.work).max()) > 1.0
+    assert kept.energy_balance < 1e-9
+
+
+@pytest.mark.slow
+def test_forces_on_the_wheels_turn_a_bicycle_that_slips():
+    """1e-10: weight, and mass times speed squared over radius, of all bodies in a steady turn."""
+    law = LateralSlip(9000.0, 900.0, relaxation_length=0.1, pneumatic_trail=0.02, twisting_stiffness=5.0)
+    tyre = Tyre(crown=0.02, lateral=law)
+    bicycle = Bicycle.benchmark().with_parts(rear_tyre=tyre, front_tyre=tyre)
+    leaning = jk.assemble(bicycle, {"roll": 0.3, "steer": 0.05})
+    turn = steady_turn(
+        bicycle,
+        leaning.q,
+        {"rear_wheel_rate": -5.0 / 0.3},
+        hold=("roll", "rear_wheel_rate"),
+        find=("steer_torque", "drive_torque"),
+    )
+    assert abs(float(turn["rear_lateral_slip"])) > 0.01
+    at = (bicycle, 0.0, turn.q, turn.u, turn.inputs | dict(zip(bicycle.states, turn.x, strict=True)))
+    constraints, slipping, places = jk.constraint_forces(*at), jk.outputs(*at), jk.positions(*at)
+    yaw_rate, rates = float(turn["yaw_rate"]), jk.coordinate_rates(*at[:4])
+    x_dot, y_dot = (float(rates[bicycle.coordinates.index(k)]) for k in ("x", "y"))
+    middle = np.array([-y_dot, x_dot]) / yaw_rate  # of the turn; the rear contact is at the origin, its heading along x
+    axle = np.asarray(jk.orientations(*at)["C"])[1]  # of the front wheel
+    across = axle[:2] / np.hypot(axle[0], axle[1])  # on the ground
+    tyres = slipping["rear_lateral_force"] * np.array([0.0, 1.0]) + slipping["front_lateral_force"] * across
+    force = np.asarray(constraints["P"] + constraints["Q"])
+    masses = {"rear wheel": bicycle.mR, "rear frame": bicycle.mB, "fork": bicycle.mH, "front wheel": bicycle.mF}
+    needed = -(yaw_rate**2) * sum(m * (np.asarray(places[k])[:2] - middle) for k, m in masses.items())
+    total = float(sum(masses.values()) * bicycle.g)
+    np.testing.assert_allclose(-force[2], total, rtol=1e-10)
+    np.testing.assert_allclose(force[:2] + tyres, needed, atol=1e-10 * total)
+
+
+@pytest.mark.slow
+def test_tyres_with_relaxation_stop_and_go_backwards_with_derivatives():
+    """A torque against the motion; everything is finite, and so is the derivative in the stiffness."""
+
+    def ride(stiffness):
+        law = LateralSlip(stiffness, 900.0, relaxation_length=0.1)
+        tyre = Tyre(None, law, LongitudinalSlip(2e4, relaxation_length=0.1), rolling_resistance=0.005)
+        bicycle = Bicycle.benchmark().with_parts(rear_tyre=tyre, front_tyre=tyre)
+        start = jk.assemble(bicycle, {"roll": 0.001}, {"rear_wheel_rate": -1.0 / 0.3})
+        found = jk.simulate(bicycle, start, jnp.linspace(0.0, 1.0, 21), inputs={"drive_torque": 75.0})
+        return found["roll"][-1], found["rear_wheel_rate"]
+
+    (roll, spin), slope = jax.jit(jax.value_and_grad(ride, has_aux=True))(9000.0)
+    assert spin[0] < 0.0 < spin[-1]
+    assert np.all(np.isfinite([roll, slope, *spin]))
+    assert slope != 0.0
+
+
+@pytest.mark.parametrize("law", [LateralSlip(9000.0), MagicFormula(12.0), LongitudinalSlip(2e4)])
+def test_a_tyre_pulls_against_its_slip(law):
+    """Less than the friction that it has, nothing without slip or load, with a slope everywhere, at rest too."""
+
+    def force(velocity, speed, load=400.0):
+        return law.force(law.slip(velocity, speed, 0.0, None), load)
+
+    assert force(0.1, 5.0) < 0.0 < force(-0.1, -5.0)
+    np.testing.assert_allclose(force(0.0, 0.0), 0.0, atol=1e-12)
+    slopes = jax.grad(force, argnums=(0, 1))(0.0, 0.0)
+    assert np.all(np.isfinite(slopes))
+    assert slopes[0] < 0.0
+    if isinstance(law, MagicFormula):
+        assert abs(float(force(50.0, 5.0))) <= 400.0
+        assert float(force(1.0, 5.0, load=-10.0)) == 0.0  # a wheel that would lift does not pull
+
+
+def test_tyres_and_roads_that_cannot_be_are_refused():
+    with pytest.raises(ValueError, match=r"cornering_stiffness = 0\.0 must be positive"):
+        LateralSlip(0.0)
+    with pytest.raises(ValueError, match=r"relaxation_length = 0\.0 must be positive"):
+        LateralSlip(9000.0, relaxation_length=0.0)
+    with pytest.raises(ValueError, match="one number"):
+        Road(lambda x, y: jnp.array([x, y])).at(0.0, 0.0)
+    with pytest.raises(TypeError, match="`road` is a Ground"):
+        Bicycle.benchmark().with_parts(road=0.1)

@@ -108,7 +108,8 @@ class MagicFormula(Slip):
     def force(self, slip, load):
         b = self.stiffness / (self.shape * self.friction) * slip
         b = b - self.curvature * (b - jnp.arctan(b))
-        return load * self.friction * jnp.sin(self.shape * jnp.arctan(b))
+        carried = jnp.maximum(load, 0.0)  # a wheel that would lift does not pull
+        return carried * self.friction * jnp.sin(self.shape * jnp.arctan(b))
 
     def equivalent(self, camber):
         return 0.0 if self.camber_ratio is None else self.camber_ratio * camber

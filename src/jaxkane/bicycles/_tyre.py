@@ -115,7 +115,7 @@ class Tyre(eqx.Module):
                 yield Torque(moment * contact.normal, wheel)
         if self.rolling_resistance is not None:
             # Over a tenth of a metre a second, so that a wheel at rest stays there.
-            size = self.rolling_resistance * load * radius * jnp.tanh(contact.speed / 0.1)
+            size = self.rolling_resistance * jnp.maximum(load, 0.0) * radius * jnp.tanh(contact.speed / 0.1)
             yield Torque(size * contact.across, wheel)
 
 
