@@ -1,6 +1,7 @@
 """Steering, drive and control of bicycles: against formulas, models put together by hand, and known limits."""
 
 import dataclasses
+import pickle
 from types import SimpleNamespace
 
 import jax
@@ -297,6 +298,13 @@ def test_the_power_of_all_parts_is_accounted_for():
     ride = jk.simulate(bicycle, start, jnp.linspace(0.0, 1.0, 2001), rtol=1e-11, atol=1e-12)
     assert ride.ok
     assert abs(float(jk.audit(bicycle, ride).energy_balance)) < 1e-9
+
+
+def test_a_path_survives_pickling():
+    follower = PathFollower(LaneChange(width=2.0, start=0.0, length=10.0))
+    again = pickle.loads(pickle.dumps(follower))
+    assert jax.tree.structure(again) == jax.tree.structure(follower)
+    np.testing.assert_allclose(again.path(5.0), 1.0, rtol=1e-12)
 
 
 # What does not fit

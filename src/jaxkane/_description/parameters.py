@@ -94,6 +94,9 @@ class Learned(eqx.Module):
     def __call__(self, *args: Any, **more: Any) -> Any:
         return self.function(*args, **more)
 
+    def __reduce__(self):
+        return Learned, (self.function,)  # the structure of a module does not survive pickling, the module does
+
 
 @dataclasses.dataclass(frozen=True)
 class ParameterInfo:
