@@ -42,7 +42,7 @@ def sharp_motorcycle() -> Bicycle:
     front_z = -(_A + _E) * sin - _F * cos
     front_inertia = _symmetric(
         _FRONT_ACROSS * cos**2 + _FRONT_ALONG * sin**2,
-        0.96,
+        0.65,
         _FRONT_ACROSS * sin**2 + _FRONT_ALONG * cos**2,
         (_FRONT_ALONG - _FRONT_ACROSS) * sin * cos,
     )
