@@ -4,7 +4,6 @@ import importlib
 import subprocess
 import sys
 
-import equinox.internal as internal
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +24,6 @@ USED = {
     "jax.ffi": "ffi_lowering pycapsule register_ffi_target",
     "jax.core": "Tracer eval_context",
     "equinox._errors": "EQX_ON_ERROR",
-    "equinox.internal": "prevbefore",
 }
 
 
@@ -86,23 +84,3 @@ print("right")
 def test_without_what_programs_are_made_of_results_stay_right():
     run = subprocess.run([sys.executable, "-c", WITHOUT], capture_output=True, text=True, timeout=300, check=False)
     assert run.stdout.strip() == "right", run.stderr[-2000:]
-
-
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_a_hundred_floats_before_are_found_at_once(dtype):
-    def hundred(x):
-        for _ in range(100):
-            x = internal.prevbefore(x)
-        return x
-
-    x = jnp.asarray([5.0, 1.0, -3.0, 2.0**-3, 1e-3, 0.0], dtype)
-    with internals.floats_before_at_once():
-        found, slope = jax.vmap(jax.jit(jax.value_and_grad(hundred)))(x)
-        other = internal.prevbefore(x)
-    expected = np.asarray(x)
-    for _ in range(100):
-        expected = np.nextafter(expected, dtype(-np.inf))
-    np.testing.assert_array_equal(found[:-1], expected[:-1])
-    assert -1e-30 < found[-1] < 0
-    np.testing.assert_array_equal(slope, np.ones(6))
-    np.testing.assert_array_equal(other[:-1], np.nextafter(np.asarray(x), dtype(-np.inf))[:-1])

@@ -1,4 +1,4 @@
-"""All that this library uses of JAX, equinox and diffrax beyond what they promise. Knows no programs and no mechanics.
+"""All that this library uses of JAX and equinox beyond what they promise. Knows no programs and no mechanics.
 
 Each has a way back, so that where a release takes it away, results stay right and only speed, or a convenience, goes:
 
@@ -9,7 +9,6 @@ Each has a way back, so that where a release takes it away, results stay right a
 | tracers of a derivative in forward mode | such a derivative must be announced by `adjoint="forward"` |
 | the state of traces | motions are compiled for derivatives that nobody can take, a tenth slower at first |
 | `reset_cache`, equinox's switch of its checks | programs are kept only where the environment says so from the start |
-| `equinox.internal.prevbefore`, which diffrax calls | first calls take a tenth longer |
 | `eval_context` | a sweep on a cluster may be refused, since programs that were first traced in a check differ |
 | `process_allgather` | none: a fit by several processes raises ImportError |
 
@@ -19,15 +18,11 @@ Each has a way back, so that where a release takes it away, results stay right a
 from __future__ import annotations
 
 import contextlib
-import contextvars
-import functools
 import importlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import jax
-import jax.numpy as jnp
-import numpy as np
 from jax.core import Tracer
 
 FUSES: str | None = None  # why programs cannot be fused, or None
@@ -182,57 +177,3 @@ def process_allgather(x: Any, *, tiled: bool = False) -> Any:
     from jax.experimental.multihost_utils import process_allgather
 
     return process_allgather(x, tiled=tiled)
-
-
-@contextlib.contextmanager
-def floats_before_at_once() -> Iterator[None]:
-    """Under it, `equinox.internal.prevbefore` of its own result is found from where that began.
-
-    diffrax asks a hundred times in turn for the float before, from the last time on, so that no step is shorter than
-    that: two thousand operations, which take XLA a tenth of a first call. Here each is one call, of which only the last
-    is needed.
-    """
-    _teach_prevbefore()
-    token = _floats_before.set({})
-    try:
-        yield
-    finally:
-        _floats_before.reset(token)
-
-
-# By the identity of each result: itself, the float that it began with, and how many it stands before that.
-_floats_before: contextvars.ContextVar[dict[int, tuple[Any, Any, int]] | None] = contextvars.ContextVar(
-    "floats_before", default=None
-)
-
-
-@functools.cache
-def _teach_prevbefore() -> None:
-    """Once for a process, since a patch that comes and goes would be seen by other threads; it asks for the context."""
-    equinox: Any = importlib.import_module("equinox.internal")
-    original = getattr(equinox, "prevbefore", None)
-    if original is None:
-        return
-
-    def prevbefore(x: Any) -> Any:
-        known = _floats_before.get()
-        if known is None or getattr(x, "dtype", None) not in (np.float32, np.float64):
-            return original(x)
-        _, first, n = known.get(id(x), (x, x, 0))
-        found = _float_before(first, n + 1)
-        known[id(found)] = found, first, n + 1
-        return found
-
-    equinox.prevbefore = prevbefore
-
-
-@jax.jit
-def _float_before(x: Any, n: Any) -> Any:
-    """The n-th float before x, with the derivative of x."""
-    whole = np.int64 if x.dtype == np.float64 else np.int32
-    least = np.iinfo(whole).min
-    turned = lambda i: jnp.where(i < 0, least - i, i)  # noqa: E731  # between the bits of floats and integers in order
-    bits = turned(jax.lax.bitcast_convert_type(x, whole))
-    before = jax.lax.bitcast_convert_type(turned(bits - jnp.asarray(n, whole)), x.dtype)
-    before = jnp.where(x == 0, -jnp.finfo(x.dtype).tiny, before)  # as equinox has it: smaller ones count as zero
-    return (x - jax.lax.stop_gradient(x)) + jax.lax.stop_gradient(before)

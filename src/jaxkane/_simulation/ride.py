@@ -21,7 +21,6 @@ from .._method.equations import _dependent_speeds
 from .._method.kane import Instant, checked_inputs
 from .._method.now import outputs_at, packed_rates, values_of
 from .._scalars.fuse import fused
-from .._scalars.jax_internals import floats_before_at_once
 from .._scalars.nan import all_finite, derivative_free_where_not_finite, flat, nan_derivative_where, nan_where
 from .._scalars.reads import compiled
 from .._scalars.types import Component
@@ -69,7 +68,7 @@ def solve(
     valid = _is_valid(system, state, ts, signals)
     # What is not finite must not enter the solver, where it would spoil the gradient of what is shared.
     system, state = _safe(valid, (system, state))
-    start = packed(state)  # one array goes through the steps: several would be as many kernels of XLA at each place
+    start = packed(state)
     ts = jnp.where(valid, ts, jnp.arange(ts.shape[0], dtype=ts.dtype))
     signals = without_nonsense(signals, valid)
     constrained = has_configuration_constraints(system, ts[0], state.q)
@@ -98,22 +97,21 @@ def solve(
     step, controller, reach = _steps(ts, signals, settings)
     if stops:
         controller = _to_stops(controller, vector_field, events, system, ts, reach)
-    with floats_before_at_once():
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(vector_field if forward else trial_rates),
-            settings.solver,
-            ts[0],
-            ts[-1],
-            step,
-            start,
-            (system, signals, disturbance),
-            saveat=diffrax.SaveAt(subs=(diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)), controller_state=stops),
-            stepsize_controller=controller,
-            adjoint=settings.adjoint,
-            max_steps=settings.max_steps,
-            progress_meter=diffrax.TqdmProgressMeter() if settings.progress else diffrax.NoProgressMeter(),
-            throw=False,
-        )
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(vector_field if forward else trial_rates),
+        settings.solver,
+        ts[0],
+        ts[-1],
+        step,
+        start,
+        (system, signals, disturbance),
+        saveat=diffrax.SaveAt(subs=(diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)), controller_state=stops),
+        stepsize_controller=controller,
+        adjoint=settings.adjoint,
+        max_steps=settings.max_steps,
+        progress_meter=diffrax.TqdmProgressMeter() if settings.progress else diffrax.NoProgressMeter(),
+        throw=False,
+    )
     times, states = cast(Any, (solution.ts, solution.ys))
     (t_reached, t_last), (motion, last) = jax.lax.stop_gradient(times), states
     reached, t_end, end = jnp.isfinite(t_reached) & valid, t_last[0], last[0]
