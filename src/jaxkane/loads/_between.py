@@ -25,8 +25,7 @@ def spring(P: Point | Body, Q: Point | Body, stiffness: Law, length: Component =
     r = Q.position_from(P)
     if is_zero(length) and not callable(stiffness):
         return _pair(stiffness * r, P, Q)
-    distance = r.norm()
-    return _pair(_law(stiffness, distance - length) * (r / distance), P, Q)
+    return _pair(_law(stiffness, r.norm() - length) * r.normalize(), P, Q)
 
 
 def damper(P: Point | Body, Q: Point | Body, damping: Law) -> tuple[Force, Force]:
