@@ -268,6 +268,7 @@ def test_a_path_is_met_on_an_arc():
 # All together
 
 
+@pytest.mark.slow
 def test_everything_goes_into_one_program():
     """Traced, and not compiled: what cannot be part of one program of scalars is an error in these tests."""
     wire = SteerByWire(1.0, 0.85, -0.95, 0.02, 0.01, 0.015, stiffness=100.0, command="steer_command")

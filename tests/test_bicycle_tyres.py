@@ -116,6 +116,7 @@ LEANING = {"roll": 0.2, "steer": 0.15, "yaw": 0.3, "x": 0.5, "y": -0.2}
 MOVING = {"roll_rate": 0.3, "rear_wheel_rate": -16.0, "steer_rate": -0.4}
 
 
+@pytest.mark.slow
 def test_a_road_that_rises_evenly_is_a_slope():
     """1e-12. Its normal is the same everywhere; gravity is tilted against it."""
     slope = Bicycle.benchmark().with_parts(road=Slope(jnp.arctan(0.1)))

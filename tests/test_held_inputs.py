@@ -36,6 +36,7 @@ def end(delay, adjoint="auto"):
     return jk.simulate(Cart(), jk.State([0.0], [0.0]), [0.0, 0.5, 1.0], {"push": push}, adjoint=adjoint)["place"]
 
 
+@pytest.mark.slow
 def test_the_exact_motion_and_its_derivative_by_a_delay():
     found, slope = jax.jit(lambda d: jax.jvp(lambda d: end(d, "forward"), (d,), (1.0,)))(0.03)
     exact = [place(t, 0.03) for t in (0.0, 0.5, 1.0)]

@@ -88,6 +88,7 @@ def test_its_derivative(pendulum):
     assert float(slope[2, 0]) == pytest.approx(float(up - down) / (2 * h), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_law_is_learned_and_the_mass_stays_physical(pendulum):
     true = jk.simulate(Rough(network(), mass=0.4), START, ts)
     noise = np.random.default_rng(0).normal(0.0, 1e-3, ts.size)

@@ -160,5 +160,5 @@ def test_no_length_however_it_is_written(length):
 
 
 def test_a_spring_between_points_that_are_always_in_one_place():
-    with pytest.raises(ValueError, match="is zero, and has no direction: .* the line between two points"):
+    with pytest.raises(ValueError, match=r"is zero, and has no direction: .* the line between two points"):
         forces(lambda P, Q, i: jk.loads.spring(P, P.fixed(0.0 * P.velocity.frame.x), 10.0, 0.5), Q0)

@@ -157,6 +157,7 @@ def test_errors_by_trial(case):
     np.testing.assert_allclose(found.clustered_covariance, errors_by_trial(records, best), rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_errors_by_window():
     """Two trials of four windows: each window left out in turn, all others solved for again."""
     records = recorded(2, wander=0.2)[:2]

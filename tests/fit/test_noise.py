@@ -115,6 +115,7 @@ def found(case):
     return minimize(case[2], LeastSquares(rtol=1e-9))
 
 
+@pytest.mark.slow
 def test_the_likelihood_is_that_of_the_linear_motion(case):
     _, y, problem = case
     there = linearize(problem, problem.start)

@@ -230,6 +230,7 @@ def test_process_noise_is_taken_for_what_it_is():
     assert 0.5 < chained.variance < 2.0
 
 
+@pytest.mark.slow
 def test_the_delay_of_what_is_held():
     t = np.arange(0.0, 4.0, 0.1)
     push = {"push": np.round(np.sin(2.0 * t))}

@@ -293,6 +293,7 @@ class Twice(Cart):
         return (*super().loads(t, q, u, motion, inputs), jk.Force(force * motion.N.x, motion["cart"]))
 
 
+@pytest.mark.slow
 def test_of_what_changes_nothing_the_simplest_is_told(trials):
     free = ("stiffness", "more_damping", "damping", "more_stiffness")
     seen = identifiability(Problem.of(Twice(), trials, free, **UNKNOWN))
