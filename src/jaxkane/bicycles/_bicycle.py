@@ -302,9 +302,6 @@ class Bicycle(WhippleBicycle):
         and the camber grows with omega . heading + (axle . n_dot) / cos(camber).
         """
         tyre, slip = self.front_tyre, self._slip(FRONT, u)
-        if tyre.rolls and tyre.rolling_resistance is None and not self.road.curved:  # what follows is not asked for
-            contact = Contact(Q, C.x, C.y, normal, down, 0.0, 0.0, slip)
-            return contact, tyre.residuals(contact)
         heading = C.y.cross(normal).normalize()
         across = normal.cross(heading)
         sin_camber, cos_camber = C.y.dot(normal), down.dot(normal)
