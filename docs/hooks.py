@@ -46,7 +46,7 @@ def on_config(config):
     }
     for entry in config.nav:
         for title, target in entry.items():
-            entry[title] = found.get(target, target)
+            entry[title] = found.get(target, target) if isinstance(target, str) else target
     return config
 
 
