@@ -13,7 +13,8 @@ import pytest
 
 import jaxkane as jk
 from jaxkane._common.digest import digest
-from jaxkane._method.checks import check_system, configuration_residual
+from jaxkane._method.checks import check_system
+from jaxkane._method.description_facts import configuration_residual
 
 distributed = pytest.importorskip("distributed")
 

@@ -18,13 +18,8 @@ from .._scalars.numbers import derivative_in_numbers, in_numbers, is_in_numbers
 from .._scalars.reads import compiled
 from .._scalars.types import Component
 from .check_description import MOST_REMEMBERED, structure_of, with_trial_numbers
-from .checks import (
-    check_system,
-    configuration_residual,
-    configuration_tolerance,
-    implied_residual,
-    is_concrete,
-)
+from .checks import check_system, configuration_tolerance, implied_residual, is_concrete
+from .description_facts import configuration_residual
 from .equations import dependent_speeds
 from .kane import as_array
 

@@ -24,7 +24,7 @@ from .._scalars.linear import as_vector, stack
 from .._scalars.nan import nan_where
 from .._scalars.numbers import in_numbers
 from .check_description import check_description
-from .description_facts import configuration_residual as configuration_residual
+from .description_facts import configuration_residual
 from .kane import Reading, Row
 
 ROUNDING, MEASURED = 2e-3, 0.05

@@ -19,7 +19,7 @@ from .._description.system import System
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, solve, stack
 from .._scalars.types import Component
-from .checks import configuration_residual
+from .description_facts import configuration_residual
 from .kane import Instant, as_array, refuse_incomplete
 
 _MOST_CHOICES = 3000

@@ -272,16 +272,7 @@ class Bicycle(WhippleBicycle):
         r_D_Q = self.front_tyre.reach(down, normal, self.rF)
         Q = Point(G_D.velocity + omega_D.cross(r_D_Q), G_D, r_D_Q)
 
-        A_inertia = (self.IRxx, self.IRyy, self.IRxx)
-        B_inertia = ((self.IBxx, 0.0, self.IBxz), (0.0, self.IByy, 0.0), (self.IBxz, 0.0, self.IBzz))
-        H_inertia = ((self.IHxx, 0.0, self.IHxz), (0.0, self.IHyy, 0.0), (self.IHxz, 0.0, self.IHzz))
-        D_inertia = (self.IFxx, self.IFyy, self.IFxx)
-        bodies = (
-            Body(self.mR, A_inertia, G_A, R, omega_A, name="rear wheel"),
-            Body(self.mB, B_inertia, G_B, B, name="rear frame"),
-            Body(self.mH, H_inertia, G_C, H, name="fork"),
-            Body(self.mF, D_inertia, G_D, C, omega_D, name="front wheel"),
-        )
+        bodies = self.bodies((G_A, G_B, G_C, G_D), (R, B, H, C), omega_A, omega_D)
         frames = {"Y": Y, "B": B, "C": C, "H": H}
         motion = BicycleMotion(bodies, points={"P": P, "Q": Q, "S": S}, frames=frames)
         forward, _ = self._contact_rates(q, u)

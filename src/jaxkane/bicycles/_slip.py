@@ -57,7 +57,23 @@ class Slip(eqx.Module):
         return -velocity - jnp.abs(speed) * lag
 
 
-class LateralSlip(Slip):
+class _Aligning(Slip):
+    """A law whose lateral force acts behind the contact, and whose camber twists the tyre."""
+
+    if TYPE_CHECKING:
+        pneumatic_trail: Scalar | None
+        twisting_stiffness: Scalar | None
+
+    def moment(self, force, camber):
+        moment: Component = 0.0
+        if self.pneumatic_trail is not None:
+            moment = moment - self.pneumatic_trail * force
+        if self.twisting_stiffness is not None:
+            moment = moment + self.twisting_stiffness * camber
+        return moment
+
+
+class LateralSlip(_Aligning):
     """Lateral force in proportion to slip and camber, as in Sharp (1971).
 
         sigma / |V| dF/dt + F = cornering_stiffness * slip + camber_stiffness * camber
@@ -81,11 +97,8 @@ class LateralSlip(Slip):
             return 0.0
         return self.camber_stiffness / self.cornering_stiffness * camber
 
-    def moment(self, force, camber):
-        return _moment(self, force, camber)
 
-
-class MagicFormula(Slip):
+class MagicFormula(_Aligning):
     """Lateral force by the Magic Formula, in proportion to the load (Pacejka 2012, eq. 4.1 to 4.6).
 
         F = load * friction * sin(shape * atan(b - curvature * (b - atan(b)))),
@@ -114,9 +127,6 @@ class MagicFormula(Slip):
     def equivalent(self, camber):
         return 0.0 if self.camber_ratio is None else self.camber_ratio * camber
 
-    def moment(self, force, camber):
-        return _moment(self, force, camber)
-
 
 class LongitudinalSlip(Slip):
     """Longitudinal force in proportion to the slip ratio.
@@ -129,12 +139,3 @@ class LongitudinalSlip(Slip):
 
     def force(self, slip, load):
         return self.stiffness * slip
-
-
-def _moment(law: LateralSlip | MagicFormula, force: Component, camber: Component) -> Component:
-    moment: Component = 0.0
-    if law.pneumatic_trail is not None:
-        moment = moment - law.pneumatic_trail * force
-    if law.twisting_stiffness is not None:
-        moment = moment + law.twisting_stiffness * camber
-    return moment

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
@@ -191,17 +191,25 @@ class WhippleBicycle(System):
         r_D_Q = self.rF * C.vector(n1, 0.0, n3).normalize()
         Q = Point(G_D.velocity + omega_D.cross(r_D_Q), G_D, r_D_Q)
 
+        bodies = self.bodies((G_A, G_B, G_C, G_D), (R, B, H, C), omega_A, omega_D)
+        return Motion(bodies, [Q.velocity], points={"P": P, "Q": Q, "S": S}, frames={"Y": Y, "B": B, "C": C})
+
+    def bodies(
+        self, centers: Sequence[Point], frames: Sequence[Frame], omega_A: Vector, omega_D: Vector
+    ) -> tuple[Body, ...]:
+        """Rear wheel, rear frame, fork and front wheel, at their mass centres and in frames in which their inertia is
+        constant; the wheels turn with `omega_A` and `omega_D`."""
         A_inertia = (self.IRxx, self.IRyy, self.IRxx)
         B_inertia = ((self.IBxx, 0.0, self.IBxz), (0.0, self.IByy, 0.0), (self.IBxz, 0.0, self.IBzz))
         H_inertia = ((self.IHxx, 0.0, self.IHxz), (0.0, self.IHyy, 0.0), (self.IHxz, 0.0, self.IHzz))
         D_inertia = (self.IFxx, self.IFyy, self.IFxx)
-        bodies = (
+        (G_A, G_B, G_C, G_D), (R, B, H, C) = centers, frames
+        return (
             Body(self.mR, A_inertia, G_A, R, omega_A, name="rear wheel"),
             Body(self.mB, B_inertia, G_B, B, name="rear frame"),
             Body(self.mH, H_inertia, G_C, H, name="fork"),
             Body(self.mF, D_inertia, G_D, C, omega_D, name="front wheel"),
         )
-        return Motion(bodies, [Q.velocity], points={"P": P, "Q": Q, "S": S}, frames={"Y": Y, "B": B, "C": C})
 
     def loads(self, t, q, u, motion, inputs):
         wheel, frame, fork = (motion[name] for name in ("rear wheel", "rear frame", "fork"))

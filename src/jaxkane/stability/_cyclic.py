@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._description.system import System
-from .._method.checks import configuration_residual, is_concrete
+from .._method.checks import is_concrete
+from .._method.description_facts import configuration_residual
 from .._method.now import rates as rates_of
 from .._scalars.jax_internals import concretely
 from .._scalars.reads import on_forget, version_of

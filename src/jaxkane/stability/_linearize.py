@@ -14,7 +14,8 @@ from jaxtyping import Array, Float
 from .._common.lookup import hint, refuse_unknown
 from .._description.system import State, System
 from .._description.values import Values
-from .._method.checks import check_system, configuration_residual, is_concrete
+from .._method.checks import check_system, is_concrete
+from .._method.description_facts import configuration_residual
 from .._method.equations import dependent_speeds
 from .._method.kane import as_array, checked_inputs, refuse_incomplete
 from .._method.now import output_names, outputs_at, rates, values_of

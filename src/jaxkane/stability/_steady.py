@@ -12,7 +12,8 @@ from jaxtyping import Array, Float
 
 from .._common.lookup import by_name, hint
 from .._description.system import State, System, names_of
-from .._method.checks import check_system, configuration_residual, is_concrete
+from .._method.checks import check_system, is_concrete
+from .._method.description_facts import configuration_residual
 from .._method.equations import dependent_speeds
 from .._method.kane import as_array, checked_values
 from .._method.now import rates

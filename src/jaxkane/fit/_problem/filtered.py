@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..._description.system import System, packed, unpacked
-from ..._method.checks import configuration_residual
+from ..._method.description_facts import configuration_residual
 from ..._method.drift import has_configuration_constraints, projected
 from ..._simulation.ride import solve
 from ..._simulation.signals import with_one_times
