@@ -35,7 +35,12 @@ class Trailer(Part):
     coordinates = ("trailer_angle", "trailer_pitch")
     dependent_coordinates = ("trailer_pitch",)
     dependent_speeds = ("trailer_angle_rate", "trailer_pitch_rate")
-    units = dict.fromkeys(coordinates, "rad") | dict.fromkeys(dependent_speeds, "rad/s")
+    units = {
+        "trailer_angle": "rad",
+        "trailer_pitch": "rad",
+        "trailer_angle_rate": "rad/s",
+        "trailer_pitch_rate": "rad/s",
+    }
 
     def motion(self, bicycle, motion, t, q, u):
         heading = motion["Y"].rotate(3, q["trailer_angle"], u["trailer_angle_rate"])
