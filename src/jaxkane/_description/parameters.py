@@ -138,11 +138,14 @@ def in_batches(system: Any) -> list[str]:
 def with_parameters(system: Any, values: Mapping[str, Any]) -> Any:
     """The system with other values of some parameters, by the names of `parameters_in`; each part is made anew, and
     checked as any other."""
-    own: dict[str, Any] = {name: value for name, value in values.items() if "." not in name}
+    fields = {field.name for field in dataclasses.fields(system)}
+    own: dict[str, Any] = {}
     inner: dict[str, dict[str, Any]] = {}
     for name, value in values.items():
-        if "." in name:
-            field, _, rest = name.partition(".")
+        field, _, rest = name.partition(".")
+        if name in fields or not rest:  # the names of a mechanism's own parameters have dots too: "mass.forearm"
+            own[name] = value
+        else:
             inner.setdefault(field, {})[rest] = value
     for field, its in inner.items():
         name, _, place = field.partition("[")
