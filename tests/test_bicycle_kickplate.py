@@ -53,9 +53,11 @@ def test_accelerations_of_a_bicycle_that_slips(instants):
     for state, at in instants:
         for end in ENDS:
             law = LateralSlip(**KNOWN["laws"][end])
-            force = law.force(state["deflections"][f"{end}_lateral_deflection"] / law.relaxation_length, 0.0)
+            force = law.force(state["deflections"][f"{end}_lateral_deflection"] / law.relaxation_length, 0.0, 0.0)
             np.testing.assert_allclose(force, state["forces"][end], rtol=1e-14)
-            np.testing.assert_allclose(law.moment(force, state["cambers"][end]), state["moments"][end], rtol=1e-14)
+            np.testing.assert_allclose(
+                law.moment(force, 0.0, 0.0, state["cambers"][end]), state["moments"][end], rtol=1e-14
+            )
         rates, known = jk.speed_rates(*at), state["accelerations"]
         np.testing.assert_allclose([rates[name] for name in known], list(known.values()), rtol=1e-12, atol=1e-11)
 

@@ -13,10 +13,12 @@ from jaxkane.bicycles import (
     LateralSlip,
     LongitudinalSlip,
     MagicFormula,
+    MagicFormula89,
     Part,
     Road,
     Slope,
     Tyre,
+    schwalbe_energizer,
     sharp_motorcycle,
 )
 from jaxkane.stability import eigenvalues, linearize, steady_turn, straight_ahead
@@ -243,7 +245,7 @@ def test_a_tyre_pulls_against_its_slip(law):
     """Less than the friction that it has, nothing without slip or load, with a slope everywhere, at rest too."""
 
     def force(velocity, speed, load=400.0):
-        return law.force(law.slip(velocity, speed, 0.0, None), load)
+        return law.force(law.slip(velocity, speed, 0.0, None), load, 0.0)
 
     assert force(0.1, 5.0) < 0.0 < force(-0.1, -5.0)
     np.testing.assert_allclose(force(0.0, 0.0), 0.0, atol=1e-12)
@@ -255,11 +257,77 @@ def test_a_tyre_pulls_against_its_slip(law):
         assert float(force(1.0, 5.0, load=-10.0)) == 0.0  # a wheel that would lift does not pull
 
 
+# mechmotum/bicycle-kickplate-model at commit 6cc4d65 (BSD 3-clause), inputs.calc_nonlinear_tire_force over its factor
+# of friction 1.31917, with signs turned, as its axes are: pressure [Pa], slip angle [deg], camber [deg], load [N],
+# force [N], moment [N m].
+MEASURED = [
+    (300e3, 1.0, 0.0, 343.0, 84.76835698090714, -1.190851541852463),
+    (300e3, -4.0, 5.0, 526.0, -334.7838255839842, 4.717175159478536),
+    (300e3, 8.0, -20.0, 800.0, 338.0190805614346, -10.511075753385656),
+    (400e3, 1.0, 0.0, 343.0, 83.29686934137285, -1.0849434969232616),
+    (400e3, -4.0, 5.0, 526.0, -364.8165838400431, 3.9478925760238326),
+    (400e3, 8.0, -20.0, 800.0, 299.53332487324724, -10.80312026556378),
+    (500e3, 1.0, 0.0, 343.0, 85.436008058033, -1.1590474034601674),
+    (500e3, -4.0, 5.0, 526.0, -294.6676952348661, 3.9121966557663743),
+    (500e3, 8.0, -20.0, 800.0, 462.2265650380066, -14.191612854953153),
+]
+
+
+@pytest.mark.parametrize("pressure", [300e3, 400e3, 500e3])
+def test_a_measured_tyre_has_the_forces_of_its_formula(pressure):
+    """1e-12, with the offsets of the tyre; without them left and right are alike."""
+    law, even = schwalbe_energizer(pressure, offsets=True), schwalbe_energizer(pressure)
+    rows = [row for row in MEASURED if row[0] == pressure]
+    assert rows
+    for _, angle, camber, load, force, moment in rows:
+        at = (np.tan(np.deg2rad(angle)), load, np.deg2rad(camber))
+        np.testing.assert_allclose(law.force(*at), force, rtol=1e-12)
+        np.testing.assert_allclose(law.moment(force, *at), moment, rtol=1e-11)
+        turned = (-at[0], load, -at[2])
+        np.testing.assert_allclose(even.force(*turned), -even.force(*at), rtol=1e-12)
+        np.testing.assert_allclose(even.moment(force, *turned), -even.moment(force, *at), rtol=1e-11)
+
+
+def test_a_measured_tyre_outside_its_formula():
+    """Held past the largest slip angle, nothing where the wheel would lift, NaN with NaN slopes above its load."""
+    law = schwalbe_energizer(400e3, offsets=True)
+    ends = [law.force(np.tan(np.deg2rad(angle)), 400.0, 0.1) for angle in (10.0, 60.0)]
+    np.testing.assert_allclose(ends[1], ends[0], rtol=1e-12)
+    assert ends[0] > law.force(0.0, 400.0, 0.1) > law.force(0.0, 400.0, 0.0)  # against the slip, towards the lean
+    assert float(law.force(0.05, -1.0, 0.1)) == float(law.moment(0.0, 0.05, -1.0, 0.1)) == 0.0
+    force, slopes = jax.value_and_grad(law.force, argnums=(0, 1, 2))(0.05, 1001.0, 0.1)
+    assert np.all(np.isnan([force, *slopes]))
+    assert np.all(np.isfinite(jax.grad(law.force, argnums=(0, 1, 2))(0.0, 0.0, 0.0)))
+    assert schwalbe_energizer().moment(0.0, 0.01, 400.0, 0.0) < 0.0  # turns out of its slip
+    assert MagicFormula89(law.lateral).moment(0.0, 0.05, 400.0, 0.1) == 0.0
+
+
+@pytest.mark.slow
+def test_a_bicycle_rides_on_measured_tyres():
+    """Its weave is slower than with ideal tyres, and damped at 6 m/s; with their offsets it cannot ride straight on."""
+
+    def on(**law):
+        tyre = Tyre(crown=0.022, lateral=schwalbe_energizer(relaxation_length=0.1, **law))
+        return Bicycle.benchmark().with_parts(rear_tyre=tyre, front_tyre=tyre)
+
+    speeds = jnp.linspace(5.0, 6.0, 5)
+    weave, ideal = (eigenvalues(each, speeds)["weave"][-1, 0] for each in (on(), Bicycle.benchmark()))
+    assert weave.real < 0.0
+    assert 0.9 * abs(ideal.imag) < abs(weave.imag) < abs(ideal.imag)
+    uneven = on(offsets=True)
+    with pytest.raises(ValueError, match="this motion is not steady"):
+        linearize(uneven, straight_ahead(uneven, 5.0))
+
+
 def test_tyres_and_roads_that_cannot_be_are_refused():
     with pytest.raises(ValueError, match=r"cornering_stiffness = 0\.0 must be positive"):
         LateralSlip(0.0)
     with pytest.raises(ValueError, match=r"relaxation_length = 0\.0 must be positive"):
         LateralSlip(9000.0, relaxation_length=0.0)
+    with pytest.raises(ValueError, match=r"350000\.0 Pa was not measured"):
+        schwalbe_energizer(350e3)
+    with pytest.raises(ValueError, match=r"largest_load = 0\.0 must be positive"):
+        MagicFormula89(jnp.ones(14), largest_load=0.0)
     with pytest.raises(ValueError, match="one number"):
         Road(lambda x, y: jnp.array([x, y])).at(0.0, 0.0)
     with pytest.raises(TypeError, match="`road` is a Ground"):

@@ -15,6 +15,8 @@ from ._ground import Ground as Ground
 from ._ground import Road as Road
 from ._ground import Slope as Slope
 from ._head import HeadTwist as HeadTwist
+from ._measured import MagicFormula89 as MagicFormula89
+from ._measured import schwalbe_energizer as schwalbe_energizer
 from ._motorcycle import sharp_motorcycle as sharp_motorcycle
 from ._part import Part as Part
 from ._path import LaneChange as LaneChange

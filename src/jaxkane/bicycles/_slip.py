@@ -33,15 +33,16 @@ class Slip(eqx.Module):
         check_parameters(self)
 
     @abc.abstractmethod
-    def force(self, slip: Component, load: Component) -> Component:
-        """[N] of the ground on the tyre; `slip`: positive where the contact moves to the negative side; `load` [N]."""
+    def force(self, slip: Component, load: Component, camber: Component) -> Component:
+        """[N] of the ground on the tyre; `slip`: positive where the contact moves to the negative side; `load` [N];
+        `camber` [rad], of which `slip` has the `equivalent`."""
 
     def equivalent(self, camber: Component) -> Component:
         """The slip that would give the force of a camber angle [rad]."""
         return 0.0
 
-    def moment(self, force: Component, camber: Component) -> Component:
-        """[N m] about the ground's normal, downwards."""
+    def moment(self, force: Component, slip: Component, load: Component, camber: Component) -> Component:
+        """[N m] about the ground's normal, downwards; `force` [N] is that of these arguments."""
         return 0.0
 
     def slip(self, velocity: Component, speed: Component, camber: Component, deflection: Component | None) -> Component:
@@ -64,7 +65,7 @@ class _Aligning(Slip):
         pneumatic_trail: Scalar | None
         twisting_stiffness: Scalar | None
 
-    def moment(self, force, camber):
+    def moment(self, force, slip, load, camber):
         moment: Component = 0.0
         if self.pneumatic_trail is not None:
             moment = moment - self.pneumatic_trail * force
@@ -89,7 +90,7 @@ class LateralSlip(_Aligning):
     pneumatic_trail: Scalar | None = parameter(None, unit="m")
     twisting_stiffness: Scalar | None = parameter(None, unit="N m/rad")
 
-    def force(self, slip, load):
+    def force(self, slip, load, camber):
         return self.cornering_stiffness * slip
 
     def equivalent(self, camber):
@@ -118,7 +119,7 @@ class MagicFormula(_Aligning):
     pneumatic_trail: Scalar | None = parameter(None, unit="m")
     twisting_stiffness: Scalar | None = parameter(None, unit="N m/rad")
 
-    def force(self, slip, load):
+    def force(self, slip, load, camber):
         b = self.stiffness / (self.shape * self.friction) * slip
         b = b - self.curvature * (b - jnp.arctan(b))
         carried = jnp.maximum(load, 0.0)  # a wheel that would lift does not pull
@@ -137,5 +138,5 @@ class LongitudinalSlip(Slip):
     stiffness: Scalar = parameter(positive=True, unit="N")
     relaxation_length: Scalar | None = parameter(None, positive=True, unit="m")
 
-    def force(self, slip, load):
+    def force(self, slip, load, camber):
         return self.stiffness * slip

@@ -94,9 +94,11 @@ class Tyre(eqx.Module):
 
     def forces(self, contact: Contact, load: Component, deflection: dict[str, Component]) -> dict[str, Component]:
         """Of the ground on the tyre [N], by direction. `load` [N]; `deflection` [m] by direction."""
-        return {
-            name: law.force(law.slip(*_moving(name, contact), deflection.get(name)), load) for name, law in self.laws
-        }
+        return {name: law.force(slip, load, contact.camber) for name, law, slip in self._slips(contact, deflection)}
+
+    def _slips(self, contact: Contact, deflection: dict[str, Component]) -> Iterator[tuple[str, Slip, Component]]:
+        for name, law in self.laws:
+            yield name, law, law.slip(*_moving(name, contact), deflection.get(name))
 
     def deflection_rates(self, contact: Contact, deflection: dict[str, Component]) -> Iterator[Component]:
         for name, law in self.laws:
@@ -107,10 +109,10 @@ class Tyre(eqx.Module):
         self, contact: Contact, wheel: Body, radius: Component, load: Component, deflection: dict[str, Component]
     ) -> Iterator[Force | Torque]:
         """What the ground does to the wheel, the force of ideal rolling apart."""
-        forces = self.forces(contact, load, deflection)
-        for name, law in self.laws:
-            yield Force(forces[name] * _direction(name, contact), contact.point)
-            moment = law.moment(forces[name], contact.camber)
+        for name, law, slip in self._slips(contact, deflection):
+            force = law.force(slip, load, contact.camber)
+            yield Force(force * _direction(name, contact), contact.point)
+            moment = law.moment(force, slip, load, contact.camber)
             if not is_zero(moment):
                 yield Torque(moment * contact.normal, wheel)
         if self.rolling_resistance is not None:
