@@ -145,8 +145,9 @@ def unrolled(program: Jaxpr, consts: Sequence[Any], inputs: Sequence[np.ndarray]
 
 def as_constants(x: Any, graph: Graph) -> np.ndarray:
     x = np.asarray(x)
-    if str(x.dtype) in DTYPES:
-        return _each(lambda v: graph.constant(v, str(x.dtype)), x)
+    dtype = _name_of(x.dtype)
+    if dtype in DTYPES:
+        return _each(lambda v: graph.constant(v, dtype), x)
     return x  # whole numbers: exponents, places
 
 
@@ -156,25 +157,28 @@ def applied(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.ndarra
         inner = equation.params[_OPENED[equation.primitive.name]]
         return unrolled(inner.jaxpr, inner.consts, xs, graph)
     avals: list[Any] = [v.aval for v in equation.outvars]
-    return [np.broadcast_to(x, aval.shape) for x, aval in zip(_operation(equation, xs, graph), avals, strict=True)]
+    found = zip(_operation(equation, xs, graph), avals, strict=True)
+    return [x if x.shape == aval.shape else np.broadcast_to(x, aval.shape) for x, aval in found]
 
 
 def _each(f: Callable[..., int], *xs: np.ndarray) -> np.ndarray:
-    xs = np.broadcast_arrays(*xs)
-    out = np.empty(xs[0].shape, dtype=np.int64)
-    for place in np.ndindex(out.shape):
-        out[place] = f(*(x[place] for x in xs))
-    return out
+    if any(x.shape != xs[0].shape for x in xs):
+        xs = np.broadcast_arrays(*xs)
+    found = [f(*numbers) for numbers in zip(*(x.ravel().tolist() for x in xs), strict=True)]
+    return np.array(found, np.int64).reshape(xs[0].shape)
+
+
+_name_of = functools.cache(str)  # of a dtype; NumPy composes it anew each time
 
 
 def _operation(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.ndarray]:
     name, params, aval = equation.primitive.name, equation.params, equation.outvars[0].aval
     name = "add" if name == "add_any" else name
-    dtype = str(aval.dtype)
-    x_dtype = str(equation.invars[0].aval.dtype) if equation.invars else dtype
+    dtype = _name_of(aval.dtype)
+    x_dtype = _name_of(equation.invars[0].aval.dtype) if equation.invars else dtype
 
     def each(operation: str, *ys: np.ndarray, dtype: str = dtype) -> np.ndarray:
-        return _each(lambda *numbers: graph.apply(operation, tuple(map(int, numbers)), dtype), *ys)
+        return _each(lambda *numbers: graph.apply(operation, numbers, dtype), *ys)
 
     moved = _moved(name, params, xs, aval.shape)
     if moved is not None:
@@ -183,7 +187,7 @@ def _operation(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.nda
         return [_each(lambda v: graph.constant(v, dtype), xs[0])]  # whole numbers are constants here
     if x_dtype not in DTYPES or dtype not in DTYPES:
         raise NotScalarError(f"{name} of {x_dtype}")
-    one = _full((), 1.0, graph, dtype) if dtype in FLOATS else xs[0]
+    one = np.array(graph.constant(1.0, dtype)) if dtype in FLOATS else xs[0]
     match name:
         case "eq" | "ne" if x_dtype == "bool":  # as jnp.mod asks whether two signs differ
             differ = each("xor", *xs)
@@ -229,7 +233,7 @@ def _operation(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.nda
         return [each(name, *xs)]
     if name in COMPARISONS and x_dtype in FLOATS:
         return [each(name, *xs)]
-    of_one_type = dtype in FLOATS and all(str(v.aval.dtype) == dtype for v in equation.invars)
+    of_one_type = dtype in FLOATS and all(_name_of(v.aval.dtype) == dtype for v in equation.invars)
     if of_one_type and name in ARITHMETIC | SIMPLE | LIBRARY:
         return [each(name, *xs)]
     raise NotScalarError(f"{name} of {x_dtype}")
