@@ -112,6 +112,7 @@ def test_few_files_see_the_integrator():
         "ride",
         "settings",
         "kinks",
+        "stages",
         "stops",
     }
 

@@ -24,7 +24,7 @@ from .._description.system import State, System, packed, unpacked
 from .._description.values import Values
 from .._description.vectors import Frame, Point, Vector
 from .._scalars.components import add3, component, cross, is_exact
-from .._scalars.fuse import fused
+from .._scalars.fuse import fused, is_native
 from .._scalars.linear import as_vector, is_written_out
 from .._scalars.types import Component
 from .kane import Inputs, Instant, Row, as_row, inputs_of, jvp
@@ -202,6 +202,11 @@ def packed_rates(system: System, t: Array, y: Array, inputs: Mapping[str, Any]) 
     q_dot, u_dot = motion_rates(system, t, state.q, state.u, values)
     x_dot = first_order_rates(system, t, state.q, state.u, values, u_dot) if system.states else None
     return packed(State(q_dot, u_dot, x_dot))
+
+
+def rates_are_native(system: System, t: Array, y: Array, inputs: Mapping[str, Any]) -> bool:
+    """Whether `packed_rates` of these is one native kernel."""
+    return is_written_out(len(system.speeds)) and is_native(_packed_rates, system, t, y, dict(inputs))
 
 
 def values_of(system: System, x: Array | None, inputs: Mapping[str, Any]) -> dict[str, Any]:

@@ -110,8 +110,17 @@ def fused(f: Callable[..., Any]) -> Callable[..., Any]:
         program, structure = found
         return jax.tree.unflatten(structure, program(*leaves))
 
-    vars(call)["find"] = find  # for `numbers`
+    vars(call)["find"] = find  # for `numbers` and `is_native`
     return call
+
+
+def is_native(f: Callable[..., Any], *args: Any) -> bool:
+    """Whether a fused function of these becomes a native kernel, a call of which costs nothing to compile."""
+    if not native.is_on() or jax.default_backend() != "cpu":
+        return False
+    leaves, treedef = jax.tree.flatten(args)
+    found = vars(f)["find"](leaves, treedef, args)
+    return bool(found and found[0].scalars())
 
 
 class _CapturedError(Exception):

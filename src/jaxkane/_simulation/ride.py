@@ -19,7 +19,7 @@ from .._method.checks import configuration_is_met
 from .._method.drift import correction, has_configuration_constraints, projected
 from .._method.equations import _dependent_speeds
 from .._method.kane import Instant, checked_inputs
-from .._method.now import outputs_at, packed_rates, values_of
+from .._method.now import outputs_at, packed_rates, rates_are_native, values_of
 from .._scalars.fuse import fused
 from .._scalars.nan import all_finite, derivative_free_where_not_finite, flat, nan_derivative_where, nan_where
 from .._scalars.reads import compiled
@@ -28,6 +28,7 @@ from .events import Events, at_zero, events_of, watched
 from .kinks import ToKinks
 from .settings import Settings, refuse_held
 from .signals import evaluate, for_fixed_steps, sample_times, signals_are_sound, with_own_times, without_nonsense
+from .stages import WrittenOut
 from .stops import AdaptiveToStops, Limits, Quantities, ToStops
 from .trajectory import Status, Trajectory
 
@@ -94,12 +95,14 @@ def solve(
     forward = isinstance(settings.adjoint, diffrax.ForwardMode)
     events = events_of(system, ts[0], state)
     stops = bool(events.names or system.dependent_speeds)
+    solver, inputs = settings.solver, inputs_at(system, signals, ts[0], state)
+    is_native = rates_are_native(system, ts[0], start, inputs)
     step, controller, reach = _steps(ts, signals, settings)
     if stops:
         controller = _to_stops(controller, vector_field, events, system, ts, reach)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(vector_field if forward else trial_rates),
-        settings.solver,
+        WrittenOut(solver) if is_native and isinstance(solver, diffrax.AbstractERK) else solver,
         ts[0],
         ts[-1],
         step,
