@@ -14,10 +14,10 @@ from jaxkane._simulation.stages import WrittenOut
 
 
 def motion(solver, jump, args):
-    """A pendulum whose length changes at a jump, at eight times."""
+    """A pendulum at eight times, whose length changes at a jump."""
 
     def rates(t, y, args):
-        return jnp.stack([y[1], -args * jnp.where(t < 0.9, 1.0, 2.0) * jnp.sin(y[0])])
+        return jnp.stack([y[1], -args * jnp.where(t < 0.9, 1.0, 2.0 if jump else 1.0) * jnp.sin(y[0])])
 
     control = diffrax.PIDController(rtol=1e-7, atol=1e-7)
     if jump:
