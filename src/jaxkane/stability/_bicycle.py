@@ -21,10 +21,23 @@ LATERAL = ("roll", "steer", "roll_rate", "steer_rate")
 
 
 def straight_ahead(bicycle: WhippleBicycle, speed: Component) -> State:
-    """A bicycle that rolls straight ahead and upright at `speed` [m/s].
+    """A bicycle that rolls straight ahead and upright at `speed` [m/s] without a drive, as is steady on level ground.
 
-    **Raises:** `ValueError` for a bicycle whose speed is prescribed.
+    Where drag, rolling resistance or a slope take a drive, `steady_turn` finds it:
+
+        steady_turn(bicycle, hold={"roll": 0.0, "yaw": 0.0, "rear_wheel_rate": -speed / bicycle.rR},
+                    find=("drive_torque",))
+
+    (on a slope that rises along x; on level ground without "yaw", which is cyclic there).
+
+    **Raises:** `ValueError` for a bicycle whose speed is prescribed, and for one on a road of given height.
     """
+    if getattr(getattr(bicycle, "road", None), "curved", False):
+        raise ValueError(
+            f"{type(bicycle).__name__}: along a Road of given height no ride is steady, not even on one that rises "
+            "evenly: coordinates follow its place. For an even grade give the bicycle a Slope(angle); the linear model "
+            "at one instant of any ride is linearize(bicycle, state, inputs, states=bicycle.lateral, steady=False)."
+        )
     if "rear_wheel_rate" not in bicycle.speeds:
         raise ValueError(
             f"{type(bicycle).__name__}: a part holds its speed, so that there is no family over speeds. Leave it out, "

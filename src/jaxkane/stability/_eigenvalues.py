@@ -100,10 +100,13 @@ def eigenvalues(
     is extrapolated, and its eigenvector: the assignment with the least sum of both changes. Under a trace, where names
     cannot depend on values, a mode whose name is not clear is NaN; give `modes` to have it.
 
-    **Raises:** `ValueError` as `linearize`, and where there is no default motion.
+    **Raises:** `ValueError` as `linearize`, and where there is no default motion, or none of `values` has a steady one.
+    Of a motion that is given, values without a steady one are NaN.
     """
     values, at, states, groups = family_of(system, values, motion, states)
     found, kept, clear = _along(system, values, at, states, groups)
+    if motion is None and is_concrete(found.values) and not np.isfinite(np.asarray(found.values)).any():
+        matrix(system, values[0], at, states)  # which says why
     if modes is None:
         modes, found = _named(found, kept, groups, clear, (system, values))
     if len(modes) != len(kept):
