@@ -13,7 +13,7 @@ from jaxkane._scalars import jax_internals as internals
 from jaxkane._scalars.fuse import fused
 
 USED = {
-    "jax.extend.core": "ClosedJaxpr Jaxpr Literal Primitive jaxpr_as_fun",
+    "jax.extend.core": "ClosedJaxpr Jaxpr JaxprEqn Literal Primitive jaxpr_as_fun",
     "jax.interpreters.ad": "Zero instantiate_zeros is_undefined_primal primitive_jvps primitive_transposes",
     "jax.interpreters.batching": "primitive_batchers",
     "jax.interpreters.mlir": "lower_fun register_lowering",

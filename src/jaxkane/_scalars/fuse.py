@@ -31,13 +31,13 @@ from .jax_internals import (
     Jaxpr,
     Literal,
     as_lowering,
-    bound,
     dce_jaxpr,
     instantiate_zeros,
     is_no_tangent,
     is_undefined_primal,
     jaxpr_as_fun,
     new_primitive,
+    new_variable,
     one_function,
     settings,
 )
@@ -410,32 +410,57 @@ def without_repetition(program: ClosedJaxpr) -> ClosedJaxpr:
     A description is read once for every speed, and much of it comes out the same. XLA would find that too, but only
     after JAX has differentiated every copy.
     """
-    once = jax.make_jaxpr(lambda *args: _evaluate_once(program.jaxpr, program.consts, args, {}))(
-        *_specs(program.in_avals)
-    )
-    jaxpr, _ = dce_jaxpr(once.jaxpr, [True] * len(once.jaxpr.outvars), instantiate=True)
-    return ClosedJaxpr(jaxpr, once.consts)
+    once = _Once()
+    outputs = once.walk(program.jaxpr, program.consts, program.jaxpr.invars)
+    jaxpr = program.jaxpr.replace(constvars=[*once.consts], eqns=once.equations, outvars=outputs)
+    jaxpr, _ = dce_jaxpr(jaxpr, [True] * len(outputs), instantiate=True)
+    return ClosedJaxpr(jaxpr, [*once.consts.values()])
 
 
-def _evaluate_once(program: Jaxpr, consts: Sequence[Any], args: Sequence[Any], known: dict[Any, Any]) -> list[Any]:
-    values: dict[Any, Any] = dict(zip((*program.constvars, *program.invars), (*consts, *args), strict=True))
-    read = lambda v: v.val if isinstance(v, Literal) else values[v]  # noqa: E731
-    for equation in program.eqns:
-        inputs = [read(v) for v in equation.invars]
-        inner = _called(equation)
-        if inner is not None:
-            outputs = _evaluate_once(inner.jaxpr, inner.consts, inputs, known)
-        else:
-            # Numbers by their bits, all else by identity: `known` keeps what it names alive.
-            names = [_bits(v) if isinstance(v, Literal) else id(read(v)) for v in equation.invars]
-            key = (equation.primitive, *names, _name_of(equation))
-            if key not in known:
-                is_product = equation.primitive.name == "dot_general" and is_small(equation)
-                outputs = sum_of_products(equation, *inputs) if is_product else bound(equation, inputs)
-                known[key] = outputs if equation.primitive.multiple_results else [outputs], inputs
-            outputs = known[key][0]
-        values.update(zip(equation.outvars, outputs, strict=True))
-    return [read(v) for v in program.outvars]
+class _Once:
+    """Equations of programs in one list, each once. They are put down as they stand and not traced anew, which would
+    take as long as all else that is done to a program."""
+
+    def __init__(self) -> None:
+        self.equations: list[Any] = []
+        self.consts: dict[Any, Any] = {}  # by their variables
+        self._known: dict[Any, Sequence[Any]] = {}  # the outputs of an equation, by its name
+
+    def walk(self, program: Jaxpr, consts: Sequence[Any], inputs: Sequence[Any]) -> list[Any]:
+        """The variables of a program's outputs, where its inputs are these variables or literals."""
+        values: dict[Any, Any] = dict(zip(program.invars, inputs, strict=True))
+        values.update((v, self._const(v, x)) for v, x in zip(program.constvars, consts, strict=True))
+        read = lambda v: v if isinstance(v, Literal) else values[v]  # noqa: E731
+        for equation in program.eqns:
+            xs = [read(v) for v in equation.invars]
+            inner = _called(equation)
+            if inner is not None:
+                outputs = self.walk(inner.jaxpr, inner.consts, xs)
+            else:
+                # Numbers by their bits, all else by identity.
+                names = [_bits(x) if isinstance(x, Literal) else id(x) for x in xs]
+                key = (equation.primitive, *names, _name_of(equation))
+                if key not in self._known:
+                    self._known[key] = self._put_down(equation, xs)
+                outputs = self._known[key]
+            values.update(zip(equation.outvars, outputs, strict=True))
+        return [read(v) for v in program.outvars]
+
+    def _const(self, variable: Any, value: Any) -> Any:
+        key = ("const", id(value))
+        if key not in self._known:
+            self._known[key] = [new_variable(variable)]
+            self.consts[self._known[key][0]] = value  # which keeps it alive, and its id its own
+        return self._known[key][0]
+
+    def _put_down(self, equation: Any, xs: list[Any]) -> Sequence[Any]:
+        if equation.primitive.name == "dot_general" and is_small(equation):
+            specs = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in xs]
+            product = jax.make_jaxpr(functools.partial(sum_of_products, equation))(*specs)
+            return self.walk(product.jaxpr, product.consts, xs)
+        outputs = [*map(new_variable, equation.outvars)]  # a program may be opened twice
+        self.equations.append(equation.replace(invars=xs, outvars=outputs))
+        return outputs
 
 
 def _bits(literal: Any) -> tuple[bytes, str]:

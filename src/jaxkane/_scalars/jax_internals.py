@@ -18,6 +18,7 @@ Each has a way back, so that where a release takes it away, results stay right a
 from __future__ import annotations
 
 import contextlib
+import copy
 import importlib
 from collections.abc import Callable
 from typing import Any
@@ -27,11 +28,13 @@ from jax.core import Tracer
 
 FUSES: str | None = None  # why programs cannot be fused, or None
 try:
-    from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, Primitive, jaxpr_as_fun
+    from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, jaxpr_as_fun
     from jax.interpreters import ad, batching, mlir
     from jax.interpreters.ad import instantiate_zeros, is_undefined_primal
     from jax.interpreters.partial_eval import dce_jaxpr
-except ImportError as error:
+
+    _ = Jaxpr.replace, JaxprEqn.replace
+except (ImportError, AttributeError) as error:
     FUSES = f"this JAX lacks what that needs ({error})"
     missing: Any = None
     ClosedJaxpr = Jaxpr = Literal = Primitive = missing
@@ -72,6 +75,11 @@ def bound(equation: Any, inputs: list[Any]) -> Any:
     """What an equation of a jaxpr does, to other inputs; with its own rules for derivatives, where it has some."""
     primitive = equation.primitive
     return primitive.bind(*inputs, **primitive.get_bind_params(equation.params))
+
+
+def new_variable(like: Any) -> Any:
+    """A variable of a jaxpr, of the same type as another; they are told apart by identity."""
+    return copy.copy(like)
 
 
 def is_moved_forward(x: Any) -> bool:
