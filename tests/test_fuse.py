@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from jaxkane._scalars import fuse
-from jaxkane._scalars.fuse import fused, without_repetition
+from jaxkane._scalars.fuse import fused
 from jaxkane._scalars.linear import determinant, solve
+from jaxkane._scalars.repetition import without_repetition
 
 
 def plain(a, b, x):

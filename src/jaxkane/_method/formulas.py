@@ -16,11 +16,11 @@ import numpy as np
 
 from .._description.parameters import ParameterInfo, declared, in_batches, leaf_name
 from .._description.system import System
-from .._scalars.fuse import without_repetition
 from .._scalars.graph import Graph, NotScalarError, unrolled
 from .._scalars.jacobian import jacobian
 from .._scalars.jax_internals import FUSES, ClosedJaxpr, jaxpr_as_fun
 from .._scalars.linear import as_vector, is_written_out
+from .._scalars.repetition import without_repetition
 from .checks import check_system, is_concrete
 from .equations import (
     constraint_jacobian,

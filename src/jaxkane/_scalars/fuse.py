@@ -16,53 +16,31 @@ from __future__ import annotations
 import functools
 import math
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
 
 import jax
-import numpy as np
 from jax.core import Tracer
 
 from . import native
-from .graph import CALLS, NotScalarError
+from .graph import NotScalarError
 from .jax_internals import (
     FUSES,
     ClosedJaxpr,
-    Jaxpr,
-    Literal,
     as_lowering,
-    dce_jaxpr,
     instantiate_zeros,
     is_no_tangent,
     is_undefined_primal,
     jaxpr_as_fun,
     new_primitive,
-    new_variable,
-    one_function,
     settings,
 )
 from .native import Scalars
-from .products import is_small, sum_of_products
+from .pieces import in_pieces, replaced
 from .reads import naming_what_is_kept, on_forget, settling, version_of
+from .repetition import PROGRAM, foreign, is_plain, without_repetition
 
-# What one compiled function may hold: elementwise work and the moving of scalars. Calls into libraries (LAPACK) may not
-# be compiled so, and loops would gain nothing.
-_PLAIN = frozenset(
-    "abs acos acosh add add_any and asin asinh atan atan2 atanh broadcast_in_dim cbrt ceil clamp concatenate "
-    "convert_element_type copy copy_p cos cosh div eq erf exp exp2 expm1 floor ge gt integer_pow is_finite jit le "
-    "log log1p logistic lt max min mul ne neg not one_minus_square or pad pjit pow reduce_and reduce_max reduce_min "
-    "reduce_or reduce_prod reduce_sum rem reshape rev round rsqrt select_n sign sin sinh slice split sqrt square "
-    "squeeze stack stop_gradient sub tan tanh transpose unstack xor".split()
-)
-_LARGEST_SUM = 64  # XLA may hand larger ones to a library
 _MOST_LANES = 128  # in XLA's hands: with more, intermediates no longer stay in the cache
-# XLA's time to compile a function grows faster than its length, above all where values of the beginning are needed at
-# the end, as in a reverse derivative: 6000 equations take 17 s whole, and 2.5 s in pieces.
-_WHOLE_UP_TO = 2500
-_PIECE = 250
-
-# In the name of each call of the method itself into LAPACK.
-BY_LAPACK = "by_lapack"
 
 Where = tuple[tuple[bool, ...], ...]
 
@@ -83,10 +61,10 @@ def fused(f: Callable[..., Any]) -> Callable[..., Any]:
         )
         if any(isinstance(c, Tracer) for c in program.consts):
             raise _CapturedError
-        foreign = list(_foreign(program.jaxpr))
-        if any(where for _, where in foreign):
-            _tell_foreign(label, dict.fromkeys(name for name, where in foreign if where))
-        return None if foreign else (_Program(program, label), jax.tree.structure(out))
+        inside = list(foreign(program.jaxpr))
+        if any(where for _, where in inside):
+            _tell_foreign(label, dict.fromkeys(name for name, where in inside if where))
+        return None if inside else (_Program(program, label), jax.tree.structure(out))
 
     on_forget(program_for.cache_clear)
 
@@ -183,7 +161,7 @@ class _Program:
             places = [i for i, m in enumerate(moving) if m]
 
             def of_moving(*ys):
-                return self.evaluate(*[*_replaced(xs, places, ys)])
+                return self.evaluate(*[*replaced(xs, places, ys)])
 
             return jax.jvp(of_moving, [xs[i] for i in places], dxs)[1]
 
@@ -198,8 +176,8 @@ class _Program:
 
         def cotangents(*args):
             known, cts = args[: len(others)], args[len(others) :]
-            full = _replaced([None] * len(linear), others, known)
-            of_linear = lambda *ys: self.evaluate(*_replaced(full, places, ys))  # noqa: E731
+            full = replaced([None] * len(linear), others, known)
+            of_linear = lambda *ys: self.evaluate(*replaced(full, places, ys))  # noqa: E731
             return jax.linear_transpose(of_linear, *[specs[i] for i in places])(list(cts))
 
         return _Program(jax.make_jaxpr(cotangents)(*[specs[i] for i in others], *_specs(self.out_avals)), self.label)
@@ -244,13 +222,6 @@ class _Program:
 
 def _chosen(sizes: Sequence[int], has: Sequence[bool]) -> tuple[int, ...]:
     return tuple(n for n, h in zip(sizes, has, strict=True) if h)
-
-
-def _replaced(values: Sequence[Any], places: Sequence[int], new: Sequence[Any]) -> list[Any]:
-    values = list(values)
-    for i, x in zip(places, new, strict=True):
-        values[i] = x
-    return values
 
 
 # A call stands for a batch over leading axes `sizes`; input i has those of them that `where[i]` says, outputs have all.
@@ -316,14 +287,7 @@ def _as_one_function(*args, program, sizes, where):
     program = program.batched(sizes, where) if sizes else program
     if not program.is_plain or 0 in sizes:
         return program.evaluate(*args)
-
-    if len(program.program.jaxpr.eqns) <= _WHOLE_UP_TO:
-        return _one_function(program.evaluate, args)
-    jaxpr = program.program.jaxpr
-    values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*program.program.consts, *args), strict=True))
-    for piece in _pieces(jaxpr):
-        values.update(zip(piece.outputs, _one_function(piece, [values[v] for v in piece.inputs]), strict=True))
-    return [v.val if isinstance(v, Literal) else values[v] for v in jaxpr.outvars]
+    return in_pieces(program.program, args)
 
 
 def _in_chunks(args, program, sizes, where):
@@ -342,47 +306,6 @@ def _in_chunks(args, program, sizes, where):
     return jax.lax.fori_loop(0, -(-n // size), chunk, empty)
 
 
-def _one_function(f: Callable[..., Any], args: Sequence[Any]) -> Any:
-    # XLA aborts on a parameter that its simplified program no longer reads. The sum reads them all, and the barrier
-    # hides constant arguments, which XLA would write into the program in the parameter's stead.
-    places = [i for i, x in enumerate(args) if x.size]
-
-    def values_and_sum(*some):
-        return f(*_replaced(args, places, some)), sum(x[(0,) * x.ndim].astype(float) for x in some)
-
-    with one_function():
-        values, _ = jax.jit(values_and_sum)(*jax.lax.optimization_barrier([args[i] for i in places]))
-    return values
-
-
-class _Piece(NamedTuple):
-    """Some equations of a program, one after the other: a function of the variables `inputs`."""
-
-    inputs: list[Any]
-    outputs: list[Any]
-    equations: Sequence[Any]
-
-    def __call__(self, *args: Any) -> list[Any]:
-        values = dict(zip(self.inputs, args, strict=True))
-        for equation in self.equations:
-            inputs = [v.val if isinstance(v, Literal) else values[v] for v in equation.invars]
-            outputs = equation.primitive.bind(*inputs, **equation.params)
-            values.update(zip(equation.outvars, outputs if equation.primitive.multiple_results else [outputs]))
-        return [values[v] for v in self.outputs]
-
-
-def _pieces(program: Jaxpr) -> list[_Piece]:
-    read_later = {v for v in program.outvars if not isinstance(v, Literal)}
-    pieces = []
-    for start in reversed(range(0, len(program.eqns), _PIECE)):
-        equations = program.eqns[start : start + _PIECE]
-        made = {v for e in equations for v in e.outvars}
-        read = dict.fromkeys(v for e in equations for v in e.invars if not isinstance(v, Literal) and v not in made)
-        pieces.append(_Piece(list(read), [v for e in equations for v in e.outvars if v in read_later], equations))
-        read_later |= set(read)
-    return pieces[::-1]
-
-
 def _lower_on_cpu(context, *args, program, sizes, where):
     target = program.target(sizes, where)
     if target is None:
@@ -392,7 +315,7 @@ def _lower_on_cpu(context, *args, program, sizes, where):
 
 if FUSES is None:
     _program_p = new_primitive(
-        "scalar_program",
+        PROGRAM,
         evaluate=_run,
         shapes=_abstract,
         jvp=_jvp,
@@ -401,105 +324,3 @@ if FUSES is None:
         traced=_inlined,
         lower_on_cpu=_lower_on_cpu,
     )
-
-
-def without_repetition(program: ClosedJaxpr) -> ClosedJaxpr:
-    """The same program with every common subexpression once, and without what no output needs; products of small
-    matrices, which XLA would hand to a library, are sums of products.
-
-    A description is read once for every speed, and much of it comes out the same. XLA would find that too, but only
-    after JAX has differentiated every copy.
-    """
-    once = _Once()
-    outputs = once.walk(program.jaxpr, program.consts, program.jaxpr.invars)
-    jaxpr = program.jaxpr.replace(constvars=[*once.consts], eqns=once.equations, outvars=outputs)
-    jaxpr, _ = dce_jaxpr(jaxpr, [True] * len(outputs), instantiate=True)
-    return ClosedJaxpr(jaxpr, [*once.consts.values()])
-
-
-class _Once:
-    """Equations of programs in one list, each once. They are put down as they stand and not traced anew, which would
-    take as long as all else that is done to a program."""
-
-    def __init__(self) -> None:
-        self.equations: list[Any] = []
-        self.consts: dict[Any, Any] = {}  # by their variables
-        self._known: dict[Any, Sequence[Any]] = {}  # the outputs of an equation, by its name
-
-    def walk(self, program: Jaxpr, consts: Sequence[Any], inputs: Sequence[Any]) -> list[Any]:
-        """The variables of a program's outputs, where its inputs are these variables or literals."""
-        values: dict[Any, Any] = dict(zip(program.invars, inputs, strict=True))
-        values.update((v, self._const(v, x)) for v, x in zip(program.constvars, consts, strict=True))
-        read = lambda v: v if isinstance(v, Literal) else values[v]  # noqa: E731
-        for equation in program.eqns:
-            xs = [read(v) for v in equation.invars]
-            inner = _called(equation)
-            if inner is not None:
-                outputs = self.walk(inner.jaxpr, inner.consts, xs)
-            else:
-                # Numbers by their bits, all else by identity.
-                names = [_bits(x) if isinstance(x, Literal) else id(x) for x in xs]
-                key = (equation.primitive, *names, _name_of(equation))
-                if key not in self._known:
-                    self._known[key] = self._put_down(equation, xs)
-                outputs = self._known[key]
-            values.update(zip(equation.outvars, outputs, strict=True))
-        return [read(v) for v in program.outvars]
-
-    def _const(self, variable: Any, value: Any) -> Any:
-        key = ("const", id(value))
-        if key not in self._known:
-            self._known[key] = [new_variable(variable)]
-            self.consts[self._known[key][0]] = value  # which keeps it alive, and its id its own
-        return self._known[key][0]
-
-    def _put_down(self, equation: Any, xs: list[Any]) -> Sequence[Any]:
-        if equation.primitive.name == "dot_general" and is_small(equation):
-            specs = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in xs]
-            product = jax.make_jaxpr(functools.partial(sum_of_products, equation))(*specs)
-            return self.walk(product.jaxpr, product.consts, xs)
-        outputs = [*map(new_variable, equation.outvars)]  # a program may be opened twice
-        self.equations.append(equation.replace(invars=xs, outvars=outputs))
-        return outputs
-
-
-def _bits(literal: Any) -> tuple[bytes, str]:
-    return np.asarray(literal.val).tobytes(), str(literal.aval)  # -0.0 == 0.0, and an array's text is rounded
-
-
-def _name_of(equation: Any) -> Any:
-    """What two equations that do the same have in common: their parameters; itself where these cannot be compared."""
-    key = tuple(sorted(equation.params.items()))
-    try:
-        hash(key)
-    except TypeError:
-        return id(equation)
-    return key
-
-
-def _called(equation: Any) -> ClosedJaxpr | None:
-    """What an equation stands for: a program within a program is opened, so that the whole is one."""
-    if equation.primitive is _program_p:
-        program, sizes, where = (equation.params[k] for k in ("program", "sizes", "where"))
-        return (program.batched(sizes, where) if sizes else program).program
-    return equation.params["jaxpr"] if equation.primitive.name in CALLS else None
-
-
-def is_plain(program: Jaxpr) -> bool:
-    """Whether a program can be one compiled function."""
-    return not any(_foreign(program))
-
-
-def _foreign(program: Jaxpr, is_ours: bool = False) -> Iterator[tuple[str, bool]]:
-    """The operations that cannot be part of one compiled function, and whether they are the description's own: the
-    method itself has LAPACK solve what is too large to be written out (`_linear`)."""
-    for equation in program.eqns:
-        name, inner = equation.primitive.name, _called(equation)
-        if inner is not None:
-            yield from _foreign(inner.jaxpr, is_ours or BY_LAPACK in equation.params.get("name", ""))
-        elif name == "dot_general" and is_small(equation):
-            continue  # see `without_repetition`
-        elif name not in _PLAIN:
-            yield name, not is_ours
-        elif name.startswith("reduce_") and getattr(equation.invars[0].aval, "size", 0) > _LARGEST_SUM:
-            yield f"{name} of more than {_LARGEST_SUM}", not is_ours

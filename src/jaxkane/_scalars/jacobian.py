@@ -13,9 +13,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from .fuse import without_repetition
 from .graph import Graph, applied, as_constants
 from .jax_internals import ClosedJaxpr, Literal, jaxpr_as_fun, types_of
+from .repetition import without_repetition
 
 Direction = tuple[int, int]  # an argument and the place of the element in it
 

@@ -18,10 +18,10 @@ import numpy as np
 from jax.core import Tracer
 
 from .components import add, is_exact, mul, sub
-from .fuse import is_plain, without_repetition
 from .graph import OPERATORS
 from .jax_internals import FUSES, ClosedJaxpr, Literal, bound, settings
 from .reads import naming_what_is_kept, on_forget, settling, version_of
+from .repetition import is_plain, without_repetition
 
 
 def recorded(f: Callable[..., dict[str, Any]]) -> Callable[..., Any]:
