@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxkane._scalars import fuse
+from jaxkane._scalars import fuse, pieces
 from jaxkane._scalars.fuse import fused
 from jaxkane._scalars.linear import determinant, solve
 from jaxkane._scalars.repetition import without_repetition
@@ -71,8 +71,8 @@ def test_the_same_as_plain_jax(name, compiled, kernels):
 
 @pytest.mark.parametrize("name", ["jit", "reverse", "batch", "batch of gradients", "gradient of a loop"])
 def test_a_long_program_in_pieces(name, by_xla, monkeypatch):
-    monkeypatch.setattr(fuse, "_WHOLE_UP_TO", 4)
-    monkeypatch.setattr(fuse, "_PIECE", 3)
+    monkeypatch.setattr(pieces, "_WHOLE_UP_TO", 4)
+    monkeypatch.setattr(pieces, "_PIECE", 3)
 
     def chosen(a, b, x):
         left = x[0] < a  # what is not a float goes from piece to piece too

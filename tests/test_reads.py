@@ -22,7 +22,7 @@ import pytest
 
 import jaxkane as jk
 from jaxkane._scalars.fuse import fused
-from jaxkane._scalars.reads import version_of
+from jaxkane._scalars.versions import version_of
 from jaxkane.fit._problem.problem import cost
 
 RTOL = 1e-12

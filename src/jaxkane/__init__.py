@@ -36,8 +36,8 @@ from ._method.equations import mass_matrix as mass_matrix
 from ._method.equations import partial_velocities as partial_velocities
 from ._scalars.configure import Configuration as Configuration
 from ._scalars.configure import configure as configure
-from ._scalars.reads import forget as forget
 from ._scalars.types import Scalar as Scalar
+from ._scalars.versions import forget as forget
 from ._simulation.along import constraint_forces as constraint_forces
 from ._simulation.along import constraint_multipliers as constraint_multipliers
 from ._simulation.along import orientations as orientations

@@ -14,7 +14,7 @@ from .._description.bodies import Force, flatten_loads
 from .._description.system import System
 from .._scalars.fuse import fused
 from .._scalars.linear import stack
-from .._scalars.reads import version_of
+from .._scalars.versions import version_of
 from .._simulation.trajectory import Trajectory
 from ._sketch import Element, Figure, Sketch, rotation
 

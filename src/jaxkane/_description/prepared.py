@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import jax
 
-from .._scalars.reads import kept_from_a_trace
 from .._scalars.types import Component
+from .._scalars.versions import kept_from_a_trace
 from .bodies import Motion, now
 from .values import Values
 

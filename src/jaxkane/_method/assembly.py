@@ -15,13 +15,13 @@ from .._description.system import State, System
 from .._scalars.jax_internals import concretely
 from .._scalars.nan import nan_where
 from .._scalars.numbers import derivative_in_numbers, in_numbers, is_in_numbers
-from .._scalars.reads import compiled
 from .._scalars.types import Component
+from .._scalars.versions import compiled
 from .check_description import MOST_REMEMBERED, structure_of, with_trial_numbers
 from .checks import check_system, configuration_tolerance, implied_residual, is_concrete
 from .description_facts import configuration_residual
 from .equations import dependent_speeds
-from .kane import as_array
+from .values import as_array
 
 
 def assemble(

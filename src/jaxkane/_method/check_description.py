@@ -17,7 +17,7 @@ from jax.core import Tracer
 
 from .._description.system import System
 from .._scalars.numbers import derivative_in_numbers, in_numbers
-from .._scalars.reads import version_of
+from .._scalars.versions import version_of
 from .description_facts import Found, configuration_residual, facts_of
 
 _CHECKED: dict[Any, None] = {}  # structures, the oldest first

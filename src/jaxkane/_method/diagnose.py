@@ -9,7 +9,7 @@ import numpy as np
 
 from .._description.bodies import Force
 from .._description.system import System
-from .._scalars.reads import compiled
+from .._scalars.versions import compiled
 from .drift import constraint_rows, dependent_speeds_from
 from .kane import Instant
 from .rates import rates_and_equations

@@ -20,7 +20,8 @@ from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, solve, stack
 from .._scalars.types import Component
 from .description_facts import configuration_residual
-from .kane import Instant, as_array, refuse_incomplete
+from .kane import Instant
+from .values import as_array, refuse_incomplete
 
 _MOST_CHOICES = 3000
 

@@ -20,8 +20,9 @@ from .._scalars.linear import as_vector, stack
 from .._scalars.types import Component
 from .checks import check_system, is_concrete, met_or_refused
 from .diagnose import diagnosis
-from .kane import Instant, as_array, as_row, checked_values, jvp, refuse_incomplete
+from .kane import Instant, jvp
 from .rates import motion_rates, rates_and_equations
+from .values import as_array, as_row, checked_values, refuse_incomplete
 
 InputValues = Mapping[str, Component] | None
 

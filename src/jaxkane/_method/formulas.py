@@ -31,9 +31,10 @@ from .equations import (
     kinetic_energy,
     partial_velocities,
 )
-from .kane import Reading, as_row
+from .kane import Reading
 from .now import rates
 from .rates import motion_rates
+from .values import as_row
 
 
 class Function(NamedTuple):

@@ -30,7 +30,8 @@ from .._scalars.linear import as_vector, stack
 from .._scalars.record import recorded
 from .._scalars.types import Component
 from .body_parts import Described, Part, origin_of
-from .kane import Instant, Reading, Row, Said, jvp
+from .kane import Instant, Reading, Said, jvp
+from .values import Row
 
 
 class Carried(NamedTuple):

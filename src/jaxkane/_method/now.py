@@ -27,9 +27,10 @@ from .._scalars.components import add3, component, cross, is_exact
 from .._scalars.fuse import fused, is_native
 from .._scalars.linear import as_vector, is_written_out
 from .._scalars.types import Component
-from .kane import Inputs, Instant, Row, as_row, inputs_of, jvp
+from .kane import Instant, jvp
 from .rates import motion_rates
 from .reactions import Reactions
+from .values import Inputs, Row, as_row, inputs_of
 
 
 class Now(Inputs):

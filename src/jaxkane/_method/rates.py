@@ -13,7 +13,8 @@ from jaxtyping import Array, Float
 from .._description.system import System
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, is_written_out, solve_positive, solve_positive_array, stack
-from .kane import Instant, as_row
+from .kane import Instant
+from .values import as_row
 
 
 def motion_rates(

@@ -22,11 +22,12 @@ from .._description.vectors import Frame, Point, virtual
 from .._scalars.components import add, dot, mul
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, solve
-from .._scalars.reads import compiled
 from .._scalars.types import Component, Triple
+from .._scalars.versions import compiled
 from .equations import InputValues
-from .kane import Instant, Row, Said, as_row, unit
+from .kane import Instant, Said, unit
 from .rates import motion_rates
+from .values import Row, as_row
 
 
 @compiled

@@ -37,8 +37,8 @@ from .jax_internals import (
 )
 from .native import Scalars
 from .pieces import in_pieces, replaced
-from .reads import naming_what_is_kept, on_forget, settling, version_of
 from .repetition import PROGRAM, foreign, is_plain, without_repetition
+from .versions import naming_what_is_kept, on_forget, settling, version_of
 
 _MOST_LANES = 128  # in XLA's hands: with more, intermediates no longer stay in the cache
 

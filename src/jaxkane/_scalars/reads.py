@@ -2,8 +2,8 @@
 
 A program keeps the numbers that its code read when it was traced: globals, attributes of modules, classes and objects,
 closures, defaults, and the code of the functions that it calls. They are part of every key under which a program is
-kept (`fuse.fused`, `compiled`), by a digest that is formed once. After that, a look at every place where something was
-found costs some microseconds.
+kept (`fuse.fused`, `versions.compiled`), by a digest that is formed once. After that, a look at every place where
+something was found costs some microseconds.
 
 It does not see what is read through objects of libraries, C extensions, `getattr` with a name that is put together, or
 arrays above a megabyte that are changed in place: for these there is `forget`.
@@ -13,32 +13,26 @@ from __future__ import annotations
 
 import argparse
 import collections
-import contextlib
 import dataclasses
 import dis
 import enum
 import functools
-import gc
 import hashlib
 import itertools
 import os
 import sys
 import sysconfig
-import threading
 import types
 import weakref
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from operator import is_
 from typing import Any
 
-import equinox as eqx
-import jax
 import numpy as np
 from jax.core import Tracer
 
 _LARGEST_ARRAY = 1 << 20  # [bytes] compared number by number
 _MOST_PLACES = 20_000  # beyond these what a place holds is told by its identity
-_MOST_KEPT = 256
 _MADE_BY_PYTHON = 1 << 9  # Py_TPFLAGS_HEAPTYPE
 _MISSING: Any = type("_Missing", (), {"__repr__": lambda self: "missing"})()
 
@@ -46,7 +40,7 @@ _MISSING: Any = type("_Missing", (), {"__repr__": lambda self: "missing"})()
 _LIBRARIES = frozenset("jax jaxlib numpy scipy equinox jaxtyping diffrax optimistix lineax optax".split())
 _INSTALLED = tuple({sysconfig.get_path(name) + os.sep for name in ("stdlib", "platstdlib", "purelib", "platlib")})
 _NAMESPACES = (types.SimpleNamespace, argparse.Namespace)
-_NUMBERS = frozenset((type(None), bool, int, float, complex, str, bytes, type(...), type(NotImplemented)))
+NUMBERS = frozenset((type(None), bool, int, float, complex, str, bytes, type(...), type(NotImplemented)))
 
 
 @functools.lru_cache(maxsize=4096)
@@ -64,7 +58,7 @@ def _is_library(module: str | None) -> bool:
     return file.startswith(_INSTALLED)
 
 
-def _is_of_library(kind: type) -> bool:
+def is_of_library(kind: type) -> bool:
     if kind.__module__ == "builtins":  # said of a class, too, that was made where there is no `__name__`
         return not kind.__flags__ & _MADE_BY_PYTHON
     return _is_library(kind.__module__)
@@ -148,7 +142,7 @@ class _Walk:
     def value(self, value: Any, names: frozenset[str]) -> None:
         """`names`: those that the code has in which the value was found, as `constants.gravity` has "gravity"."""
         kind = type(value)
-        if kind in _NUMBERS:
+        if kind in NUMBERS:
             self.say(kind.__name__, value if kind is bytes else repr(value))
         elif isinstance(value, types.ModuleType):
             self.module(value, names)
@@ -254,7 +248,7 @@ class _Walk:
         self.say("class", cls.__module__, cls.__qualname__)
         for base in cls.__mro__:
             own = vars(base)
-            if _is_of_library(base):
+            if is_of_library(base):
                 continue
             self.reads.mappings.append((own, tuple(own), tuple(own.values())))
             for name, value in tuple(own.items()):
@@ -272,7 +266,7 @@ class _Walk:
     def an_object(self, thing: Any, names: frozenset[str]) -> None:
         kind = type(thing)
         own = getattr(thing, "__dict__", None)
-        if _is_of_library(kind) and kind not in _NAMESPACES:
+        if is_of_library(kind) and kind not in _NAMESPACES:
             wrapped = own.get("__wrapped__") if isinstance(own, dict) else None
             if isinstance(own, dict) and dataclasses.is_dataclass(thing):
                 self.say("object", kind.__qualname__)
@@ -288,7 +282,7 @@ class _Walk:
             self.mapping(own, names)
         for base in kind.__mro__:
             for name, member in vars(base).items():
-                if isinstance(member, types.MemberDescriptorType) and not _is_of_library(base):
+                if isinstance(member, types.MemberDescriptorType) and not is_of_library(base):
                     value = getattr(thing, name, _MISSING)
                     self.reads.attributes.append((thing, name, value))
                     self.parts("slot", (name, value), names)
@@ -336,181 +330,3 @@ def _serial(thing: Any) -> int:
 def _gone(place: int, reference: Any) -> None:
     if place in _serials and _serials[place][0] is reference:
         del _serials[place]
-
-
-_known: dict[int, Reads] = {}
-_lock = threading.Lock()
-_forgotten = b"0"
-_memories: list[Callable[[], None]] = []
-
-
-class _Tracing(threading.local):
-    """What is being traced in this thread: a trace belongs to what was read when it began."""
-
-    def __init__(self) -> None:
-        self.reads: dict[int, Reads] = {}
-
-
-_tracing = _Tracing()
-
-
-def _reads_of(root: Any) -> Reads:
-    reads = _tracing.reads.get(id(root))
-    if reads is not None:
-        return reads
-    reads = _known.get(id(root))
-    if reads is None or reads.root is not root or not reads.unchanged():
-        reads = _kept(Reads(root))
-    reads.used = next(_count)
-    return reads
-
-
-def _kept(reads: Reads) -> Reads:
-    if reads.is_passing:
-        return reads
-    with _lock:
-        if len(_known) >= _MOST_KEPT:
-            oldest = sorted(_known, key=lambda i: _known[i].used)
-            for i in oldest[: _MOST_KEPT // 2]:
-                del _known[i]
-        reads.used = next(_count)
-        _known[id(reads.root)] = reads
-    return reads
-
-
-_nothing_to_read: set[type] = {*_NUMBERS, np.ndarray, np.dtype}
-
-
-def _roots(value: Any, found: list[Any]) -> list[Any]:
-    """Classes, functions and objects in a tree of arguments whose code, or contents, a program depends on."""
-    kind = type(value)
-    parts: Any = ()
-    if kind is tuple or kind is list:
-        parts = value
-    elif kind is dict:
-        parts = value.values()
-    elif isinstance(value, eqx.Module):
-        # Its numbers are arguments of the program, and what is static in it is compared with them.
-        parts = vars(value).values()
-        if not _is_of_library(kind):
-            found.append(kind)
-    elif isinstance(value, (jax.Array, np.generic)):  # a tracer too
-        _nothing_to_read.add(kind)
-    elif isinstance(value, jax.tree_util.Partial):
-        parts = value.func, value.args, value.keywords
-    elif not jax.tree_util.all_leaves([value]):
-        own = getattr(value, "__dict__", None)
-        parts = own.values() if own else jax.tree.leaves(value, is_leaf=lambda x: x is not value)
-        if not _is_of_library(kind):
-            found.append(kind)
-    elif isinstance(value, type) or callable(value) or not _is_of_library(kind):
-        found.append(value)
-    for part in parts:
-        if type(part) not in _nothing_to_read:
-            _roots(part, found)
-    return found
-
-
-def version_of(*values: Any) -> bytes:
-    """A digest of all that the code in these values reads at this moment, for the key of a program."""
-    return b"".join([_forgotten, *[_reads_of(root).version for root in _roots(values, [])]])
-
-
-def kept_from_a_trace(label: str) -> TypeError:
-    """What is wrong where a function returns what it made in an earlier call, of other numbers."""
-    return TypeError(
-        f"{label}: its description returns what it has kept from an earlier call (in a global, an attribute or a "
-        "cache): a motion, a frame, a point or a number that belongs to other coordinates. Make all that follows from "
-        "t, q, u and the parameters anew in every call."
-    )
-
-
-@contextlib.contextmanager
-def naming_what_is_kept(label: str) -> Iterator[None]:
-    """Where JAX meets a number of another trace, the error says what that comes from."""
-    try:
-        yield
-    except jax.errors.UnexpectedTracerError as error:
-        raise kept_from_a_trace(label) from error
-
-
-def settling(f: Callable[..., Any]) -> Callable[..., Any]:
-    """`f`, which is being traced: what it changes itself in what it reads (a counter, a memory) is no change."""
-
-    @functools.wraps(f)
-    def call(*args: Any, **kwargs: Any) -> Any:
-        before = [_reads_of(root) for root in _roots((args, kwargs), [])]
-        outer = _tracing.reads
-        _tracing.reads = {id(reads.root): reads for reads in before} | outer
-        try:
-            with _uncollected():
-                found = f(*args, **kwargs)
-        finally:
-            _tracing.reads = outer
-        for reads in before:
-            now = _known.get(id(reads.root))
-            if now is not None and now.version == reads.version and not now.unchanged():
-                after = Reads(reads.root)
-                after.version = reads.version
-                _kept(after)
-        return found
-
-    return call
-
-
-@contextlib.contextmanager
-def _uncollected() -> Iterator[None]:
-    """Python's search for cycles of garbage waits: a trace makes a hundred thousand objects that stay, and to look
-    through them again and again takes a tenth of a first call."""
-    was_on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if was_on:
-            gc.enable()
-
-
-def compiled(f: Callable[..., Any]) -> Callable[..., Any]:
-    """`equinox.filter_jit(f)`, traced again where what the code of its arguments reads has changed.
-
-    How often it was traced, tests ask of its attribute `compiled`.
-    """
-
-    def run(version: bytes, args: Any, kwargs: Any) -> Any:
-        return settling(f)(*args, **kwargs)
-
-    run.__name__, run.__qualname__ = f.__name__, f.__qualname__  # under which programs are kept on disk
-    jitted = eqx.filter_jit(run)
-
-    @functools.wraps(f)
-    def call(*args: Any, **kwargs: Any) -> Any:
-        with naming_what_is_kept(type(args[0]).__name__ if args else f.__name__):
-            return jitted(version_of(args, kwargs), args, kwargs)
-
-    vars(call)["compiled"] = jitted
-    return call
-
-
-def on_forget(memory: Callable[[], None]) -> None:
-    """Call this function when everything is to be forgotten."""
-    _memories.append(memory)
-
-
-def forget() -> None:
-    """Forget every compiled program, so that all is read and traced again at the next call.
-
-        constants_of_a_library.gravity = 1.62  # nobody is told
-        jk.forget()
-
-    Changes of what a description, an input or a controller reads are noticed without it: see "What is noticed" on the
-    page about speed. It is for what cannot be seen, and for functions that you compiled yourself with `jax.jit`: their
-    programs are thrown away too (`jax.clear_caches`).
-    """
-    global _forgotten
-    with _lock:
-        _forgotten = b"%d" % next(_count)
-        _known.clear()
-    for memory in _memories:
-        memory()
-    jax.clear_caches()

@@ -20,8 +20,8 @@ from jax.core import Tracer
 from .components import add, is_exact, mul, sub
 from .graph import OPERATORS
 from .jax_internals import FUSES, ClosedJaxpr, Literal, bound, settings
-from .reads import naming_what_is_kept, on_forget, settling, version_of
 from .repetition import is_plain, without_repetition
+from .versions import naming_what_is_kept, on_forget, settling, version_of
 
 
 def recorded(f: Callable[..., dict[str, Any]]) -> Callable[..., Any]:

@@ -22,7 +22,7 @@ from .._method.reactions import forces_now, multipliers_now
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector
 from .._scalars.nan import nan_where
-from .._scalars.reads import compiled
+from .._scalars.versions import compiled
 from .trajectory import Trajectory
 
 

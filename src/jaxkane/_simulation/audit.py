@@ -19,8 +19,8 @@ from .._method.reactions import Reactions
 from .._scalars.components import ZERO3, add3, cross, dot, matvec
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, stack
-from .._scalars.reads import compiled
 from .._scalars.types import Triple
+from .._scalars.versions import compiled
 from .trajectory import Trajectory
 
 ORDERS = (8, 6)  # points under the polynomials whose integrals are the work, and its estimated error

@@ -18,12 +18,13 @@ from .._description.units import units_of
 from .._method.checks import configuration_is_met
 from .._method.drift import correction, has_configuration_constraints, projected
 from .._method.equations import _dependent_speeds
-from .._method.kane import Instant, checked_inputs
+from .._method.kane import Instant
 from .._method.now import outputs_at, packed_rates, rates_are_native, values_of
+from .._method.values import checked_inputs
 from .._scalars.fuse import fused
 from .._scalars.nan import all_finite, derivative_free_where_not_finite, flat, nan_derivative_where, nan_where
-from .._scalars.reads import compiled
 from .._scalars.types import Component
+from .._scalars.versions import compiled
 from .events import Events, at_zero, events_of, watched
 from .kinks import ToKinks
 from .settings import Settings, refuse_held

@@ -15,7 +15,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from .._description.system import State, System
-from .._method.kane import by_names, refuse_incomplete
+from .._method.values import by_names, refuse_incomplete
 from .signals import real_array, samples_of
 
 ADJOINTS = {

@@ -16,7 +16,7 @@ from .._common.lookup import not_there
 from .._description.system import System
 from .._method.checks import is_concrete
 from .._scalars.nan import nan_where
-from .._scalars.reads import compiled
+from .._scalars.versions import compiled
 from ._eig import eig
 from ._eigenvalues import Eigenvalues, MotionAt, eigenvalues, family_of, matrix
 

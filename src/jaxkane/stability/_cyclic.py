@@ -11,7 +11,7 @@ from .._method.checks import is_concrete
 from .._method.description_facts import configuration_residual
 from .._method.now import rates as rates_of
 from .._scalars.jax_internals import concretely
-from .._scalars.reads import on_forget, version_of
+from .._scalars.versions import on_forget, version_of
 
 _FOUND: dict[tuple, tuple[str, ...]] = {}
 _TRIALS = 3  # at which the rates are finite

@@ -16,7 +16,7 @@ from .._common.lookup import not_there
 from .._description.system import State, System
 from .._method.checks import is_concrete
 from .._scalars.nan import nan_where
-from .._scalars.reads import compiled
+from .._scalars.versions import compiled
 from ..catalog import WhippleBicycle
 from ._bicycle import LATERAL, straight_ahead
 from ._eig import MOST_CONDITION, Eig, eig

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from .._common.lookup import by_name, hint
 from .._description.system import System, names_of
-from .._scalars.reads import compiled
+from .._scalars.versions import compiled
 from ._solve import jacobian
 from ._steady import Problem, SteadyMotion, as_motion
 

@@ -17,13 +17,13 @@ from .._description.values import Values
 from .._method.checks import check_system, is_concrete
 from .._method.description_facts import configuration_residual
 from .._method.equations import dependent_speeds
-from .._method.kane import as_array, checked_inputs, refuse_incomplete
 from .._method.now import output_names, outputs_at, rates, values_of
+from .._method.values import as_array, checked_inputs, refuse_incomplete
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, solve, stack
 from .._scalars.nan import nan_where
-from .._scalars.reads import compiled
 from .._scalars.types import Component
+from .._scalars.versions import compiled
 from ._cyclic import cyclic_coordinates
 from ._eig import Eig, eig, eigvals
 from ._solve import jacobian

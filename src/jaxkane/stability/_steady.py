@@ -15,11 +15,11 @@ from .._description.system import State, System, names_of
 from .._method.checks import check_system, is_concrete
 from .._method.description_facts import configuration_residual
 from .._method.equations import dependent_speeds
-from .._method.kane import as_array, checked_values
 from .._method.now import rates
+from .._method.values import as_array, checked_values
 from .._scalars.nan import nan_where
-from .._scalars.reads import compiled
 from .._scalars.types import Component
+from .._scalars.versions import compiled
 from ._cyclic import cyclic_coordinates
 from ._solve import jacobian, root
 

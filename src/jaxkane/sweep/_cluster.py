@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._scalars import native as kernels
-from .._scalars.reads import on_forget, version_of
+from .._scalars.versions import on_forget, version_of
 from ._fingerprint import traced, versions
 from ._solve import Job, Part
 

@@ -19,7 +19,7 @@ from jax.sharding import PartitionSpec as P
 
 from .._description.system import State
 from .._method.checks import with_possible_bodies
-from .._scalars.reads import compiled
+from .._scalars.versions import compiled
 from .._simulation.ride import solve
 from .._simulation.settings import Settings
 from .._simulation.trajectory import Trajectory

@@ -20,7 +20,7 @@ from scipy.linalg import qr
 from ..._description.system import System
 from ..._method.assembly import assemble
 from ..._method.drift import has_configuration_constraints
-from ..._scalars.reads import compiled
+from ..._scalars.versions import compiled
 from .._result.base_parameters import BaseParameters, sum_in_words
 from .instants import Instants
 from .regressor import Chosen, values_by_name

@@ -14,7 +14,7 @@ from scipy.optimize import least_squares
 from ..._description.system import System
 from ..._method.body_parts import described
 from ..._method.checks import check_bodies
-from ..._scalars.reads import compiled
+from ..._scalars.versions import compiled
 from .._data.trial import Trial
 from .._problem.parameters import Parameters, parameters_of
 from .._result.base_parameters import BaseParameters

@@ -22,7 +22,7 @@ from scipy.interpolate import make_interp_spline, make_lsq_spline
 from ..._common.lookup import refuse_unknown
 from ..._description.system import System
 from ..._method.equations import coordinate_rates
-from ..._scalars.reads import compiled
+from ..._scalars.versions import compiled
 from ..._simulation.trajectory import Trajectory
 from .._data.trial import Trial
 

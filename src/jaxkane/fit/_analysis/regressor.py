@@ -18,10 +18,10 @@ from ..._method.body_parts import UNITS, Bodies, Described, described
 from ..._method.check_description import MOST_REMEMBERED, structure_of, with_trial_numbers
 from ..._method.checks import check_system
 from ..._method.equations import InputValues
-from ..._method.kane import as_array, checked_values, refuse_incomplete
 from ..._method.newton_euler import Carried, carried, columns_of, unbalanced, values_of
+from ..._method.values import as_array, checked_values, refuse_incomplete
 from ..._scalars.jax_internals import concretely
-from ..._scalars.reads import compiled
+from ..._scalars.versions import compiled
 from .._problem.leaves import find_leaves
 
 Names = str | Callable[[Any], Any] | Sequence[str | Callable[[Any], Any]]

@@ -14,7 +14,7 @@ from scipy import stats
 from ..._common.lookup import not_there
 from ..._description.system import unpacked
 from ..._method.equations import _dependent_speeds
-from ..._scalars.reads import compiled
+from ..._scalars.versions import compiled
 from .._data.windows import state_names
 from .._problem import kalman
 from .._problem.filtered import brought_back, filtered

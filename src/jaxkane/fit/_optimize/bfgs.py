@@ -12,7 +12,7 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
-from ..._scalars.reads import compiled
+from ..._scalars.versions import compiled
 from .._problem.blocks import eliminate
 from .._problem.density import half_cost
 from .._problem.model import Unknowns

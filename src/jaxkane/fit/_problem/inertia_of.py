@@ -13,7 +13,7 @@ from ..._description.parameters import leaf_name
 from ..._description.system import System
 from ..._method.body_parts import origin_of
 from ..._method.kane import Reading
-from ..._scalars.reads import compiled
+from ..._scalars.versions import compiled
 from .free import Inertia
 
 _NAMES = ("m", "cx", "cy", "cz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")

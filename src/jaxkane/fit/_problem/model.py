@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from ..._description.system import System, packed, unpacked
 from ..._method.assembly import assemble
-from ..._scalars.reads import compiled
+from ..._scalars.versions import compiled
 from ..._simulation.ride import solve
 from ..._simulation.settings import Settings
 from ..._simulation.signals import Samples, with_one_times

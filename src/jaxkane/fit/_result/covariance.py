@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 from scipy import stats
 
-from ..._scalars.reads import compiled
+from ..._scalars.versions import compiled
 from .._problem.blocks import Blocks, eliminate
 from .._problem.model import Unknowns
 from .._problem.parameters import Parameters
