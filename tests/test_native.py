@@ -153,6 +153,32 @@ def test_batches_of_batches():
 
 
 @pytest.mark.usefixtures("native")
+@fused
+def spring(parameters, x):
+    m, k, rest, signs = parameters
+    return -k / m * (x - rest) * signs
+
+
+def test_numbers_that_stay_are_one_argument_of_a_kernel():
+    """m, k and rest are one array, where all lanes share them; values and derivatives are those of plain JAX."""
+    parameters, x = (2.0, 5.0, 0.1, jnp.array([1.0, -1.0])), jnp.array([0.3, -0.2])
+    plain = spring.__wrapped__
+    shared = lambda f: jax.vmap(f, in_axes=(None, 0))  # noqa: E731
+    own = lambda f: jax.vmap(f, in_axes=((0, None, None, None), 0))  # noqa: E731
+    xs, masses = jnp.stack([x, 2 * x, 3 * x]), (jnp.arange(1.0, 4.0), *parameters[1:])
+    for as_batch, at, count in (
+        (lambda f: f, (parameters, x), 3),
+        (shared, (parameters, xs), 3),
+        (own, (masses, xs), 4),
+    ):
+        lowered = jax.jit(as_batch(spring)).lower(*at).as_text()
+        call = next(line for line in lowered.splitlines() if "custom_call @jaxkane" in line)
+        assert call.split("@jaxkane")[1].split("(")[1].split(")")[0].count("%") == count
+        for mode in (jax.jacfwd, jax.jacrev):
+            found, expected = (jax.jit(mode(as_batch(f), argnums=(0, 1)))(*at) for f in (spring, plain))
+            jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-14), found, expected)
+
+
 def test_what_cannot_be_written_is_left_to_xla():
     whole = lambda x: x.astype(jnp.int32).astype(x.dtype)  # noqa: E731
     f = fused(lambda x: whole(x) + jnp.sin(x))

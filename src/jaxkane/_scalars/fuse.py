@@ -64,7 +64,8 @@ def fused(f: Callable[..., Any]) -> Callable[..., Any]:
         inside = list(foreign(program.jaxpr))
         if any(where for _, where in inside):
             _tell_foreign(label, dict.fromkeys(name for name, where in inside if where))
-        return None if inside else (_Program(program, label), jax.tree.structure(out))
+        steady = range(treedef.children()[0].num_leaves)
+        return None if inside else (_Program(program, label, frozenset(steady)), jax.tree.structure(out))
 
     on_forget(program_for.cache_clear)
 
@@ -134,10 +135,14 @@ def _specs(avals: Sequence[Any]) -> list[jax.ShapeDtypeStruct]:
 
 
 class _Program:
-    """A traced program, and the programs that follow from it, each made once."""
+    """A traced program, and the programs that follow from it, each made once.
 
-    def __init__(self, program: ClosedJaxpr, label: str = "A function"):
-        self.label = label
+    `steady`: places of the arguments that stay what they are while the program is called again and again, as the
+    parameters of a system.
+    """
+
+    def __init__(self, program: ClosedJaxpr, label: str = "A function", steady: frozenset[int] = frozenset()):
+        self.label, self.steady = label, steady
         self.program = without_repetition(program)
         self.evaluate = jaxpr_as_fun(self.program)
         self.in_avals, self.out_avals = self.program.in_avals, self.program.out_avals
@@ -158,15 +163,16 @@ class _Program:
         def tangents(*args):
             n = len(moving)
             xs, dxs = list(args[:n]), list(args[n:])
-            places = [i for i, m in enumerate(moving) if m]
 
             def of_moving(*ys):
                 return self.evaluate(*[*replaced(xs, places, ys)])
 
             return jax.jvp(of_moving, [xs[i] for i in places], dxs)[1]
 
-        dx_avals = [a for a, m in zip(self.in_avals, moving, strict=True) if m]
-        return _Program(jax.make_jaxpr(tangents)(*_specs([*self.in_avals, *dx_avals])), self.label)
+        places = [i for i, m in enumerate(moving) if m]
+        dx_avals = [self.in_avals[i] for i in places]
+        steady = self.steady | {len(moving) + j for j, i in enumerate(places) if i in self.steady}
+        return _Program(jax.make_jaxpr(tangents)(*_specs([*self.in_avals, *dx_avals])), self.label, steady)
 
     def _transposed(self, linear: tuple[bool, ...]) -> _Program:
         """(the other inputs, cotangents of the outputs) -> cotangents of the linear inputs."""
@@ -180,7 +186,8 @@ class _Program:
             of_linear = lambda *ys: self.evaluate(*replaced(full, places, ys))  # noqa: E731
             return jax.linear_transpose(of_linear, *[specs[i] for i in places])(list(cts))
 
-        return _Program(jax.make_jaxpr(cotangents)(*[specs[i] for i in others], *_specs(self.out_avals)), self.label)
+        program = jax.make_jaxpr(cotangents)(*[specs[i] for i in others], *_specs(self.out_avals))
+        return _Program(program, self.label, frozenset(j for j, i in enumerate(others) if i in self.steady))
 
     def _batched(self, sizes: tuple[int, ...], where: Where) -> _Program:
         """The program over leading axes of these sizes, of which input i has those in `where[i]`."""
@@ -205,11 +212,20 @@ class _Program:
             self._tell_not_scalar(error)
             return None
 
+    def groups(self, where: Where) -> tuple[tuple[int, ...], ...]:
+        """The arguments as a native kernel takes them: steady numbers that all lanes share are one array, since each
+        argument takes XLA as long as some forty operations of a kernel, and a loop makes the array once."""
+        groups: dict[Any, list[int]] = {}
+        for i, (aval, has) in enumerate(zip(_specs(self.in_avals), where, strict=True)):
+            together = i in self.steady and aval.shape == () and not any(has)
+            groups.setdefault(aval.dtype if together else i, []).append(i)
+        return tuple(map(tuple, groups.values()))
+
     def target(self, sizes: tuple[int, ...], where: Where) -> str | None:
         """The name of the native kernel for a batch, where there can be one."""
         scalars = self.scalars() if native.is_on() and 0 not in sizes else None
         try:
-            return scalars.target(sizes, where) if scalars else None
+            return scalars.target(sizes, where, self.groups(where)) if scalars else None
         except NotScalarError as error:
             self._tell_not_scalar(error)
         except (RuntimeError, OSError, MemoryError) as error:  # LLVM's own are RuntimeError
@@ -308,9 +324,14 @@ def _in_chunks(args, program, sizes, where):
 
 def _lower_on_cpu(context, *args, program, sizes, where):
     target = program.target(sizes, where)
-    if target is None:
-        return as_lowering(_as_one_function)(context, *args, program=program, sizes=sizes, where=where)
-    return jax.ffi.ffi_lowering(target)(context, *args)
+    rule = _as_one_function if target is None else functools.partial(_by_kernel, target=target)
+    return as_lowering(rule)(context, *args, program=program, sizes=sizes, where=where)
+
+
+def _by_kernel(*args, program, sizes, where, target):
+    groups = [[args[i] for i in group] for group in program.groups(where)]
+    outputs = [jax.ShapeDtypeStruct((*sizes, *a.shape), a.dtype) for a in program.out_avals]
+    return jax.ffi.ffi_call(target, outputs)(*(jax.numpy.stack(xs) if len(xs) > 1 else xs[0] for xs in groups))
 
 
 if FUSES is None:

@@ -85,6 +85,18 @@ class Graph:
             return None
         return float.fromhex(node.operands[0]) if node.dtype != "bool" else node.operands[0]
 
+    def reading_groups(self, groups: Sequence[Sequence[int]]) -> Graph:
+        """The same, of arguments in groups: several numbers are one array."""
+        place = {i: (g, e, len(group)) for g, group in enumerate(groups) for e, i in enumerate(group)}
+        graph = Graph()
+        for node in self.nodes:
+            if node.operation == "input":
+                argument, element, size = node.operands
+                g, e, n = place[argument]
+                node = node._replace(operands=(g, e + element, n * size))
+            graph.nodes.append(node)
+        return graph
+
     def apply(self, operation: str, operands: tuple[int, ...], dtype: str) -> int:
         known = self._folded(operation, operands, dtype) if operation in ARITHMETIC else None
         if known is None:

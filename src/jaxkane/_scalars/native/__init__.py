@@ -22,6 +22,7 @@ from .objects import Objects, cache_folder
 
 __all__ = ["Scalars", "is_on", "is_wanted", "tell", "use", "why_not"]
 
+Groups = tuple[tuple[int, ...], ...]
 FMOD = "fmod"  # in the C library what is `rem` in JAX
 
 
@@ -43,25 +44,28 @@ class Scalars:
         self.kernel = functools.cache(self._kernel)
         self.target = functools.cache(self._target)
 
-    def _kernel(self, varies: tuple[bool, ...], lanes: int) -> str:
-        writer = Writer(self.graph, varies, lanes, functools.partial(machine().of_lanes, lanes=lanes))
+    def _kernel(self, groups: Groups, varies: tuple[bool, ...], lanes: int) -> str:
+        of_lanes = functools.partial(machine().of_lanes, lanes=lanes)
+        writer = Writer(self.graph.reading_groups(groups), varies, lanes, of_lanes)
         return _compiled(writer.text(len(varies), self.outputs))[1]
 
-    def _target(self, sizes: tuple[int, ...], where: tuple[tuple[bool, ...], ...]) -> str:
+    def _target(self, sizes: tuple[int, ...], where: tuple[tuple[bool, ...], ...], groups: Groups) -> str:
         """The name under which XLA calls the program for a batch of `sizes`, of whose dimensions argument i has those
-        in `where[i]`.
+        in `where[i]`. It is called with `groups` of the arguments: one, or several numbers as one array.
 
         **Raises:** `NotScalarError` where this machine lacks a function, `RuntimeError` where LLVM fails.
         """
         missing = sorted(f for f in self.functions if not machine().has(f))
         if missing:
             raise NotScalarError(f"{', '.join(missing)} (not in the mathematical library here)")
+        bytes_of = [sum(self.bytes_of[i] for i in group) for group in groups] + self.bytes_of[len(where) :]
+        where = tuple(where[group[0]] for group in groups)
         if all(all(w) or not any(w) for w in where):  # one long batch
             sizes, where = (int(np.prod(sizes)),) if sizes else (), tuple((any(w),) if sizes else () for w in where)
         lanes = min(machine().lanes, 1 << (sizes[-1] - 1).bit_length()) if sizes else 1
         with machine().lock:
-            kernel = self.kernel(tuple(bool(w and w[-1]) for w in where), lanes)
-            address, name = _compiled(handler_text(kernel, sizes, where, len(self.outputs), self.bytes_of))
+            kernel = self.kernel(groups, tuple(bool(w and w[-1]) for w in where), lanes)
+            address, name = _compiled(handler_text(kernel, sizes, where, len(self.outputs), bytes_of))
             _register(address, name)
         return name
 
