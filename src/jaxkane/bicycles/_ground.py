@@ -16,7 +16,7 @@ import numpy as np
 
 from .._description.parameters import learned, parameter
 from .._description.vectors import Frame, Point, Vector
-from .._scalars.components import add, mul
+from .._scalars.components import add, dot, mul, sub
 from .._scalars.types import Component, Scalar
 from ._part import check_parameters
 
@@ -129,38 +129,49 @@ class Road(Ground):
         along_x, along_y = ((one, 0.0 * one), (0.0 * one, one))
         return jax.jvp(self.at, (x, y), along_x)[1], jax.jvp(self.at, (x, y), along_y)[1]
 
+    def slope_rates(self, x: Any, y: Any, rates: Pair) -> Pair:
+        """How dh/dx and dh/dy change as the place moves [1/s]; exactly zero where it does not."""
+        x, y = jnp.asarray(x, float), jnp.asarray(y, float)
+        one = jnp.ones((), x.dtype)
+        h_xx, h_xy = jax.jvp(self.slopes, (x, y), (one, 0.0 * one))[1]
+        h_yy = jax.jvp(lambda y: self.slopes(x, y)[1], (y,), (one,))[1]
+        return dot((h_xx, h_xy), rates), dot((h_xy, h_yy), rates)
+
     def place(self, N, x, y):
         return x * N.x + y * N.y - self.at(x, y) * N.z
 
     def climbing(self, x: Component, y: Component, rates: Pair) -> Component:
         """The rate of the height of a point that moves on the road [m/s]."""
-        a, b = self.slopes(x, y)
-        return a * rates[0] + b * rates[1]
+        return dot(self.slopes(x, y), rates)
 
     def velocity(self, N, x, y, rates):
-        return N.vector(rates[0], rates[1], -self.climbing(x, y, rates))
+        return N.vector(rates[0], rates[1], mul(-1.0, self.climbing(x, y, rates)))
 
     def normal(self, N, x, y):
         a, b = self.slopes(x, y)
         return N.vector(a, b, 1.0).normalize()
 
     def normal_rate(self, N, x, y, rates):
-        (a, b), (a_dot, b_dot) = self._along(self.slopes, x, y, rates)
-        length = jnp.sqrt(a * a + b * b + 1.0)
-        n, change = N.vector(a, b, 1.0) / length, N.vector(a_dot, b_dot, 0.0) / length
+        (a, b), (a_dot, b_dot) = self.slopes(x, y), self.slope_rates(x, y, rates)
+        shrink = 1.0 / jnp.sqrt(a * a + b * b + 1.0)
+        n, change = shrink * N.vector(a, b, 1.0), shrink * N.vector(a_dot, b_dot, 0.0)
         return change - n.dot(change) * n
 
     def rates(self, x, y, yaw, forward, aside):
         a, b = self.slopes(x, y)
         length, of_x = jnp.sqrt(a * a + b * b + 1.0), jnp.sqrt(a * a + 1.0)
-        cos, sin = jnp.cos(yaw), jnp.sin(yaw)
-        along = (forward * cos - aside * sin) / of_x  # along x of the tangent frame, seen from above
-        across = (forward * sin + aside * cos) / (length * of_x)
-        return along - across * a * b, across * of_x**2
+        ahead, right = super().rates(x, y, yaw, forward, aside)  # in the tangent plane
+        along, across = mul(ahead, 1.0 / of_x), mul(right, 1.0 / (length * of_x))
+        return sub(along, mul(across, a * b)), mul(across, of_x**2)
 
     def tangent(self, N, x, y, rates):
-        (turn, tilt), (turn_rate, tilt_rate) = self._along(self._angles, x, y, rates())
-        return N.rotate(2, turn, turn_rate).rotate(1, tilt, tilt_rate, "tangent")
+        # Its x is turned about N.y by atan(a), then its y about that x by -atan(b / s), s^2 = 1 + a^2.
+        (a, b), (a_dot, b_dot) = self.slopes(x, y), self.slope_rates(x, y, rates())
+        s2 = 1.0 + a * a
+        s = jnp.sqrt(s2)
+        tilt_rate = mul(sub(mul(a_dot, a * b), mul(b_dot, s2)), 1.0 / (s * (s2 + b * b)))
+        turned = N.rotate(2, jnp.arctan(a), mul(a_dot, 1.0 / s2))
+        return turned.rotate(1, -jnp.arctan(b / s), tilt_rate, "tangent")
 
     def clearance(self, N, contact, center, radius, crown):
         inner = radius if crown is None else radius - crown
@@ -172,11 +183,3 @@ class Road(Ground):
         ]
         above = -(places[2] + jax.vmap(self.at)(*places[:2]))
         return jnp.min(above / (inner * (1.0 - cos)))
-
-    def _angles(self, x: Any, y: Any) -> tuple[Any, Any]:
-        a, b = self.slopes(x, y)
-        return jnp.arctan(a), -jnp.arctan(b / jnp.sqrt(1.0 + a * a))
-
-    def _along(self, f: Callable[..., Any], x: Any, y: Any, rates: Pair) -> Any:
-        at, moving = ([jnp.asarray(each, float) for each in pair] for pair in ((x, y), rates))
-        return jax.jvp(f, at, moving)
