@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Self
 
 import jax
@@ -126,7 +126,14 @@ def read_at(now: Instant, u_dot: Row, read: Read) -> Any:
 
 def _state_rates(system: System, t: Component, q: Row, u: Row, motion: Motion, now: Now) -> Row:
     names, label = system.states, f"{type(system).__name__}.state_rates"
-    rates: Any = system.state_rates(t, q, u, [now[name] for name in names], motion, now)
+    return named_row(system.state_rates(t, q, u, [now[name] for name in names], motion, now), names, label)
+
+
+def named_row(rates: Any, names: Sequence[str], label: str) -> Row:
+    """Numbers in the order of `names`, or by name in a dict, as a row of components.
+
+    **Raises:** `ValueError` or `TypeError` for what is not one number for each name.
+    """
     if isinstance(rates, Mapping):
         refuse_unknown(rates, names, f"{label} names what is no state:")
         missing = [name for name in names if name not in rates]

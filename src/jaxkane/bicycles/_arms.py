@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from itertools import takewhile
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import jax.numpy as jnp
@@ -82,10 +83,10 @@ class Arms(Part):
         return ()
 
     def check(self, bicycle):
-        rider = bicycle.rider
-        if not isinstance(rider, Rider) or rider.right_shoulder is None:
+        rider = _with_shoulders(takewhile(lambda part: part is not self, bicycle.parts))
+        if rider is None:
             raise ValueError(
-                f"Arms need a rider with shoulders, and the rider of this {type(bicycle).__name__} is {rider!r}: "
+                f"Arms need a rider with shoulders, whom this {type(bicycle).__name__} does not have before them: "
                 "with_parts(rider=LeaningRider(..., shoulder=(x, y, z))) or RigidRider."
             )
         if not is_concrete(self, rider) or in_batches(self) or in_batches(rider):
@@ -137,7 +138,7 @@ class Arms(Part):
         return flexion, rotation, elbow
 
     def _arms(self, bicycle: Bicycle, motion: Any, q: Any, u: Any) -> Iterator[tuple[str, _Arm]]:
-        U, angles = motion["U"], self.posture(bicycle.rider.right_shoulder)  # type: ignore[union-attr]
+        U, angles = motion["U"], self.posture(_with_shoulders(bicycle.parts).right_shoulder)  # type: ignore[union-attr]
         for side, sign in _SIDES.items():
             names = [f"{side}_{joint}" for joint in _JOINTS]
             flexion, rotation, elbow = (add(q[name], angle) for name, angle in zip(names, angles, strict=True))
@@ -195,3 +196,8 @@ class Arms(Part):
         if damping is not None:
             torque = torque - damping * u[f"{name}_rate"]
         return torque
+
+
+def _with_shoulders(parts: Iterable[Any]) -> Rider | None:
+    """The rider whose arms they are, in whichever field he is."""
+    return next((part for part in parts if isinstance(part, Rider) and part.right_shoulder is not None), None)

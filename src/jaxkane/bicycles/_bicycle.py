@@ -15,14 +15,18 @@ from typing import Any, Self
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._common.lookup import not_there, refuse_unknown
+from .._common.lookup import refuse_unknown
 from .._description.bodies import Body, Motion
 from .._description.vectors import Frame, Point, Vector, inertial
+from .._method.kane import as_row
+from .._method.now import named_row
 from .._scalars.components import add
 from .._scalars.types import Component
+from ..catalog._bicycle_file import refuse_other_units
 from ..catalog.bicycle import WhippleBicycle
+from ._asked import as_tuple, by_name, commanded, moved, refuse_misfits, told
 from ._files import as_meijaard, read_yaml
-from ._ground import Ground
+from ._ground import Ground, Slope
 from ._head import HeadTwist
 from ._part import Part
 from ._rider import rider_of
@@ -32,12 +36,6 @@ REAR, FRONT = "rear", "front"
 OFF_ROAD = 1e-3
 """[m]: a motion over a `Road` ends where a contact is further from it than that."""
 _ASIDE = ("_lateral_slip", "_lateral_deflection")
-
-
-def _as_tuple(parts: Any) -> tuple[Any, ...]:
-    if isinstance(parts, (tuple, list)):
-        return tuple(parts)
-    return () if parts is None else (parts,)
 
 
 class Bicycle(WhippleBicycle):
@@ -77,20 +75,11 @@ class Bicycle(WhippleBicycle):
     control: Part | tuple[Part, ...] | None = None
     steering: Part | tuple[Part, ...] | None = None
     drive: Part | tuple[Part, ...] | None = None
-    extra: tuple[Part, ...] = eqx.field(default=(), converter=_as_tuple)
+    extra: tuple[Part, ...] = eqx.field(default=(), converter=as_tuple)
     road: Ground = eqx.field(default_factory=Ground)
 
     def __check_init__(self) -> None:
-        kinds = (("rear_tyre", Tyre), ("front_tyre", Tyre), ("head", HeadTwist | None), ("road", Ground))
-        for name, kind in kinds:
-            if not isinstance(getattr(self, name), kind):
-                raise TypeError(f"{type(self).__name__}: `{name}` is a {_called(kind)}, got {getattr(self, name)!r}.")
-        for name in ("rider", "control", "steering", "drive", "extra"):
-            for part in _as_tuple(getattr(self, name)):
-                if not isinstance(part, Part):
-                    raise TypeError(f"{type(self).__name__}: `{name}` holds a Part of jaxkane.bicycles, got {part!r}.")
-        for part in self.parts:
-            part.check(self)
+        refuse_misfits(self)
 
     def with_parts(self, **parts: Any) -> Self:
         """A copy with other parts, or parameters, by the names of the fields."""
@@ -104,13 +93,15 @@ class Bicycle(WhippleBicycle):
         A YAML file may also hold a rider: a rigid one ("Moore2019", "principal"), or one who leans
         ("MooreRiderLean2012"). The speed `v` is passed over.
 
-        **Raises:** `ValueError` that names the lines that are unknown, repeated or malformed, and what is missing.
+        **Raises:** `ValueError` that names the lines that are unknown, repeated or malformed, what is missing, and
+        what is not in metres or radians.
         """
         if Path(path).suffix.lower() not in (".yml", ".yaml"):
             return super().from_file(path)
         kind, values = read_yaml(path)
         try:
             found, rider = as_meijaard(kind, values)
+            refuse_other_units(found)
             return cls.from_parameters(found | ({} if rider is None else {"rider": rider_of(rider)}))
         except ValueError as error:
             raise ValueError(f"{os.fspath(path)}: {error}") from None
@@ -119,7 +110,7 @@ class Bicycle(WhippleBicycle):
     def parts(self) -> tuple[Part, ...]:
         """All parts, in the order in which they are asked; tyres are none of them."""
         held = (getattr(self, field.name) for field in dataclasses.fields(self))
-        return tuple(part for each in held for part in _as_tuple(each) if isinstance(part, Part))
+        return tuple(part for each in held for part in as_tuple(each) if isinstance(part, Part))
 
     @property
     def coordinates(self) -> tuple[str, ...]:
@@ -164,6 +155,17 @@ class Bicycle(WhippleBicycle):
         return tuple(name for name in (*self.coordinates, *self.speeds, *self.states) if name in moving)
 
     @property
+    def needs_trim(self) -> bool:
+        """Whether riding straight on takes a torque of the drive, or moves coordinates of parts that gravity loads."""
+        resists = any(part.resists for part in self.parts) or isinstance(self.road, Slope)
+        settles = any(
+            name not in (*part.lateral(), *part.dependent_coordinates)
+            for part in self.parts
+            for name in part.coordinates
+        )
+        return resists or settles or any(tyre.rolling_resistance is not None for _, tyre in self._tyres())
+
+    @property
     def mode_groups(self) -> dict[str, tuple[str, ...]]:
         """Those of `lateral` that it has beside the Whipple bicycle's, by the name of the modes that they bring.
 
@@ -172,7 +174,7 @@ class Bicycle(WhippleBicycle):
         tyres = {end: [f"{end}_lateral_{what}" for what in ("slip", "deflection")] for end in (REAR, FRONT)}
         found = {f"{end} tyre": tuple(name for name in names if name in self.lateral) for end, names in tyres.items()}
         for field in dataclasses.fields(self):
-            held = [part for part in _as_tuple(getattr(self, field.name)) if isinstance(part, Part)]
+            held = [part for part in as_tuple(getattr(self, field.name)) if isinstance(part, Part)]
             found[field.name] = tuple(name for part in held for name in part.lateral())
         elastic = [found.pop("head"), *([found.pop("front tyre")] if len(found["front tyre"]) == 2 else [])]
         found |= dict(zip(("wobble", "front end"), [names for names in elastic if names], strict=False))
@@ -213,7 +215,9 @@ class Bicycle(WhippleBicycle):
         if self.road.curved:
             climbing = self.road.climbing(q["x"], q["y"], self._place_rates(q, u))
             moving += [*(u[name] for name in self._of_front()), climbing]
-        return (*turning, *moving, *(rate for part in self.parts for rate in part.q_dot(self, t, q, u)))
+        for part in self.parts:
+            moving += as_row(part.q_dot(self, t, q, u), part.coordinates, told(part, "q_dot"))
+        return (*turning, *moving)
 
     @property
     def steer_point(self) -> tuple[Component, Component]:
@@ -280,7 +284,7 @@ class Bicycle(WhippleBicycle):
         motion.front, residuals = self._front_contact(Q, C, down, normal, q, u)
         motion = motion.extended((), residuals)
         for part in self.parts:
-            motion = part.motion(self, motion, t, q, u)
+            motion = moved(part, self, motion, t, q, u)
         return motion
 
     def _front_contact(
@@ -349,20 +353,8 @@ class Bicycle(WhippleBicycle):
             found |= {f"{end}_{name}_force": force for name, force in forces.items()}
         return found
 
-    def _commanded(self, t: Any, q: Any, u: Any, motion: Any, values: Mapping[str, Component]) -> Commanded:
-        """Inputs and states by name, with what the parts add to the inputs."""
-        values = Commanded(values)
-        for part in self.parts:
-            for name, command in part.commands(self, t, q, u, motion, values).items():
-                if name not in self.inputs:
-                    label = f"the inputs of {type(self).__name__}, of which {type(part).__name__} adds to this one"
-                    raise not_there(name, self.inputs, label)
-                values[name] = add(values[name], command)
-                values.commanded[name] = None
-        return values
-
     def loads(self, t, q, u, motion, inputs):
-        values = self._commanded(t, q, u, motion, inputs)
+        values = commanded(self, t, q, u, motion, inputs)
         found: list[Any] = [super().loads(t, q, u, motion, values)]
         ground = [each for each in self._wheels(motion) if each[1].laws or each[1].rolling_resistance is not None]
         carried = self.tyre_loads(motion) if ground else {}
@@ -373,21 +365,25 @@ class Bicycle(WhippleBicycle):
         return found
 
     def state_rates(self, t, q, u, x, motion: Any, now):
-        now = now.with_values(self._commanded(t, q, u, motion, now))
+        now = now.with_values(commanded(self, t, q, u, motion, now))
         rates = []
         for end, tyre, contact, _, _ in self._wheels(motion):
             rates += tyre.deflection_rates(contact, self._deflections(end, tyre, x))
         for part in self.parts:
-            rates += list(part.state_rates(self, t, q, u, x, motion, now))
+            rates += named_row(part.state_rates(self, t, q, u, x, motion, now), part.states, told(part, "state_rates"))
         return rates
 
     def outputs(self, t, q, u, motion: Any, now):
-        given = self._commanded(t, q, u, motion, now)
+        given = commanded(self, t, q, u, motion, now)
         now = now.with_values(given)
         found: dict[str, Any] = dict(self.tyre_forces(motion, now))
         found |= {f"applied_{name}": now[name] for name in given.commanded}
         for part in self.parts:
-            found |= part.outputs(self, t, q, u, motion, now)
+            more = by_name(part.outputs(self, t, q, u, motion, now), told(part, "outputs"))
+            twice = [name for name in more if name in found]
+            if twice:
+                raise ValueError(f"{told(part, 'outputs')}: there is an output {twice[0]!r} already.")
+            found |= more
         return found
 
     def configuration_constraints(self, t, q):
@@ -432,18 +428,3 @@ class BicycleMotion(Motion):
 
     rear: Contact
     front: Contact
-
-
-class Commanded(dict[str, Any]):
-    """Inputs and states by name, as parts receive them; `commanded`: names of those inputs that parts add to."""
-
-    def __init__(self, values: Mapping[str, Component]):
-        super().__init__(values)
-        self.commanded: dict[str, None] = {}
-
-    def __missing__(self, name: str) -> Component:
-        raise not_there(name, self, "the inputs and states of this bicycle")
-
-
-def _called(kind: Any) -> str:
-    return getattr(kind, "__name__", "HeadTwist or None")

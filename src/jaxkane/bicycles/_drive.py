@@ -21,6 +21,8 @@ class Drag(Part):
     ahead: Scalar = parameter(0.4, unit="m")
     density: Scalar = parameter(1.2, positive=True, unit="kg/m^3")
 
+    resists = True
+
     def motion(self, bicycle, motion, t, q, u):
         B, hub = motion["B"], motion["rear wheel"].center
         place = hub.fixed(self.ahead * B.x + (bicycle.rR - self.height) * B.z, B)

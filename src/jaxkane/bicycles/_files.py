@@ -16,9 +16,9 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from pathlib import Path
 
 from .._common.lookup import hint
+from ..catalog._bicycle_file import lines_of
 
 _HEADER = ("parameterization", "parameters", "rider", "description", "values")
 
@@ -40,7 +40,7 @@ def read_yaml(path: str | os.PathLike[str]) -> tuple[str, Values]:
     lines: dict[str, int] = {}
     faults: list[str] = []
     section = ""
-    for number, line in enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1):
+    for number, line in enumerate(lines_of(path), start=1):
         text = line if line.lstrip()[:1] != "#" else ""
         text = text.partition(" #")[0].rstrip()
         indented = text[:1].isspace()

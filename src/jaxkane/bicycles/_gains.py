@@ -14,6 +14,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._common.lookup import refuse_unknown
 from .._description.parameters import parameter, to_float
 from .._method.checks import is_concrete
 from .._scalars.components import mul, sub
@@ -73,13 +74,17 @@ class ScheduledGains(Part):
     """
 
     at: tuple[float, ...] = eqx.field(static=True, converter=lambda at: tuple(np.asarray(at, dtype=float).tolist()))
-    measured: tuple[str, ...] = eqx.field(static=True, converter=tuple)
+    measured: tuple[str, ...] = eqx.field(static=True, converter=lambda m: (m,) if isinstance(m, str) else tuple(m))
     gains: Float[Array, "n m"] = eqx.field(converter=to_float)
     follow: Float[Array, " n"] = eqx.field(converter=to_float)
     command: str = eqx.field(static=True, default=STEER)
 
     inputs = ("desired_roll",)
     units = {"desired_roll": "rad"}
+
+    def check(self, bicycle):
+        known = (*bicycle.coordinates, *bicycle.speeds, *bicycle.dependent_speeds, *bicycle.states)
+        refuse_unknown(self.measured, known, f"ScheduledGains: {type(bicycle).__name__} has no")
 
     def __check_init__(self) -> None:
         n, m = len(self.at), len(self.measured)
@@ -162,8 +167,10 @@ def lqr(
     (m,), the weights of the states; `R`: of the command; `states`: names, by default `bicycle.lateral`, all that move
     to first order when it leaves the upright plane; `command`: the input by which it steers.
 
-    **Raises:** `ValueError` as those two functions, as where no regulator exists.
+    **Raises:** `ValueError` as those two functions, as where no regulator exists, and for a bicycle with a balance.
     """
+    if "desired_roll" in bicycle.inputs:
+        raise ValueError(f"lqr: the {type(bicycle).__name__} has a balance already: bicycle.with_parts(control=None).")
     names = bicycle.lateral if states is None else tuple(states)
     gains, follow = [], []
     for v in np.asarray(speeds, dtype=float):

@@ -30,6 +30,10 @@ class HeadTwist(Part):
     speeds = ("head_twist_rate",)
     units = {"head_twist": "rad", "head_twist_rate": "rad/s"}
 
+    def check(self, bicycle):
+        if bicycle.head is not self:
+            raise ValueError("A HeadTwist stands between frame and fork: with_parts(head=HeadTwist(...)).")
+
     def turned(self, tilted: Frame, S: Point, q: Any, u: Any) -> tuple[Frame, Point]:
         """The frame along the steer axis and the point on it, as they carry the front assembly."""
         axis = S.fixed(-self.height * tilted.z)

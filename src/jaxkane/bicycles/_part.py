@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -14,11 +15,22 @@ if TYPE_CHECKING:
     from ._bicycle import Bicycle, BicycleMotion
 
 
+NAMES = ("coordinates", "speeds", "dependent_speeds", "dependent_coordinates", "inputs", "states")
+
+
 def check_parameters(part: Any) -> None:
-    """Refuse parameters that are no finite numbers; None stands for one that is not there."""
+    """Refuse parameters that are no finite numbers; None stands for one that may be left out by default."""
+    made = {field.name: field.default_factory for field in dataclasses.fields(part)}
     for name, info in parameter_info(part).items():
-        if getattr(part, name) is not None:
-            check_parameter(f"{type(part).__name__}.{name}", getattr(part, name), info)
+        default = made[name]
+        if getattr(part, name) is None and default is not dataclasses.MISSING and default() is None:
+            continue
+        check_parameter(f"{type(part).__name__}.{name}", getattr(part, name), info)
+
+
+def called(value: Any) -> str:
+    """What was given, in the words of an error: a module by its class, which is shorter than its numbers."""
+    return f"a {type(value).__name__}" if isinstance(value, eqx.Module) else repr(value)
 
 
 class Part(eqx.Module):
@@ -45,9 +57,13 @@ class Part(eqx.Module):
     inputs: ClassVar[tuple[str, ...]] = ()
     states: ClassVar[tuple[str, ...]] = ()
     units: ClassVar[Mapping[str, str]] = {}
+    resists: ClassVar[bool] = False  # riding straight on: then linear models over speeds have a torque of the drive
 
     def __check_init__(self) -> None:
         check_parameters(self)
+        for kind in NAMES:
+            if isinstance(names := getattr(self, kind), str):
+                raise TypeError(f"{type(self).__name__}.{kind} is a tuple of names, got {names!r}: ({names!r},).")
 
     def check(self, bicycle: Bicycle) -> None:
         """Refuse, by an error, a bicycle that this part does not fit."""
@@ -68,7 +84,8 @@ class Part(eqx.Module):
     ) -> Mapping[str, Component]:
         """What the part adds to inputs of the bicycle, by name: `{"steer_torque": -self.gain * q["roll"]}`.
 
-        `values` holds inputs and states by name, those with what the parts before this one have added.
+        `values` holds inputs and states by name, those with what the parts before this one have added. A part that
+        adds to an input of another part, which has read it here, must stand before that part.
         """
         return {}
 
@@ -80,9 +97,9 @@ class Part(eqx.Module):
 
     def state_rates(
         self, bicycle: Bicycle, t: Component, q: Any, u: Any, x: Any, motion: BicycleMotion, now: Any
-    ) -> Sequence[Component]:
-        """Rates of the part's states of the first order; `now` as in `System.state_rates`, its inputs with all that was
-        added to them."""
+    ) -> Sequence[Component] | Mapping[str, Component]:
+        """Rates of the part's states of the first order, in their order or by name; `now` as in `System.state_rates`,
+        its inputs with all that was added to them."""
         return ()
 
     def outputs(

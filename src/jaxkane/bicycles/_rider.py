@@ -155,8 +155,11 @@ def separate_rider(bicycle: Bicycle, rider: Rider) -> Bicycle:
 
     With a rider who does not lean its motion is that of the bicycle before.
 
-    **Raises:** `ValueError` where B has not the mass or the inertia that the rider's body takes.
+    **Raises:** `ValueError` where B has not the mass or the inertia that the rider's body takes, and for a bicycle that
+    has a rider already, who is none of B.
     """
+    if bicycle.rider is not None:
+        raise ValueError("separate_rider: the bicycle has a rider already, whom its frame B does not count.")
     m = bicycle.mB - rider.mass
     x = (bicycle.mB * bicycle.xB - rider.mass * rider.x) / m
     z = (bicycle.mB * bicycle.zB - rider.mass * rider.z) / m

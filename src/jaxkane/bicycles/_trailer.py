@@ -42,6 +42,10 @@ class Trailer(Part):
         "trailer_pitch_rate": "rad/s",
     }
 
+    def check(self, bicycle):
+        if bicycle.road.curved:
+            raise ValueError("A Trailer rolls on level ground or a Slope, not on a Road of given height.")
+
     def motion(self, bicycle, motion, t, q, u):
         heading = motion["Y"].rotate(3, q["trailer_angle"], u["trailer_angle_rate"])
         T = heading.rotate(2, q["trailer_pitch"], u["trailer_pitch_rate"], "trailer")

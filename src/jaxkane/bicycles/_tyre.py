@@ -13,7 +13,7 @@ from .._description.parameters import parameter
 from .._description.vectors import Point, Vector
 from .._scalars.components import is_zero, mul, sub
 from .._scalars.types import Component, Scalar
-from ._part import check_parameters
+from ._part import called, check_parameters
 from ._slip import LongitudinalSlip, Slip
 
 
@@ -58,6 +58,11 @@ class Tyre(eqx.Module):
 
     def __check_init__(self) -> None:
         check_parameters(self)
+        along, across = self.longitudinal, self.lateral
+        if not (along is None or isinstance(along, LongitudinalSlip)):
+            raise TypeError(f"Tyre: `longitudinal` is a LongitudinalSlip or None, got {called(along)}.")
+        if isinstance(across, LongitudinalSlip) or not (across is None or isinstance(across, Slip)):
+            raise TypeError(f"Tyre: `lateral` is a law of lateral slip or None, got {called(across)}.")
 
     @property
     def rolls(self) -> bool:

@@ -4,8 +4,19 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+
+def lines_of(path: str | os.PathLike[str]) -> list[str]:
+    """The lines of a text file; the mark at its beginning that some editors write is none of its text.
+
+    **Raises:** `ValueError` for a file that is no text.
+    """
+    try:
+        return Path(path).read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        raise ValueError(f"{os.fspath(path)} is no text file in UTF-8.") from None
 
 
 def read_bicycle_file(
@@ -21,7 +32,7 @@ def read_bicycle_file(
     deviations: dict[str, float] = {}
     lines: dict[str, int] = {}
     faults: list[str] = []
-    for number, line in enumerate(Path(path).read_text(encoding="utf-8").splitlines(), start=1):
+    for number, line in enumerate(lines_of(path), start=1):
         line = line.strip()
         if not line or line.startswith("#"):
             continue
@@ -43,3 +54,15 @@ def read_bicycle_file(
     if faults:
         raise ValueError(f"{os.fspath(path)}: " + "; ".join(faults) + ".")
     return values, deviations
+
+
+def refuse_other_units(values: Mapping[str, float]) -> None:
+    """Refuse a tilt of the steer axis that must be in degrees, and lengths that must be in millimetres.
+
+    **Raises:** `ValueError`.
+    """
+    if abs(values.get("lam", 0.0)) >= 0.5 * math.pi:
+        raise ValueError(f"lam = {values['lam']:g} rad tilts the steer axis by more than a right angle. In degrees?")
+    for name in ("w", "rR", "rF"):
+        if values.get(name, 0.0) > 20.0:
+            raise ValueError(f"{name} = {values[name]:g} m is longer than any bicycle. In millimetres?")

@@ -14,7 +14,7 @@ from .._description.parameters import parameter, parameter_info
 from .._description.system import System
 from .._description.vectors import Frame, Point, Vector, inertial
 from .._scalars.types import Scalar
-from ._bicycle_file import read_bicycle_file
+from ._bicycle_file import read_bicycle_file, refuse_other_units
 from ._entry import entry
 
 # Meijaard et al. (2007), Table 1: the benchmark bicycle.
@@ -107,6 +107,8 @@ class WhippleBicycle(System):
     lateral: ClassVar[tuple[str, ...]] = ("roll", "steer", "roll_rate", "steer_rate")
     """Coordinates, speeds and states that move to first order when a bicycle leaves straight riding, where those of
     Meijaard et al. (2007) suffice."""
+    needs_trim: ClassVar[bool] = False
+    """Whether something resists riding straight on, or sinks under its weight: see `stability.straight_ahead`."""
     units = dict.fromkeys(coordinates[:6], "rad") | {"x": "m", "y": "m"}
     units |= dict.fromkeys((*speeds, *dependent_speeds), "rad/s") | dict.fromkeys(inputs, "N m")
 
@@ -145,13 +147,15 @@ class WhippleBicycle(System):
         """A bicycle from a text file of BicycleParameters (`NAME = value+/-deviation`).
 
         The deviations are read by `jaxkane.catalog.read_bicycle_file`. Where a file also splits the front assembly H
-        into handlebar G and fork S, those parts are passed over.
+        into handlebar G and fork S, those parts are passed over; so is the speed `v`.
 
-        **Raises:** `ValueError` that names the lines that are unknown, repeated or malformed, and what is missing.
+        **Raises:** `ValueError` that names the lines that are unknown, repeated or malformed, what is missing, and
+        what is not in metres or radians.
         """
-        values, _ = read_bicycle_file(path, known=(*parameter_info(cls), *_IMPLIED, *_PARTS_OF_H))
+        values, _ = read_bicycle_file(path, known=(*parameter_info(cls), *_IMPLIED, *_PARTS_OF_H, "v"))
         try:
-            return cls.from_parameters({name: x for name, x in values.items() if name not in _PARTS_OF_H})
+            refuse_other_units(values)
+            return cls.from_parameters({name: x for name, x in values.items() if name not in (*_PARTS_OF_H, "v")})
         except ValueError as error:
             raise ValueError(f"{os.fspath(path)}: {error}") from None
 

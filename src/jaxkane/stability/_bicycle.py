@@ -11,26 +11,26 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._description.system import State
+from .._method.checks import is_concrete
 from .._method.equations import equations_of_motion
+from .._scalars.nan import nan_where
 from .._scalars.types import Component
 from ..catalog import WhippleBicycle
 from ._solve import jacobian
+from ._steady import SteadyMotion, steady_turn
 
-LATERAL = ("roll", "steer", "roll_rate", "steer_rate")
+LATERAL = WhippleBicycle.lateral
 """The states of Meijaard et al. (2007); riding straight, the speed does not notice them to first order."""
 
 
-def straight_ahead(bicycle: WhippleBicycle, speed: Component) -> State:
-    """A bicycle that rolls straight ahead and upright at `speed` [m/s] without a drive, as is steady on level ground.
+def straight_ahead(bicycle: WhippleBicycle, speed: Component) -> State | SteadyMotion:
+    """A bicycle that rolls straight ahead and upright at `speed` [m/s], on a slope along x.
 
-    Where drag, rolling resistance or a slope take a drive, `steady_turn` finds it:
+    Where it `needs_trim`, as drag, rolling resistance or a slope take a drive, this is the `steady_turn` with the
+    "drive_torque" that holds the rate of the rear wheel, -speed / rR.
 
-        steady_turn(bicycle, hold={"roll": 0.0, "yaw": 0.0, "rear_wheel_rate": -speed / bicycle.rR},
-                    find=("drive_torque",))
-
-    (on a slope that rises along x; on level ground without "yaw", which is cyclic there).
-
-    **Raises:** `ValueError` for a bicycle whose speed is prescribed, and for one on a road of given height.
+    **Raises:** `ValueError` for a bicycle whose speed is prescribed, for one on a road of given height, and where there
+    is no such motion.
     """
     if getattr(getattr(bicycle, "road", None), "curved", False):
         raise ValueError(
@@ -46,7 +46,11 @@ def straight_ahead(bicycle: WhippleBicycle, speed: Component) -> State:
     v = jnp.asarray(speed, dtype=jnp.result_type(bicycle.rR))
     wheel = bicycle.speeds.index("rear_wheel_rate")
     u = jnp.zeros(len(bicycle.speeds), v.dtype).at[wheel].set(-v / bicycle.rR)
-    return State(jnp.zeros(len(bicycle.coordinates), v.dtype), u)
+    q = jnp.zeros(len(bicycle.coordinates), v.dtype)
+    if not bicycle.needs_trim:
+        return State(q, u)
+    upright = dict.fromkeys(("yaw", *(name for name in bicycle.lateral if name in bicycle.coordinates)), 0.0)
+    return steady_turn(bicycle, q, u, hold={**upright, "rear_wheel_rate": u[wheel]}, find=("drive_torque",))
 
 
 class Canonical(eqx.Module):
@@ -68,11 +72,13 @@ def canonical(bicycle: WhippleBicycle) -> Canonical:
     -df/dx_dot is linear and -df/dx is quadratic in the speed, so that their values at speeds of -1, 0 and 1 m/s give
     their derivatives with respect to speed without an error. Pitch has no slope in roll and steer when upright.
 
-    **Raises:** `ValueError` for a bicycle with more speeds, whose equations are more than these two.
+    **Raises:** `ValueError` for a bicycle with more speeds or with states, whose equations are more than these two, and
+    for one whose equations have other terms, as gains that are scheduled over speed; under a trace these are NaN.
     """
-    if bicycle.speeds != WhippleBicycle.speeds:
+    name, more = type(bicycle).__name__, (*bicycle.speeds[len(WhippleBicycle.speeds) :], *bicycle.states)
+    if more or bicycle.speeds != WhippleBicycle.speeds:
         raise ValueError(
-            f"canonical: {type(bicycle).__name__} has the speeds {', '.join(bicycle.speeds)}, and no equations in roll "
+            f"canonical: {name} moves by {', '.join((*bicycle.speeds, *bicycle.states))}, and has no equations in roll "
             "and steer alone; jaxkane.stability.linearize gives all of them."
         )
     lateral = np.array([0, 2])  # of (roll, rear wheel, steer), both coordinates and speeds
@@ -89,14 +95,17 @@ def canonical(bicycle: WhippleBicycle) -> Canonical:
 
     still = straight_ahead(bicycle, 0.0)
     M, _ = equations_of_motion(bicycle, 0.0, still.q, still.u)
-    K, C = jax.lax.map(stiffness_and_damping, jnp.array([-1.0, 0.0, 1.0], still.q.dtype))
-    return Canonical(
-        M=M[np.ix_(lateral, lateral)],
-        C1=(C[2] - C[0]) / 2,
-        K0=K[1] / bicycle.g,
-        K2=(K[2] + K[0]) / 2 - K[1],
-        C0=C[1],
-    )
+    K, C = jax.lax.map(stiffness_and_damping, jnp.array([-1.0, 0.0, 1.0, 2.0], still.q.dtype))
+    C1, K2 = (C[2] - C[0]) / 2, (K[2] + K[0]) / 2 - K[1]
+    off = jnp.stack([K[3] - K[1] - 4 * K2, C[3] - C[1] - 2 * C1, C[2] - C[1] - C1, K[2] - K[0]])  # zero of these terms
+    others = ~(jnp.max(jnp.abs(off)) < jnp.finfo(K.dtype).eps ** 0.5 * jnp.max(jnp.abs(jnp.stack([K[3], C[3]]))))
+    if is_concrete(others) and others:
+        raise ValueError(
+            f"canonical: the equations of {name} hold other terms of the speed than C0 + v C1 and K0 + v^2 K2; "
+            "jaxkane.stability.linearize gives them at one speed."
+        )
+    found = (M[np.ix_(lateral, lateral)], C1, K[1] / bicycle.g, K2, C[1])
+    return Canonical(*(nan_where(others, each, bicycle) for each in found))
 
 
 MODES = ("weave", "weave", "capsize", "castering")

@@ -131,7 +131,7 @@ def family_of(system: System, values: Any, motion: MotionAt, states: Sequence[st
     if motion is None and isinstance(system, WhippleBicycle):
         is_straight, motion = True, straight_ahead
         more = len(system.speeds) > len(WhippleBicycle.speeds) or system.states
-        if states is None and not (more and system.lateral == LATERAL):  # what else moves, the system does not say
+        if states is None and not (more and type(system).lateral is LATERAL):  # what else moves, it does not say
             states = system.lateral
     if motion is None:
         raise ValueError(

@@ -124,7 +124,8 @@ def steady_turn(
     t = jnp.asarray(t, q.dtype)
     check_system(system, t, q)
     guess = problem.unknowns(q, u, known)
-    held = [problem.quantity(system, t, q, u, k) if x is None else x for k, x in values.items()]
+    kept = [(k, values[k]) for k in problem.held]  # a cyclic coordinate stays where it is by itself
+    held = [problem.quantity(system, t, q, u, k) if x is None else x for k, x in kept]
     held = jnp.stack([jnp.asarray(x, q.dtype) for x in held]) if held else jnp.zeros(0, q.dtype)
     motion, slopes, J = _solve(problem, guess, (system, t, q, known, held))
     if is_concrete(motion.q) and not bool(jnp.all(jnp.isfinite(motion.q))):

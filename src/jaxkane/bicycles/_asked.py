@@ -1,0 +1,120 @@
+"""What a bicycle asks of its parts, and what it refuses of their answers. Knows parts; knows no particular one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from .._common.lookup import not_there, refuse_unknown
+from .._method.checks import is_concrete
+from .._scalars.components import add, component
+from .._scalars.types import Component
+from ._ground import Ground
+from ._head import HeadTwist
+from ._part import Part, called
+from ._tyre import Tyre
+
+if TYPE_CHECKING:
+    from ._bicycle import Bicycle, BicycleMotion
+
+_ORDER = "rider, control, steering, drive, extra"
+
+
+def as_tuple(parts: Any) -> tuple[Any, ...]:
+    if isinstance(parts, (tuple, list)):
+        return tuple(parts)
+    return () if parts is None else (parts,)
+
+
+def refuse_misfits(bicycle: Bicycle) -> None:
+    """Refuse what stands in the wrong field, parts that do not fit, and tyres thicker than their wheels."""
+    name = type(bicycle).__name__
+    for field, kind in (("rear_tyre", Tyre), ("front_tyre", Tyre), ("head", HeadTwist), ("road", Ground)):
+        held = getattr(bicycle, field)
+        if not (isinstance(held, kind) or (field == "head" and held is None)):
+            or_none = " or None" if field == "head" else ""
+            raise TypeError(f"{name}: `{field}` is a {kind.__name__}{or_none}, got {called(held)}.")
+    for field in _ORDER.split(", "):
+        for part in as_tuple(getattr(bicycle, field)):
+            if not isinstance(part, Part):
+                raise TypeError(f"{name}: `{field}` holds a Part of jaxkane.bicycles, got {called(part)}.")
+    known = (*bicycle.coordinates, *bicycle.speeds, *bicycle.dependent_speeds, *bicycle.states)
+    for part in bicycle.parts:
+        part.check(bicycle)
+        refuse_unknown(part.lateral(), known, f"{told(part, 'lateral')}: {name} has no")
+    for end, tyre, radius in (("rear", bicycle.rear_tyre, bicycle.rR), ("front", bicycle.front_tyre, bicycle.rF)):
+        crown = tyre.crown
+        if crown is None or not is_concrete(crown, radius) or crown.ndim or radius.ndim:
+            continue  # members of a batch are not looked at
+        if crown >= radius:
+            raise ValueError(
+                f"{name}: {end}_tyre.crown = {crown} m is the radius of the tyre's cross section, and must be less "
+                f"than that of its wheel, {radius} m."
+            )
+
+
+def told(part: Part, method: str) -> str:
+    return f"{type(part).__name__}.{method}"
+
+
+def by_name(given: Any, label: str) -> Mapping[str, Any]:
+    """What a part's method returned, by name."""
+    if not isinstance(given, Mapping):
+        hint = " Does it end without a `return`?" if given is None else ""
+        raise TypeError(f"{label} returns numbers by name, in a dict; got {given!r}.{hint}")
+    return given
+
+
+def moved(part: Part, bicycle: Bicycle, motion: BicycleMotion, t: Component, q: Any, u: Any) -> BicycleMotion:
+    """The motion with what a part adds."""
+    found = part.motion(bicycle, motion, t, q, u)
+    if not isinstance(found, type(motion)):
+        hint = " Does it end without a `return`?" if found is None else ""
+        raise TypeError(f"{told(part, 'motion')} returns `motion.extended(...)`, got {found!r}.{hint}")
+    return found
+
+
+class Commanded(dict[str, Any]):
+    """Inputs and states by name, as parts receive them.
+
+    `commanded`: names of those inputs that parts add to; `read`: names that were looked up.
+    """
+
+    def __init__(self, values: Mapping[str, Component]):
+        super().__init__(values)
+        self.commanded: dict[str, None] = {}
+        self.read: set[str] = set()
+
+    def __getitem__(self, name: str) -> Component:
+        self.read.add(name)
+        return super().__getitem__(name)
+
+    def __missing__(self, name: str) -> Component:
+        raise not_there(name, self, "the inputs and states of this bicycle")
+
+
+def commanded(bicycle: Bicycle, t: Any, q: Any, u: Any, motion: Any, values: Mapping[str, Component]) -> Commanded:
+    """Inputs and states by name, with what the parts add to the inputs.
+
+    **Raises:** `KeyError` for an input that no part has; `ValueError` for one that its part has read before.
+    """
+    name = type(bicycle).__name__
+    found = Commanded(values)
+    late: set[str] = set()
+    for part in bicycle.parts:
+        found.read.clear()
+        given = by_name(part.commands(bicycle, t, q, u, motion, found), told(part, "commands"))
+        for to, command in given.items():
+            if to not in bicycle.inputs:
+                raise not_there(
+                    to, bicycle.inputs, f"the inputs of {name}, of which {type(part).__name__} adds to this one"
+                )
+            if to in late:
+                raise ValueError(
+                    f"{name}: {type(part).__name__} adds to {to!r} behind the part that reads it, which would not "
+                    f"notice. Put it before that part; parts are asked in the order {_ORDER}."
+                )
+            found[to] = add(found.get(to), component(command))
+            found.commanded[to] = None
+        late |= found.read.intersection(part.inputs)
+    return found

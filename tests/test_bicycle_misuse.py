@@ -1,0 +1,154 @@
+"""Bicycles and parts that are written or put together wrongly: each is refused by an error that says what to do."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane.bicycles import (
+    Arms,
+    Bicycle,
+    HeadTwist,
+    LaneChange,
+    LateralSlip,
+    LeaningRider,
+    LeanSteerGains,
+    LongitudinalSlip,
+    Part,
+    PathFollower,
+    RigidRider,
+    Road,
+    ScheduledGains,
+    SteeringMotor,
+    Trailer,
+    Tyre,
+    lqr,
+    separate_rider,
+)
+from jaxkane.stability import straight_ahead
+
+BENCHMARK = Bicycle.benchmark()
+RIDER = RigidRider(mass=20.0, x=0.3, z=-1.0, Ixx=0.8, Iyy=0.8, Izz=0.4, Ixz=0.0, shoulder=[0.33, 0.2, -1.47])
+ARMS = Arms.of_person(83.5, 1.83, grip=[0.55, 0.28, -1.05])
+TRAILER = Trailer(
+    hitch_x=-0.1, hitch_z=-0.5, length=1.2, wheel_radius=0.25, mass=20.0, center=0.1, height=0.2, Ixx=1.0, Iyy=1.0,
+    Izz=1.2,
+)  # fmt: skip
+GAINS = LeanSteerGains(roll=-50.0, steer=35.0, roll_rate=-13.0, steer_rate=3.5, command="steer_command")
+
+
+class Named(Part):
+    """A coordinate whose name is no tuple."""
+
+    coordinates = "drop"
+
+
+class Aside(Part):
+    def lateral(self):
+        return ("lean",)
+
+
+@pytest.mark.parametrize(
+    ("made", "error", "words"),
+    [
+        (lambda: BENCHMARK.with_parts(rear_tyre=LateralSlip(9e3)), TypeError, "`rear_tyre` is a Tyre, got a LateralSl"),
+        (lambda: BENCHMARK.with_parts(extra=[HeadTwist(1e3)]), ValueError, r"with_parts\(head="),
+        (lambda: BENCHMARK.with_parts(extra=[ARMS, RIDER]), ValueError, "does not have before them"),
+        (lambda: BENCHMARK.with_parts(extra=[Aside()]), ValueError, "Aside.lateral: Bicycle has no lean"),
+        (lambda: BENCHMARK.with_parts(front_tyre=Tyre(crown=0.35)), ValueError, r"front_tyre\.crown = 0\.35 m"),
+        (lambda: BENCHMARK.with_parts(road=Road(lambda x, y: 0.0), extra=[TRAILER]), ValueError, "not on a Road"),
+        (lambda: Tyre(lateral=9e3), TypeError, "law of lateral slip or None, got 9000.0"),
+        (lambda: Tyre(lateral=LongitudinalSlip(1e4)), TypeError, "got a LongitudinalSlip"),
+        (lambda: Tyre(longitudinal=LateralSlip(1e4)), TypeError, "got a LateralSlip"),
+        (lambda: LateralSlip(None), TypeError, "cornering_stiffness must be a real number"),
+        (lambda: LeaningRider(*np.ones(9), stiffness=None), TypeError, "stiffness must be a real number"),
+        (lambda: Named(), TypeError, r"is a tuple of names, got 'drop'"),
+        (lambda: separate_rider(BENCHMARK.with_parts(rider=RIDER), RIDER), ValueError, "has a rider already"),
+        (
+            lambda: lqr(BENCHMARK.with_parts(control=LeanSteerGains()), [4.0], np.ones(4), 0.1),
+            ValueError,
+            "balance alr",
+        ),
+        (
+            lambda: BENCHMARK.with_parts(control=ScheduledGains([4.0], "rol", [[1.0]], [1.0])),
+            ValueError,
+            "Bicycle has no rol; did you mean 'roll'",
+        ),
+    ],
+)
+def test_what_does_not_fit_is_refused_where_it_is_put_together(made, error, words):
+    with pytest.raises(error, match=words):
+        made()
+
+
+def test_arms_belong_to_a_rider_in_any_field():
+    bicycle = BENCHMARK.with_parts(rider=(RIDER, ARMS))
+    assert bicycle.dependent_coordinates[1:] == Arms.coordinates
+
+
+class Nothing(Part):
+    """Every method forgets to return."""
+
+    of: str = dataclasses.field(metadata={"static": True})
+
+    def motion(self, bicycle, motion, t, q, u):
+        return None if self.of == "motion" else motion
+
+    def commands(self, bicycle, t, q, u, motion, values):
+        return {"none": None, "number": 1.0}.get(self.of, {"steer_torque": None} if self.of == "value" else {})
+
+    def outputs(self, bicycle, t, q, u, motion, now):
+        return None if self.of == "outputs" else {}
+
+
+class Twice(Part):
+    def outputs(self, bicycle, t, q, u, motion, now):
+        return {"front_lateral_force": 0.0}
+
+
+class Filter(Part):
+    """A state of the first order whose rate is given by name."""
+
+    states = ("filtered",)
+
+    def state_rates(self, bicycle, t, q, u, x, motion, now):
+        return {"filtered": now["steer_torque"] - x["filtered"]}
+
+
+class Counts(Filter):
+    def state_rates(self, bicycle, t, q, u, x, motion, now):
+        return (1.0, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("part", "error", "words"),
+    [
+        (Nothing("motion"), TypeError, r"Nothing\.motion returns `motion\.extended.*without a `return`"),
+        (Nothing("none"), TypeError, r"Nothing\.commands returns numbers by name.*without a `return`"),
+        (Nothing("number"), TypeError, r"Nothing\.commands returns numbers by name"),
+        (Nothing("value"), TypeError, "one number, got None"),
+        (Nothing("outputs"), TypeError, r"Nothing\.outputs returns numbers by name"),
+        (Twice(), ValueError, r"Twice\.outputs: there is an output 'front_lateral_force' already"),
+        (Counts(), ValueError, r"Counts\.state_rates must have 1 entries \(filtered\), got 2"),
+    ],
+)
+def test_what_a_part_answers_wrongly_is_refused(part, error, words):
+    bicycle = BENCHMARK.with_parts(front_tyre=Tyre(lateral=LateralSlip(9e3)), extra=[part])
+    with pytest.raises(error, match=words):
+        jk.simulate(bicycle, straight_ahead(bicycle, 5.0), jnp.array([0.0, 0.1]))
+
+
+@pytest.mark.parametrize(
+    "parts",
+    [
+        {"control": SteeringMotor(), "steering": GAINS},
+        {"control": (LeanSteerGains(roll=-50.0), PathFollower(LaneChange()))},
+    ],
+)
+def test_a_command_that_comes_too_late_is_refused(parts):
+    """It would be lost: the part that has the input has read it already."""
+    bicycle = BENCHMARK.with_parts(**parts)
+    with pytest.raises(ValueError, match="behind the part that reads it"):
+        jk.accelerations(bicycle, 0.0, jnp.zeros(8), jnp.zeros(3))
