@@ -18,6 +18,7 @@ import pytest
 from PIL import Image
 
 import jaxkane as jk
+from jaxkane._animate._record import record
 from jaxkane._animate._scene import project, which_way_is_up
 
 needs_a_browser = pytest.mark.skipif(browser.PROGRAM is None, reason=browser.WHY_NOT)
@@ -362,3 +363,26 @@ def test_nothing_is_drawn_until_someone_looks(weaving, page, tmp_path):
     page.value("document.querySelector('iframe').scrollIntoView()")
     page.wait(f"({shown}) > ''")
     assert page.errors == []
+
+
+class Pushed(jk.System):
+    """A point mass that a motor pushes, late."""
+
+    coordinates, speeds, states = ("x",), ("v",), ("push",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x))])
+
+    def loads(self, t, q, u, motion, inputs):
+        [body] = motion.bodies
+        return [jk.weight(motion, -9.81 * motion.N.y), jk.Force(inputs["push"] * motion.N.x, body)]
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return (10.0 - x["push"],)
+
+
+def test_loads_that_read_states_are_drawn():
+    system, ts = Pushed(), np.linspace(0.0, 1.0, 3)
+    ride = moved(system, ts, ts[:, None], np.ones((3, 1)))
+    np.testing.assert_allclose(record(system, ride, None).forces, [[[0.0, -9.81, 0.0], [0.0, 0.0, 0.0]]] * 3)

@@ -27,7 +27,7 @@ from jaxkane.bicycles import (
     lqr,
     separate_rider,
 )
-from jaxkane.stability import straight_ahead
+from jaxkane.stability import canonical, straight_ahead
 
 BENCHMARK = Bicycle.benchmark()
 RIDER = RigidRider(mass=20.0, x=0.3, z=-1.0, Ixx=0.8, Iyy=0.8, Izz=0.4, Ixz=0.0, shoulder=[0.33, 0.2, -1.47])
@@ -152,3 +152,44 @@ def test_a_command_that_comes_too_late_is_refused(parts):
     bicycle = BENCHMARK.with_parts(**parts)
     with pytest.raises(ValueError, match="behind the part that reads it"):
         jk.accelerations(bicycle, 0.0, jnp.zeros(8), jnp.zeros(3))
+
+
+PLAIN = {field: getattr(BENCHMARK, field) for field in ("w", "c", "lam", "rR", "mR", "IRxx", "IRyy", "xB", "zB", "mB")}
+PLAIN |= {f"IB{axes}": getattr(BENCHMARK, f"IB{axes}") for axes in ("xx", "yy", "zz", "xz")}
+PLAIN |= {name: getattr(BENCHMARK, name) for name in ("xH", "zH", "mH", "IHxx", "IHyy", "IHzz", "IHxz")}
+PLAIN |= {name: getattr(BENCHMARK, name) for name in ("rF", "mF", "IFxx", "IFyy")}
+
+
+def written(folder, suffix=".txt", **more):
+    lines = [f"{name} = {x}" if suffix == ".txt" else f"{name}: {x}" for name, x in (PLAIN | more).items()]
+    path = folder / f"bicycle{suffix}"
+    path.write_text("\n".join(lines), encoding="utf-8-sig")  # with the mark of some editors
+    return path
+
+
+@pytest.mark.parametrize("suffix", [".txt", ".yml"])
+def test_units_of_files(suffix, tmp_path):
+    assert Bicycle.from_file(written(tmp_path, suffix, v=4.6)).mB == BENCHMARK.mB
+    with pytest.raises(ValueError, match=r"lam = 18 rad .* In degrees\?"):
+        Bicycle.from_file(written(tmp_path, suffix, lam=18.0))
+    with pytest.raises(ValueError, match=r"rR = 300 m .* In millimetres\?"):
+        Bicycle.from_file(written(tmp_path, suffix, rR=300.0))
+    damaged = tmp_path / f"damaged{suffix}"
+    damaged.write_bytes(b"\x00\xff\xfe\x81")
+    with pytest.raises(ValueError, match=f"damaged{suffix} is no text file"):
+        Bicycle.from_file(damaged)
+
+
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        ({"steering": SteeringMotor(lag=0.1)}, "steer_motor_torque, and has no equations in roll and steer alone"),
+        (
+            {"control": ScheduledGains([2.0, 4.0], ["roll"], [[-20.0], [-10.0]], [-20.0, -10.0])},
+            "hold other terms of the speed",
+        ),
+    ],
+)
+def test_canonical_matrices_are_refused_where_they_do_not_tell_all(parts, words):
+    with pytest.raises(ValueError, match=words):
+        canonical(BENCHMARK.with_parts(**parts))

@@ -2,11 +2,12 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import jaxkane as jk
-from jaxkane.bicycles import Bicycle, Tyre
+from jaxkane.bicycles import Bicycle, Drag, LongitudinalSlip, Part, Tyre
 from jaxkane.catalog import CATALOG, WhippleBicycle
-from jaxkane.stability import canonical
+from jaxkane.stability import canonical, eigenvalues, straight_ahead
 
 WHIPPLE = CATALOG["WhippleBicycle"]
 
@@ -28,3 +29,71 @@ def test_crowns_change_only_what_gravity_does_in_roll_and_steer():
     for name in ("M", "C1", "K2"):
         np.testing.assert_allclose(getattr(found, name), getattr(known, name), atol=1e-12)
     np.testing.assert_allclose(found.K0[0, 0] - known.K0[0, 0], 94.0 * 0.02, atol=1e-12)
+
+
+class Seat(Part):
+    """A child on a spring, which the weight compresses."""
+
+    mass: jk.Scalar = jk.parameter(18.0, positive=True, unit="kg")
+    stiffness: jk.Scalar = jk.parameter(2e4, unit="N/m")
+
+    coordinates = ("seat_drop",)
+    speeds = ("seat_drop_rate",)
+
+    def motion(self, bicycle, motion, t, q, u):
+        B, place = motion["B"], bicycle.on_frame(motion, -0.1, 0.0, -0.95)
+        center = place.moving(q["seat_drop"] * B.z, u["seat_drop_rate"] * B.z)
+        return motion.extended([jk.Body(self.mass, 0.0, center, name="child")], points={"seat": place})
+
+    def loads(self, bicycle, t, q, u, motion, values):
+        force = -self.stiffness * q["seat_drop"] * motion["B"].z
+        return [jk.Force(force, motion["child"]), jk.Force(-force, motion["seat"])]
+
+    def lateral(self):
+        return ()
+
+
+def test_riding_straight_takes_a_drive_against_drag_and_a_seat_that_gives_way():
+    """1e-7, the smoothing of the drag at rest: density / 2 area v^2 rR, and weight over stiffness."""
+    bicycle = Bicycle.benchmark().with_parts(drive=Drag(area=0.6), extra=[Seat()])
+    motion = straight_ahead(bicycle, 5.0)
+    np.testing.assert_allclose(motion["drive_torque"], -0.5 * 1.2 * 0.6 * 25.0 * bicycle.rR, rtol=1e-7)
+    np.testing.assert_allclose(motion["seat_drop"], 18.0 * bicycle.g / 2e4, rtol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("slipping", [False, True])
+def test_rolling_resistance_moves_the_normal_forces_ahead(slipping):
+    """1e-9: eigenvalues with it are those with the moment of the normal forces about the contacts."""
+    law = LongitudinalSlip(2e4, relaxation_length=0.1) if slipping else None
+    resisting = Tyre(longitudinal=law, rolling_resistance=0.01)
+    plain = Bicycle.benchmark().with_parts(rear_tyre=Tyre(longitudinal=law), front_tyre=Tyre(longitudinal=law))
+    speeds = jnp.array([4.0, 5.0])
+    found = eigenvalues(plain.with_parts(rear_tyre=resisting, front_tyre=resisting), speeds)
+    known = eigenvalues(plain.with_parts(extra=[Ahead()]), speeds)
+    assert found.modes == ("weave", "weave", "capsize", "castering")
+    np.testing.assert_allclose(found.eigenvalues, known.eigenvalues, rtol=1e-9)
+
+
+class Ahead(Part):
+    """Normal forces that act ahead of the contacts."""
+
+    share: jk.Scalar = jk.parameter(0.01)  # of the wheels' radii
+    resists = True
+
+    def loads(self, bicycle, t, q, u, motion, values):
+        carried, found = bicycle.tyre_loads(motion), []
+        for end, contact, radius in (("rear", motion.rear, bicycle.rR), ("front", motion.front, bicycle.rF)):
+            moment = (self.share * radius * contact.heading).cross(-carried[end] * contact.normal)
+            found.append(jk.Torque(moment, motion[f"{end} wheel"]))
+        return found
+
+
+@pytest.mark.slow
+def test_slip_along_the_wheel_leaves_the_modes_their_names():
+    """1e-10: to first order upright riding does not notice it."""
+    tyre = Tyre(longitudinal=LongitudinalSlip(2e4))
+    bicycle, speeds = Bicycle.benchmark().with_parts(rear_tyre=tyre), jnp.array([4.0, 5.0])
+    found, known = eigenvalues(bicycle, speeds), eigenvalues(Bicycle.benchmark(), speeds)
+    assert found.modes == known.modes
+    np.testing.assert_allclose(found.eigenvalues, known.eigenvalues, rtol=1e-10)

@@ -71,18 +71,17 @@ def record(system: System, trajectory: Trajectory, figure: Figure | None) -> Rec
     numbers, rest = eqx.partition(system, eqx.is_array)
     t, q, u, u_dep = (np.asarray(x)[reached] for x in (trajectory.t, trajectory.q, trajectory.u, trajectory.u_dep))
     u = np.concatenate([u, u_dep], axis=1)
-    values = {name: np.asarray(x)[reached] for name, x in trajectory.values.items()}
-    found = jax.tree.map(np.asarray, _along(numbers, rest, figure, version_of(system, figure), t, q, u, values))
+    found = jax.tree.map(np.asarray, _along(numbers, rest, figure, version_of(system, figure), t, q, u))
     if not found.bodies:
         raise ValueError(f"animate({name}): no body has a position. Give points their places, see jaxkane.Point.at.")
     return eqx.tree_at(lambda r: (r.mass, r.inertia), found, (found.mass[0], found.inertia[0]))
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2, 3))
-def _along(numbers, rest, figure, version, t, q, u, values):
+def _along(numbers, rest, figure, version, t, q, u):
     # A picture's program runs once or twice: it should compile quickly, which one function for one instant does.
     system = eqx.combine(numbers, rest)
-    return jax.lax.map(lambda now: _instants(figure, version)(system, *now), (t, q, u, values))
+    return jax.lax.map(lambda now: _instants(figure, version)(system, *now), (t, q, u))
 
 
 @functools.lru_cache(maxsize=64)
@@ -90,13 +89,14 @@ def _instants(figure: Figure | None, version: Any) -> Any:
     return fused(lambda system, *now: _instant(system, figure, *now))
 
 
-def _instant(system: System, figure: Figure | None, t, q, u, values) -> Any:
+def _instant(system: System, figure: Figure | None, t, q, u) -> Any:
     motion = system.motion(t, q, u)
     N, dtype = motion.N, q.dtype
     placed = [i for i, body in enumerate(motion.bodies) if body.center.has_position]
     bodies = [motion.bodies[i] for i in placed]
     points = {"O": N.vector(0.0, 0.0, 0.0)}
     points |= {name: point.position for name, point in motion.points.items() if point.has_position}
+    values = dict.fromkeys((*system.inputs, *system.states), jnp.zeros((), dtype))
     centers = [body.center for body in bodies]
     forces = [
         load.vector
