@@ -259,3 +259,23 @@ def test_what_kernels_cannot_do_is_told_once_by_name(monkeypatch):
         found = [f(Ball(jnp.array(1.5)), jnp.array(x)) for x in (0.4, 2.7, 2.5)]
     np.testing.assert_allclose(found, [0.0, 3.0, 3.0])
     assert len(told) == 1
+
+
+@fused
+def of_two(a, b):
+    return 2.0 * jnp.sin(a), a * b, b**2
+
+
+def test_what_members_share_remains_shared():
+    """Only an output without an axis of members may be given out without one."""
+    a, b = jnp.array(0.7), jnp.arange(1.0, 4.0)
+    shared, product, square = jax.jit(jax.vmap(of_two, in_axes=(None, 0), out_axes=(None, 0, 0)))(a, b)
+    np.testing.assert_allclose(shared, 2 * np.sin(0.7), rtol=1e-15)
+    np.testing.assert_allclose(product, 0.7 * b, rtol=1e-15)
+    np.testing.assert_allclose(square, b**2, rtol=1e-15)
+    inner = jax.vmap(of_two, in_axes=(None, 0), out_axes=(None, 0, 0))
+    both = jax.jit(jax.vmap(inner, in_axes=(0, None), out_axes=(0, 0, None)))
+    assert [x.shape for x in both(b, b)] == [(3,), (3, 3), (3,)]
+    np.testing.assert_allclose(both(b, b)[1], np.outer(b, b), rtol=1e-15)
+    slopes = jax.jit(jax.grad(lambda a: sum(jnp.sum(x) for x in inner(a, b))))
+    np.testing.assert_allclose(slopes(a), 2 * np.cos(0.7) + 6.0, rtol=1e-14)

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
+import numpy as np
 from jax.core import Tracer
 
 from . import native
@@ -27,6 +28,7 @@ from .graph import NotScalarError
 from .jax_internals import (
     FUSES,
     ClosedJaxpr,
+    Literal,
     as_lowering,
     instantiate_zeros,
     is_no_tangent,
@@ -151,6 +153,7 @@ class _Program:
         self.tangent = functools.cache(self._tangent)
         self.transposed = functools.cache(self._transposed)
         self.batched = functools.cache(self._batched)
+        self.part = functools.cache(self._part)
         self.scalars = functools.cache(self._scalars)
         self.compiled = functools.cache(self._compiled)
 
@@ -199,6 +202,28 @@ class _Program:
         for d in reversed(range(len(sizes))):
             f = jax.vmap(f, in_axes=tuple(0 if has[d] else None for has in where), axis_size=sizes[d])
         return _Program(jax.make_jaxpr(f)(*avals), self.label)
+
+    def moved(self, moving: tuple[bool, ...]) -> tuple[bool, ...]:
+        """Which outputs follow from any of the inputs that move."""
+        program = self.program.jaxpr
+        moved = {v for v, m in zip(program.invars, moving, strict=True) if m}
+        for equation in program.eqns:
+            if any(not isinstance(v, Literal) and v in moved for v in equation.invars):
+                moved.update(equation.outvars)
+        return tuple(not isinstance(v, Literal) and v in moved for v in program.outvars)
+
+    def _part(self, inputs: tuple[bool, ...], outputs: tuple[bool, ...]) -> _Program:
+        """The program of some outputs, which follow from these inputs alone."""
+        specs, places = _specs(self.in_avals), [i for i, is_one in enumerate(inputs) if is_one]
+        others = [np.zeros(a.shape, a.dtype) for a in specs]
+
+        def part(*xs):
+            return [
+                y for y, is_one in zip(self.evaluate(*replaced(others, places, xs)), outputs, strict=True) if is_one
+            ]
+
+        steady = frozenset(j for j, i in enumerate(places) if i in self.steady)
+        return _Program(jax.make_jaxpr(part)(*[specs[i] for i in places]), self.label, steady)
 
     def _compiled(self, sizes: tuple[int, ...], where: Where) -> Callable[..., list[Any]]:
         """The program over a batch, as a function that is compiled once for each kind of batch."""
@@ -288,7 +313,19 @@ def _transpose(cotangents, *args, program, sizes, where):
 def _batch(args, axes, *, program, sizes, where):
     size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
     args = [x if axis is None else jax.numpy.moveaxis(x, axis, 0) for x, axis in zip(args, axes, strict=True)]
-    where = tuple((axis is not None, *w) for axis, w in zip(axes, where, strict=True))
+    moving = tuple(axis is not None for axis in axes)
+    moves = program.moved(moving)
+    if any(moves) and not all(moves):  # what follows from shared inputs alone remains shared, as parameters
+        found = {}
+        for is_moved in (False, True):
+            inputs = tuple(is_moved or not m for m in moving)
+            part = program.part(inputs, tuple(m == is_moved for m in moves))
+            each = zip(args, moving, where, inputs, strict=True)
+            args_of_part, in_batch = zip(*[(x, (m, *w) if is_moved else w) for x, m, w, is_one in each if is_one])
+            shape = (size, *sizes) if is_moved else sizes
+            found[is_moved] = iter(_program_p.bind(*args_of_part, program=part, sizes=shape, where=in_batch))
+        return [next(found[m]) for m in moves], [0 if m else None for m in moves]
+    where = tuple((m, *w) for m, w in zip(moving, where, strict=True))
     outputs = _program_p.bind(*args, program=program, sizes=(size, *sizes), where=where)
     return outputs, [0] * len(outputs)
 

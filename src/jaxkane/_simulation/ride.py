@@ -68,10 +68,12 @@ def solve(
         signals = for_fixed_steps(signals)
     origin = flat((system, state, ts, signals, disturbance))
     valid = _is_valid(system, state, ts, signals)
-    # What is not finite must not enter the solver, where it would spoil the gradient of what is shared.
+    # What is not finite must not enter the solver, where it would spoil the gradient of what is shared. In its steps
+    # what all members of a batch share remains shared, of which a kernel computes its part once.
+    stepped = _finite(system)
     system, state = _safe(valid, (system, state))
     start = packed(state)
-    ts = jnp.where(valid, ts, jnp.arange(ts.shape[0], dtype=ts.dtype))
+    ts = jnp.where(_is_rising(ts), ts, jnp.arange(ts.shape[0], dtype=ts.dtype))
     signals = without_nonsense(signals, valid)
     constrained = has_configuration_constraints(system, ts[0], state.q)
 
@@ -97,7 +99,7 @@ def solve(
     events = events_of(system, ts[0], state)
     stops = bool(events.names or system.dependent_speeds)
     solver, inputs = settings.solver, inputs_at(system, signals, ts[0], state)
-    is_native = rates_are_native(system, ts[0], start, inputs)
+    is_native = rates_are_native(stepped, ts[0], start, inputs)
     step, controller, reach = _steps(ts, signals, settings)
     if stops:
         controller = _to_stops(controller, vector_field, events, system, ts, reach)
@@ -108,7 +110,7 @@ def solve(
         ts[-1],
         step,
         start,
-        (system, signals, disturbance),
+        (stepped, signals, disturbance),
         saveat=diffrax.SaveAt(subs=(diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True)), controller_state=stops),
         stepsize_controller=controller,
         adjoint=settings.adjoint,
@@ -127,8 +129,8 @@ def solve(
     if events.names:
         happened = status >= Status.EVENT
         beside = jax.tree.map(lambda x, first: jnp.where(happened, x, first), (t_end, end), (ts[0], start))
-        moving = lambda t, y: vector_field(t, y, (system, signals, disturbance))  # noqa: E731
-        found = at_zero(system, beside[0], beside[1], jnp.maximum(which, 0), happened, moving, 4 * reach, events)
+        moving = lambda t, y: vector_field(t, y, (stepped, signals, disturbance))  # noqa: E731
+        found = at_zero(stepped, beside[0], beside[1], jnp.maximum(which, 0), happened, moving, 4 * reach, events)
         t_end, end = jax.tree.map(lambda x, y: jnp.where(happened, x, y), (found.t, found.y), (t_end, end))
         smooth |= happened & found.smooth
         # The last step ends a little beside the event: samples from there to here are those of the event itself.
@@ -223,11 +225,14 @@ def _is_few(x: Any) -> bool:
     return eqx.is_inexact_array(x) and 0 < x.size <= _SCALARS_UP_TO
 
 
-def _is_valid(system: System, state: State, ts: Array, signals: Any) -> Array:
+def _is_rising(ts: Array) -> Array:
     # A window of a fit may stand still at its last time.
-    rising = jnp.all(ts[1:] >= ts[:-1]) & (ts[-1] > ts[0])
+    return all_finite(ts) & jnp.all(ts[1:] >= ts[:-1]) & (ts[-1] > ts[0])
+
+
+def _is_valid(system: System, state: State, ts: Array, signals: Any) -> Array:
     many = eqx.filter((system, state), _is_few, inverse=True)
-    others = all_finite((many, ts)) & rising & signals_are_sound(signals)
+    others = all_finite(many) & _is_rising(ts) & signals_are_sound(signals)
     for value in _positive(system):
         if not _is_few(value):
             others &= jnp.all(value > 0)
@@ -255,6 +260,24 @@ def _safe(valid: Array, values: Any) -> Any:
     many = jax.tree.map(lambda x: jnp.where(valid, x, jnp.ones_like(x)), many)
     leaves, treedef = jax.tree.flatten(few)
     return eqx.combine(jax.tree.unflatten(treedef, _safe_scalars(valid, leaves)), many, rest)
+
+
+def _finite(values: Any) -> Any:
+    """The values where they are finite, ones elsewhere."""
+    few, rest = eqx.partition(values, _is_few)
+    many, rest = eqx.partition(rest, eqx.is_inexact_array)
+    leaves, treedef = jax.tree.flatten(few)
+    found = _finite_scalars(leaves) if leaves else leaves
+    return eqx.combine(jax.tree.unflatten(treedef, found), jax.tree.map(_finite_or_one, many), rest)
+
+
+@fused
+def _finite_scalars(values: list[Array]) -> list[Array]:
+    return [_finite_or_one(x) for x in values]
+
+
+def _finite_or_one(x: Array) -> Array:
+    return jnp.where(jnp.isfinite(x), x, jnp.ones_like(x))
 
 
 @fused
