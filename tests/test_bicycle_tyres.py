@@ -273,6 +273,56 @@ def test_tyres_with_relaxation_stop_and_go_backwards_with_derivatives():
     assert slope != 0.0
 
 
+def with_load_transfer(lag, **more):
+    law = MagicFormula(12.0, 1.1, camber_ratio=0.07, relaxation_length=0.1)
+    tyre = Tyre(0.02, law, load_lag=lag, **more)
+    return Bicycle.benchmark().with_parts(rear_tyre=tyre, front_tyre=tyre)
+
+
+@pytest.mark.slow
+def test_tyres_feel_what_the_ground_carries_in_a_steady_turn():
+    """1e-10 of the weight: loads and lateral forces of the tyres, against the forces of constraint at the contacts."""
+    bicycle = with_load_transfer(0.02, rolling_resistance=0.005)
+    leaning = jk.assemble(bicycle, {"roll": 0.3, "steer": 0.12})
+    held, found = ("roll", "rear_wheel_rate"), ("steer_torque", "drive_torque")
+    turn = steady_turn(bicycle, leaning.q, {"rear_wheel_rate": -5.0 / 0.3}, hold=held, find=found)
+    at = (bicycle, 0.0, turn.q, turn.u, turn.inputs | dict(zip(bicycle.states, turn.x, strict=True)))
+    carried, outputs = jk.constraint_forces(*at), jk.outputs(*at)
+    loads = {"rear": -float(carried["P"][2]), "front": -float(carried["Q"][2])}
+    weight = 94.0 * 9.81
+    np.testing.assert_allclose(sum(loads.values()), weight, rtol=1e-12)
+    law = bicycle.front_tyre.lateral
+    for end, load in loads.items():
+        slip = turn[f"{end}_lateral_deflection"] / law.relaxation_length
+        np.testing.assert_allclose(outputs[f"{end}_lateral_force"], law.force(slip, load, 0.0), atol=1e-10 * weight)
+    np.testing.assert_allclose(turn["front_load_transfer"], 7.849 / weight, rtol=1e-3)
+    np.testing.assert_allclose(turn["rear_load_transfer"], -turn["front_load_transfer"], rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_tyres_feel_what_the_ground_carries_in_braking():
+    """1e-10: the transfer stands still at what the moments about the rear contact give.
+
+    N w = sum of m g x - a (sum of m h + IRyy / rR + IFyy / rF), with the acceleration a forwards.
+    """
+    bicycle = with_load_transfer(0.02)
+    start = jk.assemble(bicycle, {}, {"rear_wheel_rate": -5.0 / 0.3})
+    torque = {"drive_torque": 80.0}  # states that are left out are zero
+    rates = jk.speed_rates(bicycle, 0.0, start.q, start.u, torque)
+    a = -float(rates["rear_wheel_rate"] * bicycle.rR)
+    masses = [(bicycle.mR, bicycle.rR), (bicycle.mF, bicycle.rF), (bicycle.mB, -bicycle.zB), (bicycle.mH, -bicycle.zH)]
+    inertia = sum(m * h for m, h in masses) + bicycle.IRyy / bicycle.rR + bicycle.IFyy / bicycle.rF
+    weight = sum(m for m, _ in masses) * bicycle.g
+    transfer = -a * inertia / bicycle.w / weight
+    assert a < -2.0
+    assert transfer > 0.2  # more than a fifth of the weight
+    moved = {"front_load_transfer": transfer, "rear_load_transfer": -transfer}
+    at_rest = jk.state_rates(bicycle, 0.0, start.q, start.u, torque)
+    still = jk.state_rates(bicycle, 0.0, start.q, start.u, torque | moved)
+    np.testing.assert_allclose(at_rest["front_load_transfer"], 50.0 * transfer, rtol=1e-10)
+    np.testing.assert_allclose([still[name] for name in moved], 0.0, atol=1e-10)
+
+
 @pytest.mark.parametrize("law", [LateralSlip(9000.0), MagicFormula(12.0), LongitudinalSlip(2e4)])
 def test_a_tyre_pulls_against_its_slip(law):
     """Less than the friction that it has, nothing without slip or load, with a slope everywhere, at rest too."""
@@ -357,6 +407,8 @@ def test_tyres_and_roads_that_cannot_be_are_refused():
         LateralSlip(0.0)
     with pytest.raises(ValueError, match=r"relaxation_length = 0\.0 must be positive"):
         LateralSlip(9000.0, relaxation_length=0.0)
+    with pytest.raises(ValueError, match=r"load_lag = 0\.0 must be positive"):
+        Tyre(load_lag=0.0)
     with pytest.raises(ValueError, match=r"350000\.0 Pa was not measured"):
         schwalbe_energizer(350e3)
     with pytest.raises(ValueError, match=r"largest_load = 0\.0 must be positive"):

@@ -197,7 +197,8 @@ _compiled_outputs = compiled(outputs_at)
 
 @compiled
 def _compiled_state_rates(system, t, q, u, inputs):
-    x_dot = rates(system, t, q, u, inputs).x
+    at_zero = dict.fromkeys(system.states, jnp.zeros((), q.dtype))  # those that are left out
+    x_dot = rates(system, t, q, u, at_zero | inputs).x
     return {} if x_dot is None else dict(zip(system.states, x_dot, strict=True))
 
 

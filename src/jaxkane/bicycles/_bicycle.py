@@ -136,7 +136,7 @@ class Bicycle(WhippleBicycle):
 
     @property
     def states(self) -> tuple[str, ...]:
-        return (*self._deflected(), *self._of_parts("states"))
+        return (*self._deflected(), *self._transferred(), *self._of_parts("states"))
 
     @property
     def units(self) -> Mapping[str, str]:
@@ -202,6 +202,10 @@ class Bicycle(WhippleBicycle):
 
     def _deflected(self) -> tuple[str, ...]:
         return tuple(f"{end}_{name}_deflection" for end, tyre in self._tyres() for name in tyre.deflects)
+
+    def _transferred(self) -> tuple[str, ...]:
+        """Names of the states by which tyres' loads follow what the ground carries."""
+        return tuple(f"{end}_load_transfer" for end, tyre in self._tyres() if tyre.load_lag is not None)
 
     def _slip(self, end: str, u: Any) -> tuple[Component, Component]:
         """Velocities of a tyre's contact, along the heading and across it [m/s]; exactly zero where it rolls."""
@@ -338,15 +342,36 @@ class Bicycle(WhippleBicycle):
         moments = [body.center.position_from(P).cross(body.mass * gravity).dot(Y.y) for body in motion.bodies]
         front = sum(moments[1:], moments[0]) / motion["Q"].position_from(P).cross(motion.front.normal).dot(Y.y)
         masses = [body.mass for body in motion.bodies]
-        total = sum(masses[1:], masses[0]) * gravity.dot(motion.rear.normal)
-        return {REAR: total - front * motion.front.normal.dot(motion.rear.normal), FRONT: front}
+        pressing = sum(masses[1:], masses[0]) * gravity.dot(motion.rear.normal)
+        return {REAR: pressing - front * motion.front.normal.dot(motion.rear.normal), FRONT: front}
+
+    def _weight(self, motion: Any) -> Component:
+        """[N]"""
+        masses = [body.mass for body in motion.bodies]
+        return sum(masses[1:], masses[0]) * self.g
+
+    def _carried(self, motion: Any, values: Mapping[str, Component]) -> dict[str, Component]:
+        """Loads that the tyres feel [N]."""
+        found = self.tyre_loads(motion)
+        for name in self._transferred():
+            end = name.partition("_")[0]
+            found[end] = found[end] + self._weight(motion) * values[name]
+        return found
+
+    def _transfer_rates(self, motion: Any, now: Any) -> Iterator[Component]:
+        """Of the loads that follow what the ground carries, over the weight [1/s]."""
+        felt = self._carried(motion, now) if self._transferred() else {}
+        for (end, tyre), point, contact in zip(self._tyres(), ("P", "Q"), (motion.rear, motion.front), strict=True):
+            if tyre.load_lag is not None:
+                carried = -now.force(point).dot(contact.normal)
+                yield (carried - felt[end]) / (self._weight(motion) * tyre.load_lag)
 
     def _deflections(self, end: str, tyre: Tyre, values: Any) -> dict[str, Component]:
         return {name: values[f"{end}_{name}_deflection"] for name in tyre.deflects}
 
     def tyre_forces(self, motion: Any, values: Mapping[str, Component]) -> dict[str, Component]:
         """Forces of the ground on the tyres that slip [N], as "front_lateral_force"; `values` as of `loads`."""
-        carried = self.tyre_loads(motion)
+        carried = self._carried(motion, values)
         found = {}
         for end, tyre, contact, _, _ in self._wheels(motion):
             forces = tyre.forces(contact, carried[end], self._deflections(end, tyre, values))
@@ -357,7 +382,7 @@ class Bicycle(WhippleBicycle):
         values = commanded(self, t, q, u, motion, inputs)
         found: list[Any] = [super().loads(t, q, u, motion, values)]
         ground = [each for each in self._wheels(motion) if each[1].laws or each[1].rolling_resistance is not None]
-        carried = self.tyre_loads(motion) if ground else {}
+        carried = self._carried(motion, values) if ground else {}
         for end, tyre, contact, wheel, radius in ground:
             deflections = self._deflections(end, tyre, values)
             found.append(tuple(tyre.loads(contact, wheel, radius, carried[end], deflections)))
@@ -369,6 +394,7 @@ class Bicycle(WhippleBicycle):
         rates = []
         for end, tyre, contact, _, _ in self._wheels(motion):
             rates += tyre.deflection_rates(contact, self._deflections(end, tyre, x))
+        rates += self._transfer_rates(motion, now)
         for part in self.parts:
             rates += named_row(part.state_rates(self, t, q, u, x, motion, now), part.states, told(part, "state_rates"))
         return rates

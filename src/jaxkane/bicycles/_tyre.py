@@ -49,12 +49,16 @@ class Tyre(eqx.Module):
     - `longitudinal`: law of the longitudinal force. None: it rolls without slip.
     - `rolling_resistance`: resisting torque over load times radius, of a bicycle 0.003 to 0.01. Without slip the
         force follows from the constraint.
+    - `load_lag` [s]: the load that laws and rolling resistance feel is the one that the ground carries, with a lag of
+        the first order: a state "front_load_transfer", by which it differs from the load at rest, over the bicycle's
+        weight. None: the load at rest.
     """
 
     crown: Scalar | None = parameter(None, positive=True, unit="m")
     lateral: Slip | None = None
     longitudinal: LongitudinalSlip | None = None
     rolling_resistance: Scalar | None = parameter(None)
+    load_lag: Scalar | None = parameter(None, positive=True, unit="s")
 
     def __check_init__(self) -> None:
         check_parameters(self)
