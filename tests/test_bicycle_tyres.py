@@ -57,6 +57,14 @@ def test_stiff_tyres_roll_ideally(relaxation):
     np.testing.assert_allclose((10.0 * found[1] - found[0]) / 9.0, whipple, atol=1e-6)
 
 
+@pytest.mark.slow
+def test_tyres_of_a_stiffness_over_their_load_roll_ideally():
+    """1e-6 asked at 1e8, met where that is the stiffness over the load [1/rad], 3e10 to 6e10 N/rad."""
+    tyre = Tyre(lateral=MagicFormula(1e8))
+    found = slow_eigenvalues(Bicycle.benchmark().with_parts(rear_tyre=tyre, front_tyre=tyre))
+    np.testing.assert_allclose(found, slow_eigenvalues(Bicycle.benchmark()), atol=1e-6)
+
+
 # Sharp (1971), tables 1 to 3, model 1, as printed; read in the public transcription 0tmeF/MotoDynamics,
 # docs/research/sharp-1971-estabilidad-lineal.md. Real parts of capsize, weave, wobble [1/s]; imaginary parts [rad/s].
 SHARP = {
@@ -149,12 +157,16 @@ def test_linear_models_on_a_grade():
     np.testing.assert_allclose(here.A, linearize(slope, up, states=slope.lateral).A, rtol=1e-12, atol=1e-12)
 
 
-def test_linear_models_where_straight_riding_is_not_steady():
-    """What to do is said, at once along a road; NaN only where a family was given."""
+def test_along_a_road_linear_models_say_what_to_ask():
     road = Bicycle.benchmark().with_parts(road=Road(lambda x, y: 0.1 * x))
     for ask in (straight_ahead, linearize_straight, eigenvalues):
         with pytest.raises(ValueError, match=r"along a Road .* Slope\(angle\).*steady=False"):
             ask(road, 5.0)
+
+
+@pytest.mark.slow
+def test_linear_models_where_straight_riding_is_not_steady():
+    """What to do is said; NaN only where a family was given."""
     across = Bicycle.benchmark().with_parts(road=Slope(0.1, towards=0.5 * np.pi))
     with pytest.raises(ValueError, match="no steady motion"):
         eigenvalues(across, 5.0)
