@@ -138,6 +138,8 @@ def in_batches(system: Any) -> list[str]:
 def with_parameters(system: Any, values: Mapping[str, Any]) -> Any:
     """The system with other values of some parameters, by the names of `parameters_in`; each part is made anew, and
     checked as any other."""
+    if not values:
+        return system
     fields = {field.name for field in dataclasses.fields(system)}
     own: dict[str, Any] = {}
     inner: dict[str, dict[str, Any]] = {}
