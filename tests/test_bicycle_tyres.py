@@ -394,7 +394,7 @@ def test_a_measured_tyre_outside_its_formula():
     assert np.all(np.isnan([force, *slopes]))
     assert np.all(np.isfinite(jax.grad(law.force, argnums=(0, 1, 2))(0.0, 0.0, 0.0)))
     assert schwalbe_energizer().moment(0.0, 0.01, 400.0, 0.0) < 0.0  # turns out of its slip
-    assert MagicFormula89(law.lateral).moment(0.0, 0.05, 400.0, 0.1) == 0.0
+    assert MagicFormula89(law.force_coefficients).moment(0.0, 0.05, 400.0, 0.1) == 0.0
 
 
 @pytest.mark.slow

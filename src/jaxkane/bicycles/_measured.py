@@ -37,14 +37,14 @@ class MagicFormula89(Slip):
     with Fz in kN and angles in degrees. Coefficients are those of axes in which slip and camber give forces of the same
     sign, and a moment of the opposite one: a tyre pulls against its slip, towards its lean, and turns out of its slip.
 
-    **Arguments:** `lateral` (14,): a0 to a13; `aligning` (18,): c0 to c17, None for no moment; `relaxation_length`
-    [m] as in `LateralSlip`: the slip angle follows with it, camber acts at once; `largest_slip` [rad] and
-    `largest_load` [N] of the formula, numbers that no fit moves. A larger slip angle counts as the largest. A larger
-    load gives NaN, with which a motion ends.
+    **Arguments:** `force_coefficients` (14,): a0 to a13; `moment_coefficients` (18,): c0 to c17, None for no moment;
+    `relaxation_length` [m] as in `LateralSlip`: the slip angle follows with it, camber acts at once; `largest_slip`
+    [rad] and `largest_load` [N] of the formula, numbers that no fit moves. A larger slip angle counts as the largest. A
+    larger load gives NaN, with which a motion ends.
     """
 
-    lateral: Float[Array, 14] = parameter(shape=(14,))
-    aligning: Float[Array, 18] | None = parameter(None, shape=(18,))
+    force_coefficients: Float[Array, 14] = parameter(shape=(14,))
+    moment_coefficients: Float[Array, 18] | None = parameter(None, shape=(18,))
     relaxation_length: Scalar | None = parameter(None, positive=True, unit="m")
     largest_slip: float = eqx.field(default=10.0 * _DEGREE, static=True, converter=float)
     largest_load: float = eqx.field(default=1000.0, static=True, converter=float)
@@ -55,16 +55,16 @@ class MagicFormula89(Slip):
                 raise ValueError(f"MagicFormula89.{name} = {getattr(self, name)} must be positive.")
 
     def force(self, slip, load, camber):
-        a, alpha, Fz, gamma = self.lateral, *self._in_degrees(slip, load, camber)
+        a, alpha, Fz, gamma = self.force_coefficients, *self._in_degrees(slip, load, camber)
         # B C D / Fz, by sin(2 atan x) = 2 x / (1 + x^2), so that a wheel without load has a stiffness factor too
         slope = 2.0 * a[3] / a[4] / (1.0 + (Fz / a[4]) ** 2) * (1.0 - a[5] * jnp.abs(gamma))
         shift = _Shift(a[8] * gamma + a[9] * Fz + a[10], a[11] * Fz * gamma + a[12] * Fz + a[13])
         return self._carried(_magic(alpha, Fz, a[0], a[1] * Fz + a[2], slope, a[6] * Fz + a[7], shift), load)
 
     def moment(self, force, slip, load, camber):
-        if self.aligning is None:
+        if self.moment_coefficients is None:
             return 0.0
-        c, alpha, Fz, gamma = self.aligning, *self._in_degrees(slip, load, camber)
+        c, alpha, Fz, gamma = self.moment_coefficients, *self._in_degrees(slip, load, camber)
         leaning = jnp.abs(gamma)
         slope = (c[3] * Fz + c[4]) * (1.0 - c[6] * leaning) * jnp.exp(-c[5] * Fz)
         curvature = (c[7] * Fz**2 + c[8] * Fz + c[9]) * (1.0 - c[10] * leaning)
@@ -167,8 +167,8 @@ def schwalbe_energizer(
         raise ValueError(
             f"schwalbe_energizer: pressure = {pressure!r} Pa was not measured; there are {', '.join(map(str, known))}."
         )
-    lateral, aligning = (
+    force, moment = (
         jnp.array([0.0 if i in own and not offsets else x for i, x in enumerate(coefficients)])
         for coefficients, own in zip(known[pressure], _OFFSETS, strict=True)
     )
-    return MagicFormula89(lateral=lateral, aligning=aligning, relaxation_length=relaxation_length)
+    return MagicFormula89(force_coefficients=force, moment_coefficients=moment, relaxation_length=relaxation_length)
