@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -193,3 +194,10 @@ def test_units_of_files(suffix, tmp_path):
 def test_canonical_matrices_are_refused_where_they_do_not_tell_all(parts, words):
     with pytest.raises(ValueError, match=words):
         canonical(BENCHMARK.with_parts(**parts))
+
+
+def test_parts_are_put_together_while_others_are_traced():
+    thick = jax.jit(
+        lambda x: BENCHMARK.with_parts(rear_tyre=Tyre(crown=0.02), front_tyre=Tyre(crown=x)).front_tyre.crown
+    )
+    assert thick(0.03) == 0.03

@@ -172,6 +172,9 @@ def test_lqr_balances_the_bicycle_by_steering(at_four):
         stability.lqr(at_four, np.ones(4), 1.0, inputs=("drive_torque",))
     with pytest.raises(ValueError, match=r"Q is \(4, 4\)"):
         stability.lqr(at_four, np.ones(3), 1.0)
+    for Q, R in ((np.ones(4), 0.0), (-np.ones(4), 1.0), (np.full(4, np.nan), 1.0)):
+        with pytest.raises(ValueError, match=r"no negative eigenvalue|Q is not finite"):
+            stability.lqr(at_four, Q, R, inputs=("steer_torque",))
 
 
 def test_python_control_gets_the_names_or_is_asked_for(at_four, monkeypatch):

@@ -46,7 +46,7 @@ def refuse_misfits(bicycle: Bicycle) -> None:
         crown = tyre.crown
         if crown is None or not is_concrete(crown, radius) or crown.ndim or radius.ndim:
             continue  # members of a batch are not looked at
-        if crown >= radius:
+        if float(crown) >= float(radius):  # numbers, where others are traced
             raise ValueError(
                 f"{name}: {end}_tyre.crown = {crown} m is the radius of the tyre's cross section, and must be less "
                 f"than that of its wheel, {radius} m."

@@ -41,8 +41,8 @@ class ConstantSpeed(Part):
 
     The rate is a dependent speed then, which an initial state leaves out. The output "holding_torque" [N m] is the
     torque that the drive has to give, on the rear wheel with its reaction on the frame, negative where it pushes on, as
-    "drive_torque". Linear models over speeds are those of the bicycle without this part: riding straight and upright
-    needs no drive, and deviations from it change the speed to second order only.
+    "drive_torque". Linear models over speeds are those of the bicycle without this part, with the "drive_torque" that
+    riding straight and upright takes: deviations from it change the speed to second order only.
 
     **Arguments:** `speed` [m/s].
     """

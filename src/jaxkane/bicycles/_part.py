@@ -47,7 +47,8 @@ class Part(eqx.Module):
 
     A subclass names what it adds: `coordinates`, `speeds`, `dependent_speeds`, `dependent_coordinates`, `inputs`,
     `states` and `units`, as a `System` does; and overrides those methods that it needs. `q`, `u` and `x` hold all
-    values of the bicycle, read by name.
+    values of the bicycle, read by name. `resists = True` says that riding straight on takes a drive because of it:
+    linear models over speeds then have the "drive_torque" that this takes.
     """
 
     coordinates: ClassVar[tuple[str, ...]] = ()
@@ -57,7 +58,7 @@ class Part(eqx.Module):
     inputs: ClassVar[tuple[str, ...]] = ()
     states: ClassVar[tuple[str, ...]] = ()
     units: ClassVar[Mapping[str, str]] = {}
-    resists: ClassVar[bool] = False  # riding straight on: then linear models over speeds have a torque of the drive
+    resists: ClassVar[bool] = False
 
     def __check_init__(self) -> None:
         check_parameters(self)

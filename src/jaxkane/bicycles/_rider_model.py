@@ -72,6 +72,7 @@ class SequentialLoopRider(Part):
         **Raises:** `ValueError` for a speed outside.
         """
         speeds, *columns = _OF_BENCHMARK.T
+        speed = float(speed)
         if not speeds[0] <= speed <= speeds[-1]:
             known = f"{speeds[0]:g} to {speeds[-1]:g} m/s"
             raise ValueError(f"SequentialLoopRider.benchmark: gains are known from {known}, not at {speed} m/s.")

@@ -69,6 +69,12 @@ def lqr(
                 f"mode with the eigenvalue {root:.4g}, which does not decay. Leave out the states that it moves: "
                 "linearize(..., states=(...)), or add an input."
             )
+    least_Q, least_R = (float(np.linalg.eigvalsh(0.5 * (W + W.T))[0]) for W in (Q, R))
+    if not (least_Q >= -1e-12 * np.abs(Q).max() and least_R > 0.0):
+        raise ValueError(
+            "lqr: Q must have no negative eigenvalue and R only positive ones; "
+            f"the least of them are {least_Q:.4g} and {least_R:.4g}."
+        )
     P = solve_continuous_are(A, B, Q, R)
     K = np.linalg.solve(R, B.T @ P)
     return K, P, np.linalg.eigvals(A - B @ K)
@@ -101,4 +107,6 @@ def _weights(W: Any, n: int, name: str, what: str) -> np.ndarray:
     W = np.diag(np.broadcast_to(W, (n,))) if W.ndim == 0 or W.shape == (n,) else W
     if W.shape != (n, n):
         raise ValueError(f"lqr: {name} is ({n}, {n}), or ({n},) for a diagonal: one for each of the {what}.")
+    if not np.all(np.isfinite(W)):
+        raise ValueError(f"lqr: {name} is not finite.")
     return W
