@@ -341,21 +341,15 @@ class Bicycle(WhippleBicycle):
         gravity, Y, P = self.gravity(motion.N), motion["Y"], motion["P"]
         moments = [body.center.position_from(P).cross(body.mass * gravity).dot(Y.y) for body in motion.bodies]
         front = sum(moments[1:], moments[0]) / motion["Q"].position_from(P).cross(motion.front.normal).dot(Y.y)
-        masses = [body.mass for body in motion.bodies]
-        pressing = sum(masses[1:], masses[0]) * gravity.dot(motion.rear.normal)
+        pressing = _mass(motion) * gravity.dot(motion.rear.normal)
         return {REAR: pressing - front * motion.front.normal.dot(motion.rear.normal), FRONT: front}
-
-    def _weight(self, motion: Any) -> Component:
-        """[N]"""
-        masses = [body.mass for body in motion.bodies]
-        return sum(masses[1:], masses[0]) * self.g
 
     def _carried(self, motion: Any, values: Mapping[str, Component]) -> dict[str, Component]:
         """Loads that the tyres feel [N]."""
         found = self.tyre_loads(motion)
         for name in self._transferred():
             end = name.partition("_")[0]
-            found[end] = found[end] + self._weight(motion) * values[name]
+            found[end] = found[end] + _mass(motion) * self.g * values[name]
         return found
 
     def _transfer_rates(self, motion: Any, now: Any) -> Iterator[Component]:
@@ -364,7 +358,7 @@ class Bicycle(WhippleBicycle):
         for (end, tyre), point, contact in zip(self._tyres(), ("P", "Q"), (motion.rear, motion.front), strict=True):
             if tyre.load_lag is not None:
                 carried = -now.force(point).dot(contact.normal)
-                yield (carried - felt[end]) / (self._weight(motion) * tyre.load_lag)
+                yield (carried - felt[end]) / (_mass(motion) * self.g * tyre.load_lag)
 
     def _deflections(self, end: str, tyre: Tyre, values: Any) -> dict[str, Component]:
         return {name: values[f"{end}_{name}_deflection"] for name in tyre.deflects}
@@ -454,3 +448,8 @@ class BicycleMotion(Motion):
 
     rear: Contact
     front: Contact
+
+
+def _mass(motion: Motion) -> Component:
+    masses = [body.mass for body in motion.bodies]
+    return sum(masses[1:], masses[0])
