@@ -266,6 +266,11 @@ def of_two(a, b):
     return 2.0 * jnp.sin(a), a * b, b**2
 
 
+@fused
+def with_a_constant(b):
+    return jnp.ones(()), 2.0 * b
+
+
 def test_what_members_share_remains_shared():
     """Only an output without an axis of members may be given out without one."""
     a, b = jnp.array(0.7), jnp.arange(1.0, 4.0)
@@ -279,3 +284,5 @@ def test_what_members_share_remains_shared():
     np.testing.assert_allclose(both(b, b)[1], np.outer(b, b), rtol=1e-15)
     slopes = jax.jit(jax.grad(lambda a: sum(jnp.sum(x) for x in inner(a, b))))
     np.testing.assert_allclose(slopes(a), 2 * np.cos(0.7) + 6.0, rtol=1e-14)
+    batch = jax.jit(jax.vmap(with_a_constant))(b)
+    np.testing.assert_array_equal(batch, [np.ones(3), 2 * b])

@@ -315,7 +315,7 @@ def _batch(args, axes, *, program, sizes, where):
     args = [x if axis is None else jax.numpy.moveaxis(x, axis, 0) for x, axis in zip(args, axes, strict=True)]
     moving = tuple(axis is not None for axis in axes)
     moves = program.moved(moving)
-    if any(moves) and not all(moves):  # what follows from shared inputs alone remains shared, as parameters
+    if any(moves) and not all(moves) and not all(moving):  # what follows from shared inputs alone remains shared
         found = {}
         for is_moved in (False, True):
             inputs = tuple(is_moved or not m for m in moving)
