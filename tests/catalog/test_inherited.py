@@ -206,7 +206,7 @@ def test_stability_of_a_bicycle_with_more_states(leaning):
     slow = slow[(np.abs(slow) < 100.0) & (np.abs(slow) > 1e-6)]  # without the stiff pair, and that of the speed
     np.testing.assert_allclose(np.sort_complex(slow), expected, rtol=1e-3)
     assert set(found.states) == {"roll", "steer", "lean", "roll_rate", "steer_rate", "lean_rate", "rear_wheel_rate"}
-    with pytest.raises(ValueError, match=r"canonical: Leaning has the speeds .*lean_rate, and no equations in roll"):
+    with pytest.raises(ValueError, match=r"canonical: Leaning moves by .*lean_rate, and has no equations in roll"):
         jk.stability.canonical(leaning)
 
 
