@@ -112,6 +112,21 @@ def test_dry_friction_is_a_damper_at_slow_rates():
     np.testing.assert_allclose(a, b, rtol=1e-12)
 
 
+def test_a_wire_turns_the_fork_and_is_felt_at_the_handlebar():
+    """1e-12: the coupling's torque on the fork, and its share on the handlebar, over their speeds."""
+    wire = SteerByWire(1.0, 0.85, -0.95, 0.02, 0.01, 0.015, stiffness=100.0, ratio=0.5, feedback=0.8)
+    q, u = {"handlebar": 0.1, "steer": 0.02}, {"rear_wheel_rate": -12.0}
+
+    def forces(stiffness):
+        bicycle = BENCHMARK.with_parts(steering=dataclasses.replace(wire, stiffness=stiffness))
+        start = jk.assemble(bicycle, q, u)
+        F = jk.generalized_active_forces(bicycle, 0.0, start.q, start.u)
+        return np.array([F[bicycle.speeds.index(name)] for name in ("steer_rate", "handlebar_rate")])
+
+    torque = (100.0 - 40.0) * (0.5 * 0.1 - 0.02)
+    np.testing.assert_allclose(forces(100.0) - forces(40.0), [torque, -0.8 * 0.5 * torque], rtol=1e-12)
+
+
 @pytest.mark.slow
 def test_a_stiff_wire_makes_one_piece_of_handlebar_and_fork():
     """1e-4 of the largest slow eigenvalue at 1e5 N m/rad, and ten times that at 1e4: of the first order."""
