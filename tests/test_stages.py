@@ -61,3 +61,26 @@ def test_they_are_written_out_where_the_right_hand_side_is_a_native_kernel():
         assert not rates_are_native(system, jnp.zeros(()), y, {})
     finally:
         native.use(True)
+
+
+class Rod(jk.System):
+    mass: jk.Scalar = jk.parameter(1.0, positive=True)
+    length: jk.Scalar = jk.parameter(0.5)
+    coordinates, speeds = ("angle",), ("rate",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, q["angle"], u["rate"])
+        return jk.Motion([jk.Body(self.mass, 0.0, O.fixed(-self.length * A.y))])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+
+
+def test_a_member_without_mass_leaves_the_gradient_of_the_others():
+    def ends(length, masses):
+        start, ts = jk.State({"angle": 0.3}, {}), jnp.linspace(0.0, 0.5, 3)
+        return jax.vmap(lambda m: jk.simulate(Rod(m, length), start, ts, adjoint="reverse").q[-1, 0])(masses)
+
+    slope = jax.jit(jax.grad(lambda length, masses: ends(length, masses)[0]))
+    assert slope(0.5, jnp.array([1.0, 0.0])) == slope(0.5, jnp.array([1.0, 2.0]))

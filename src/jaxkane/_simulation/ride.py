@@ -70,7 +70,7 @@ def solve(
     valid = _is_valid(system, state, ts, signals)
     # What is not finite must not enter the solver, where it would spoil the gradient of what is shared. In its steps
     # what all members of a batch share remains shared, of which a kernel computes its part once.
-    stepped = _finite(system)
+    stepped = _sound(system)
     system, state = _safe(valid, (system, state))
     start = packed(state)
     ts = jnp.where(_is_rising(ts), ts, jnp.arange(ts.shape[0], dtype=ts.dtype))
@@ -262,22 +262,27 @@ def _safe(valid: Array, values: Any) -> Any:
     return eqx.combine(jax.tree.unflatten(treedef, _safe_scalars(valid, leaves)), many, rest)
 
 
-def _finite(values: Any) -> Any:
-    """The values where they are finite, ones elsewhere."""
-    few, rest = eqx.partition(values, _is_few)
+def _sound(system: System) -> System:
+    """The system with ones for parameters that are not finite, or not positive as they must be: behind a mask these
+    would still spoil the reverse gradient of what is shared."""
+    must_be = {id(x) for x in _positive(system)}
+    few, rest = eqx.partition(system, _is_few)
     many, rest = eqx.partition(rest, eqx.is_inexact_array)
+    many = jax.tree.map(lambda x: _sound_or_one(x, id(x) in must_be), many)
     leaves, treedef = jax.tree.flatten(few)
-    found = _finite_scalars(leaves) if leaves else leaves
-    return eqx.combine(jax.tree.unflatten(treedef, found), jax.tree.map(_finite_or_one, many), rest)
+    positive = [id(x) in must_be for x in leaves]
+    split = [[x for x, p in zip(leaves, positive, strict=True) if p == kind] for kind in (False, True)]
+    found = [iter(each) for each in _sound_scalars(*split)] if leaves else []
+    return eqx.combine(jax.tree.unflatten(treedef, [next(found[p]) for p in positive]), many, rest)
 
 
 @fused
-def _finite_scalars(values: list[Array]) -> list[Array]:
-    return [_finite_or_one(x) for x in values]
+def _sound_scalars(values: list[Array], positive: list[Array]) -> tuple[list[Array], list[Array]]:
+    return [_sound_or_one(x, False) for x in values], [_sound_or_one(x, True) for x in positive]
 
 
-def _finite_or_one(x: Array) -> Array:
-    return jnp.where(jnp.isfinite(x), x, jnp.ones_like(x))
+def _sound_or_one(x: Array, positive: bool) -> Array:
+    return jnp.where(jnp.isfinite(x) & (x > 0) if positive else jnp.isfinite(x), x, jnp.ones_like(x))
 
 
 @fused
