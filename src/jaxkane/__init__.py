@@ -11,14 +11,14 @@ from ._description.bodies import Force as Force
 from ._description.bodies import Motion as Motion
 from ._description.bodies import Torque as Torque
 from ._description.bodies import weight as weight
+from ._description.frames import Frame as Frame
 from ._description.parameters import learned as learned
 from ._description.parameters import parameter as parameter
+from ._description.points import Point as Point
+from ._description.points import inertial as inertial
 from ._description.system import State as State
 from ._description.system import System as System
-from ._description.vectors import Frame as Frame
-from ._description.vectors import Point as Point
 from ._description.vectors import Vector as Vector
-from ._description.vectors import inertial as inertial
 from ._method.assembly import assemble as assemble
 from ._method.drift import best_dependent_speeds as best_dependent_speeds
 from ._method.equations import accelerations as accelerations

@@ -22,7 +22,9 @@ import jax
 import jax.numpy as jnp
 
 from ._description.bodies import Body
-from ._description.vectors import Frame, Point, Vector
+from ._description.frames import Frame
+from ._description.points import Point
+from ._description.vectors import Vector
 from ._scalars.types import Component
 
 Named = dict[str, Component]

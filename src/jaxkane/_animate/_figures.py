@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from .._description.bodies import Body, Motion
-from .._description.vectors import Frame, Vector
+from .._description.frames import Frame
+from .._description.vectors import Vector
 from ..catalog import WhippleBicycle
 from ._record import Record
 from ._scene import Builder

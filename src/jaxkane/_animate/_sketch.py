@@ -11,8 +11,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._description.bodies import Body, Motion
+from .._description.frames import Frame
+from .._description.points import Point
 from .._description.system import System
-from .._description.vectors import Frame, Point, Vector
+from .._description.vectors import Vector
 from .._scalars.linear import stack
 
 # On a light page and on a dark one. What is no name of these is taken for a colour of the browser's.

@@ -13,7 +13,9 @@ import numpy as np
 from .._common.lookup import not_there
 from .._scalars.components import add, component, dot, is_zero, mul, sub
 from .._scalars.types import Component, Triple
-from .vectors import Frame, Point, Vector
+from .frames import Frame
+from .points import Point
+from .vectors import Vector
 
 UNNAMED = "body"  # the name of bodies that were not given one
 

@@ -15,8 +15,9 @@ import numpy as np
 
 from .._common.lookup import refuse_unknown
 from .._description.bodies import UNNAMED, Body, Motion
+from .._description.points import Point
 from .._description.system import System
-from .._description.vectors import Point, Vector
+from .._description.vectors import Vector
 from .._scalars.components import is_zero
 from .._scalars.jax_internals import Literal, concretely
 from .check_description import MOST_REMEMBERED, structure_of, with_trial_numbers

@@ -6,8 +6,9 @@ from collections.abc import Iterable, Iterator
 from typing import Any
 
 from .._description.bodies import Force, Load, Motion
+from .._description.frames import Frame
+from .._description.points import Point
 from .._description.system import System
-from .._description.vectors import Frame, Point
 from .._scalars.components import is_exact
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, stack

@@ -20,9 +20,11 @@ from jaxtyping import Array
 
 from .._common.lookup import not_there, refuse_unknown
 from .._description.bodies import Motion
+from .._description.frames import Frame
+from .._description.points import Point
 from .._description.system import State, System, packed, unpacked
 from .._description.values import Values
-from .._description.vectors import Frame, Point, Vector
+from .._description.vectors import Vector
 from .._scalars.components import add3, component, cross, is_exact
 from .._scalars.fuse import fused, is_native
 from .._scalars.linear import as_vector, is_written_out

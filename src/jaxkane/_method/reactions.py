@@ -17,8 +17,10 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 
 from .._description.bodies import Motion
+from .._description.frames import Frame
+from .._description.points import Point
 from .._description.system import System
-from .._description.vectors import Frame, Point, virtual
+from .._description.virtual import virtual
 from .._scalars.components import add, dot, mul
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, solve

@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from .._description.frames import Frame
+from .._description.points import Point
 from .._description.system import System
-from .._description.vectors import Frame, Point
 from .._method.equations import InputValues, _arrays, _dependent_accelerations
 from .._method.kane import Instant
 from .._method.now import outputs_at, rates

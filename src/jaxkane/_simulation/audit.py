@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._description.bodies import Force, Motion, kinetic_energy_of
+from .._description.points import Point
 from .._description.system import System
-from .._description.vectors import Point, Vector
+from .._description.vectors import Vector
 from .._method.description_facts import configuration_residual
 from .._method.drift import relative_condition
 from .._method.rates import accelerations_and_mass_matrix

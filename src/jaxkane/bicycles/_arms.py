@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._description.bodies import Body, Torque
+from .._description.frames import Frame
 from .._description.parameters import in_batches, parameter
-from .._description.vectors import Frame, Point
+from .._description.points import Point
 from .._method.checks import is_concrete
 from .._scalars.components import add
 from .._scalars.types import Component, Scalar

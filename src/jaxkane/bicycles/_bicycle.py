@@ -17,7 +17,9 @@ import jax.numpy as jnp
 
 from .._common.lookup import refuse_unknown
 from .._description.bodies import Body, Motion
-from .._description.vectors import Frame, Point, Vector, inertial
+from .._description.frames import Frame
+from .._description.points import Point, inertial
+from .._description.vectors import Vector
 from .._method.kane import as_row
 from .._method.now import named_row
 from .._scalars.components import add

@@ -14,8 +14,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._description.frames import Frame
 from .._description.parameters import learned, parameter
-from .._description.vectors import Frame, Point, Vector
+from .._description.points import Point
+from .._description.vectors import Vector
 from .._scalars.components import add, dot, mul, sub
 from .._scalars.types import Component, Scalar
 from ._part import check_parameters

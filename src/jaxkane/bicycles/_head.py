@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from .._description.bodies import Torque
+from .._description.frames import Frame
 from .._description.parameters import parameter
-from .._description.vectors import Frame, Point
+from .._description.points import Point
 from .._scalars.types import Scalar
 from ._part import Part
 

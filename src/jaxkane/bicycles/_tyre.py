@@ -10,7 +10,8 @@ import jax.numpy as jnp
 
 from .._description.bodies import Body, Force, Torque
 from .._description.parameters import parameter
-from .._description.vectors import Point, Vector
+from .._description.points import Point
+from .._description.vectors import Vector
 from .._scalars.components import is_zero, mul, sub
 from .._scalars.types import Component, Scalar
 from ._part import called, check_parameters

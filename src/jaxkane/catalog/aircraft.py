@@ -8,9 +8,10 @@ import jax.numpy as jnp
 
 from .. import rotations
 from .._description.bodies import Body, Force, Motion, Torque
+from .._description.frames import Frame
 from .._description.parameters import parameter
+from .._description.points import Point, inertial
 from .._description.system import System
-from .._description.vectors import Frame, Point, inertial
 from .._scalars.types import Component, Scalar
 from ._entry import entry
 

@@ -10,9 +10,11 @@ from typing import Any, ClassVar, Self
 import jax.numpy as jnp
 
 from .._description.bodies import Body, Motion, Torque, weight
+from .._description.frames import Frame
 from .._description.parameters import parameter, parameter_info
+from .._description.points import Point, inertial
 from .._description.system import System
-from .._description.vectors import Frame, Point, Vector, inertial
+from .._description.vectors import Vector
 from .._scalars.types import Scalar
 from ._bicycle_file import read_bicycle_file, refuse_other_units
 from ._entry import entry

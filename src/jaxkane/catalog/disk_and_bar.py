@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from .._description.bodies import Body, Motion, Torque, weight
 from .._description.parameters import parameter
+from .._description.points import inertial
 from .._description.system import System
-from .._description.vectors import inertial
 from .._scalars.types import Scalar
 from ._entry import entry
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from .. import rotations
 from .._description.bodies import Body, Force, Motion, Torque
 from .._description.parameters import parameter
+from .._description.points import Point, inertial
 from .._description.system import System
-from .._description.vectors import Point, inertial
 from .._scalars.types import Scalar
 from ._entry import entry
 

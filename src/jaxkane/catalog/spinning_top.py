@@ -5,8 +5,8 @@ from __future__ import annotations
 from .. import rotations
 from .._description.bodies import Body, Motion, weight
 from .._description.parameters import parameter
+from .._description.points import inertial
 from .._description.system import System
-from .._description.vectors import inertial
 from .._scalars.types import Scalar
 from ._entry import entry
 

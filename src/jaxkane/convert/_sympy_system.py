@@ -11,9 +11,11 @@ from typing import Any, ClassVar
 import jax
 
 from .._description.bodies import Body, Force, Motion, Torque
+from .._description.frames import Frame
 from .._description.parameters import parameter
+from .._description.points import Point, inertial
 from .._description.system import System
-from .._description.vectors import Frame, Point, Vector, inertial
+from .._description.vectors import Vector
 from .._scalars.components import ZERO3, dot, sub
 from .._scalars.types import Component, Scalar
 from ._lagrangian import factor, factor_rate

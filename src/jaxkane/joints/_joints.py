@@ -17,7 +17,8 @@ from jax.core import Tracer
 
 from .. import rotations
 from .._description.bodies import Body, Force, Load, Torque
-from .._description.vectors import Frame, Point
+from .._description.frames import Frame
+from .._description.points import Point
 from .._scalars.components import add, component, is_zero, mul, sub
 from .._scalars.types import Component, Triple
 

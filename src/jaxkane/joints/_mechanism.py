@@ -13,9 +13,10 @@ from typing import Any, ClassVar
 
 from .._common.lookup import hint
 from .._description.bodies import Body, Force, Motion
+from .._description.frames import Frame
 from .._description.parameters import parameter, parameter_info
+from .._description.points import Point, inertial
 from .._description.system import System
-from .._description.vectors import Frame, Point, inertial
 from .._scalars.components import ZERO3, add, dot, is_zero, mul, sub
 from .._scalars.types import Component, Scalar, Triple
 from ..rotations import Matrix

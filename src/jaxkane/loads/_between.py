@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from .._description.bodies import Body, Force, Torque
-from .._description.vectors import Frame, Point, Vector
+from .._description.frames import Frame
+from .._description.points import Point
+from .._description.vectors import Vector
 from .._scalars.components import component, is_zero
 from .._scalars.types import Component
 from ._laws import coulomb, smooth_abs

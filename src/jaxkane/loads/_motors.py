@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from .._description.bodies import Body
-from .._description.vectors import Frame, Point, Vector
+from .._description.frames import Frame
+from .._description.points import Point
+from .._description.vectors import Vector
 from .._scalars.components import mul
 from .._scalars.types import Component
 
