@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._method.assembly import _newton, _newton_in_numbers
+from jaxkane._method.newton import newton, newton_in_numbers
 from jaxkane._scalars.fuse import fused
 from jaxkane._scalars.numbers import derivative_in_numbers, in_numbers, is_in_numbers
 
@@ -112,7 +112,7 @@ def test_newtons_method_finds_in_numbers_what_it_finds_compiled(base, start):
     """Where there is one place, two rods in line, none, and no number; from beside, and from where all slopes agree."""
     system = eqx.tree_at(lambda s: s.base, Rods(), jnp.array(base))
     q = jnp.array([*start, 0.2])
-    found, right = (f(system, q, jnp.array(0.0), (0, 1), False) for f in (_newton_in_numbers, _newton))
+    found, right = (f(system, q, jnp.array(0.0), (0, 1), False) for f in (newton_in_numbers, newton))
     assert bool(found.good) == bool(right.good)
     assert float(found.remainder) == pytest.approx(float(right.remainder), abs=1e-12) or not right.good
     if right.good:

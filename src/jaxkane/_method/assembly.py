@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
 
-from .._common.lookup import refuse_unknown
 from .._description.system import State, System
-from .._scalars.jax_internals import concretely
-from .._scalars.nan import nan_where
-from .._scalars.numbers import derivative_in_numbers, in_numbers, is_in_numbers
+from .._scalars.numbers import is_in_numbers
 from .._scalars.types import Component
-from .._scalars.versions import compiled
-from .check_description import MOST_REMEMBERED, structure_of, with_trial_numbers
-from .checks import check_system, configuration_tolerance, implied_residual, is_concrete
+from .checks import check_system, configuration_tolerance, is_concrete
 from .description_facts import configuration_residual
 from .equations import dependent_speeds
+from .free_coordinates import Plan, plan_of
+from .newton import Found, newton, newton_in_numbers
 from .values import as_array
 
 
@@ -56,7 +52,7 @@ def assemble(
     """
     name = type(system).__name__
     _check_time(name, t)
-    plan = _plan(system, q, free)
+    plan = plan_of(system, q, free)
     q0 = as_array(plan.guess | dict(q) if isinstance(q, Mapping) else q, system.coordinates, f"{name}: q")
     given: dict[str, Any] = {}
     if isinstance(u, Mapping):
@@ -88,67 +84,7 @@ def _check_time(name: str, t: Any) -> None:
         raise ValueError(f"{name}: the time t = {t} is not finite.")
 
 
-class _Plan(NamedTuple):
-    """Which coordinates are moved, which are `named`, and where some that were not named start.
-
-    `lenient`: a constraint that does not read what is moved is no equation: it only has to be met.
-    """
-
-    moved: tuple[str, ...]
-    named: tuple[str, ...]
-    guess: dict[str, float]
-    lenient: bool
-
-
-def _plan(system: System, q: Any, free: Sequence[str] | None) -> _Plan:
-    names = system.coordinates
-    named = tuple(q) if isinstance(q, Mapping) else tuple(names)
-    quaternions = _euler_parameters(system) if isinstance(q, Mapping) else []
-    guess = {names[four[3]]: 1.0 for four in quaternions if names[four[3]] not in named}
-    if free is not None:
-        free = (free,) if isinstance(free, str) else tuple(free)
-        refuse_unknown(free, names, f"{type(system).__name__} has no coordinate", "it has")
-        return _Plan(tuple(c for c in names if c in free), named, guess, lenient=True)
-    if system.dependent_coordinates:
-        return _Plan(tuple(system.dependent_coordinates), named, guess, lenient=False)
-    if not isinstance(q, Mapping):
-        return _Plan(tuple(names), named, guess, lenient=False)
-    # Beside a scalar that is named, the axis of a rotation cannot be found: it is zero, or named too.
-    still = {names[i] for four in quaternions if names[four[3]] in named for i in four}
-    return _Plan(tuple(c for c in names if c not in named and c not in still), named, guess, lenient=True)
-
-
-def found_of(system: System, named: Iterable[str]) -> tuple[tuple[str, ...], dict[str, float]]:
-    """Of coordinates in a dict with these names: those that `assemble` moves, and where of those that are left out
-    some start that do not start at zero."""
-    plan = _plan(system, dict.fromkeys(named, 0.0), None)
-    return plan.moved, plan.guess
-
-
-_EULER_PARAMETERS: dict[Any, list[tuple[int, ...]]] = {}  # structures, the oldest first
-
-
-def _euler_parameters(system: System) -> list[tuple[int, ...]]:
-    """Places of every four coordinates, one after the other, of which a constraint says that their norm is one."""
-    structure = structure_of(system)
-    found = _EULER_PARAMETERS.get(structure)
-    if found is None:
-        rng = np.random.default_rng(0)
-        probe = rng.uniform(0.2, 0.9, len(system.coordinates)).astype(jnp.result_type(float))
-        with concretely():
-            trial = with_trial_numbers((system, np.zeros((), probe.dtype), probe), rng)
-            values = np.abs(in_numbers(configuration_residual, *trial))
-        found = _EULER_PARAMETERS[structure] = [
-            (i, i + 1, i + 2, i + 3)
-            for i, square in enumerate(np.convolve(probe**2, np.ones(4), "valid") if len(probe) > 3 else ())
-            if any(np.any(np.abs(values - abs(x)) < 1e-5) for x in (square - 1.0, square**0.5 - 1.0))
-        ]
-        if len(_EULER_PARAMETERS) > MOST_REMEMBERED:
-            _EULER_PARAMETERS.pop(next(iter(_EULER_PARAMETERS)), None)
-    return found
-
-
-def _solve_configuration(system: System, q0, t, plan: _Plan):
+def _solve_configuration(system: System, q0, t, plan: Plan):
     t = jnp.asarray(t if isinstance(t, jax.Array) else np.asarray(t, q0.dtype), dtype=q0.dtype)
     n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q0).shape[0]
     if n_h == 0:
@@ -161,157 +97,13 @@ def _solve_configuration(system: System, q0, t, plan: _Plan):
     places = tuple(system.coordinates.index(c) for c in plan.moved)
     concrete = is_concrete(system, q0, t)
     in_python = concrete and is_in_numbers(configuration_residual, system, t, q0)
-    found = (_newton_in_numbers if in_python else _newton)(system, q0, t, places, plan.lenient)
+    found = (newton_in_numbers if in_python else newton)(system, q0, t, places, plan.lenient)
     if concrete and not bool(found.good):
         raise ValueError(_why_not(system, q0, plan, found))
     return found.q
 
 
-def _met(residuals):
-    """Which constraints are met."""
-    return abs(residuals) <= float(jnp.finfo(residuals.dtype).eps) ** 0.6
-
-
-def _flat(slopes):
-    """Which slopes are no more than rounding."""
-    return abs(slopes) <= float(jnp.finfo(slopes.dtype).eps) ** 0.9
-
-
-def _slopes(system: System, t, q, places: np.ndarray):
-    """How the constraints change with what is moved (h, moved)."""
-    return jax.jacfwd(lambda dq: configuration_residual(system, t, q.at[places].add(dq)))(
-        jnp.zeros(len(places), q.dtype)
-    )
-
-
-class _Found(NamedTuple):
-    q: Any  # NaN where it is not good
-    good: Any  # the constraints are met, and determine what was moved
-    remainder: Any  # largest residual
-    follows: Any  # largest of those that follow from these
-    slope: Any  # smallest singular value of the residuals' derivatives along what was moved
-    steps: Any
-
-
-@compiled
-def _newton(system: System, q0, t, where: tuple[int, ...], lenient: bool) -> _Found:
-    places, origin = np.array(where, int), (system, q0, t)
-    # What is not finite must not enter the linear solver, which would raise for all members of a batch.
-    finite = jnp.all(jnp.stack([jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((system, q0))]))
-    system, q0 = jax.tree.map(lambda x: jnp.where(finite, x, jnp.ones_like(x)), (system, q0))
-    start, already_met = _start(system, q0, t, places)
-    already_met = already_met & lenient
-    n_h = len(already_met)
-    if len(places) == n_h and not lenient:
-        directions = jnp.eye(n_h, dtype=q0.dtype)
-    else:  # (h, moved): along the constraints' gradients only
-        directions = _slopes(system, t, start, places)
-
-    def residual(amount, args):
-        system, t, start, directions = args
-        h = configuration_residual(system, t, start.at[places].add(amount @ directions))
-        return jnp.where(already_met, amount, h)
-
-    eps = float(jnp.finfo(q0.dtype).eps)
-    newton = optx.Newton(rtol=8 * eps, atol=8 * eps)
-    args = (system, t, start, directions)
-    solution = optx.root_find(residual, newton, jnp.zeros(n_h, q0.dtype), args, max_steps=_MOST_STEPS, throw=False)
-    q = start.at[places].add(solution.value @ directions)
-    h = configuration_residual(system, t, q)
-    derivatives = jax.jacfwd(residual)(jax.lax.stop_gradient(solution.value), jax.lax.stop_gradient(args))
-    slope = jnp.linalg.svd(derivatives, compute_uv=False)[-1]
-    follows = jnp.max(jnp.abs(implied_residual(system, t, q)), initial=0.0)
-    good = finite & jnp.all(_met(h)) & (slope > eps**0.6) & (follows <= configuration_tolerance(q0.dtype))
-    q = nan_where(~good, q, origin)
-    return _Found(q, good, jnp.max(jnp.abs(h)), follows, slope, solution.stats["num_steps"])
-
-
-def _start(system: System, q0, t, places: np.ndarray):
-    """The initial guess (n_q,), and which constraints (h,) are met already and read nothing of what is moved."""
-    q, system = jax.lax.stop_gradient((q0, system))
-    here, there = jax.lax.map(lambda q: _slopes(system, t, q, places), jnp.stack([q, _elsewhere(q)]))
-    directions = jnp.linalg.svd(here, full_matrices=True)[:2]
-    beside, already_met = _of_slopes(jnp, configuration_residual(system, t, q), directions, there)
-    return q0.at[places].add(beside.astype(q0.dtype)), already_met
-
-
-def _elsewhere(q):
-    """Coordinates at no special place."""
-    return q + np.random.default_rng(0).uniform(0.3, 0.7, q.shape).astype(q.dtype)
-
-
-def _of_slopes(xp: Any, h, directions, there):
-    """What is moved before Newton's method begins (moved,), and which constraints (h,) are met already and read
-    nothing of what is moved; from the residuals, U and the singular values of their slopes at the guess, and their
-    slopes elsewhere (h, moved). `xp`: NumPy or JAX's.
-
-    Where the slopes of the constraints depend on each other and the residuals contradict that, as for two rods in
-    line, Newton's method knows no direction: then it starts beside the guess, in what these constraints read.
-    """
-    reads = ~_flat(there)  # (h,moved)
-    U, s = directions
-    unmoved = _flat(xp.concatenate([s, xp.zeros(len(h), s.dtype)])[: len(h)])
-    left = U @ xp.where(unmoved, U.T @ h, 0.0)  # of the residuals, what no direction takes away
-    beside = xp.any(reads & ~_met(left)[:, None], axis=0)
-    return xp.where(beside, 1.0, 0.0), _met(h) & ~xp.any(reads, axis=1)
-
-
-_MOST_STEPS = 64
-
-
-def _newton_in_numbers(system: System, q0, t, where: tuple[int, ...], lenient: bool) -> _Found:
-    """`_newton` where all numbers are known: the same steps, by NumPy, before XLA would have begun to compile them."""
-    system, q0, t = jax.device_get((system, q0, t))
-    places, finite = np.array(where, int), all(np.all(np.isfinite(x)) for x in jax.tree.leaves((system, q0)))
-    if not finite:
-        system, q0 = jax.tree.map(np.ones_like, (system, q0))
-    along = np.zeros((len(q0), len(places)), q0.dtype)
-    along[places, np.arange(len(places))] = 1.0
-
-    def slopes(q):
-        return derivative_in_numbers(configuration_residual, (system, t, q), (None, None, along))
-
-    h = in_numbers(configuration_residual, system, t, q0)
-    beside, already_met = _of_slopes(np, h, _svd(slopes(q0)), slopes(_elsewhere(q0)))
-    start, already_met = q0 + along @ beside.astype(q0.dtype), already_met & lenient
-    n_h = len(already_met)
-    directions = np.eye(n_h, dtype=q0.dtype) if len(places) == n_h and not lenient else slopes(start)
-
-    def at(amount):
-        """The coordinates, the residuals, and how what Newton's method sees of them changes with the amount."""
-        q = start + along @ (amount @ directions)
-        h = in_numbers(configuration_residual, system, t, q)
-        derivatives = np.where(already_met[:, None], np.eye(n_h, dtype=q0.dtype), slopes(q) @ directions.T)
-        return q, h, derivatives
-
-    tolerance, amount, steps = 8 * float(np.finfo(q0.dtype).eps), np.zeros(n_h, q0.dtype), 0
-    q, h, derivatives = at(amount)
-    while steps < _MOST_STEPS:
-        seen = np.where(already_met, amount, h)
-        try:
-            step = np.linalg.solve(derivatives, seen)
-        except np.linalg.LinAlgError:
-            break
-        amount, steps = amount - step, steps + 1
-        q, h, derivatives = at(amount)
-        arrived = np.all(np.abs(step) < tolerance * (1 + np.abs(amount))) and np.all(np.abs(seen) < tolerance)
-        if arrived or not np.all(np.isfinite(derivatives)):
-            break
-    slope = _svd(derivatives)[1][-1]
-    follows = np.max(np.abs(implied_residual(system, t, q)), initial=0.0)
-    good = finite and bool(np.all(_met(h))) and bool(slope > float(np.finfo(q0.dtype).eps) ** 0.6)
-    good &= bool(follows <= configuration_tolerance(q0.dtype))
-    return _Found(jax.device_put(q), good, np.max(np.abs(h)), follows, slope, steps)
-
-
-def _svd(A):
-    """U and the singular values of an array of NumPy, NaN where it is not finite, as JAX has it."""
-    if np.all(np.isfinite(A)):
-        return np.linalg.svd(A, full_matrices=True)[:2]
-    return np.full((len(A), len(A)), np.nan, A.dtype), np.full(min(A.shape), np.nan, A.dtype)
-
-
-def _why_not(system: System, q0, plan: _Plan, found: _Found) -> str:
+def _why_not(system: System, q0, plan: Plan, found: Found) -> str:
     name = type(system).__name__
     moved = ", ".join(plan.moved)
     held = ", ".join(

@@ -21,7 +21,7 @@ from .._description.vectors import Vector
 from .._scalars.components import is_zero
 from .._scalars.jax_internals import Literal, concretely
 from .check_description import MOST_REMEMBERED, structure_of, with_trial_numbers
-from .kane import Reading
+from .reading import Reading
 
 TEN = ("m", "mx", "my", "mz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
 """Mass [kg], first moment [kg m], and inertia [kg m^2] as matrix entries, about the body's own point."""

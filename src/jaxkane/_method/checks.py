@@ -25,7 +25,7 @@ from .._scalars.nan import nan_where
 from .._scalars.numbers import in_numbers
 from .check_description import check_description
 from .description_facts import configuration_residual
-from .kane import Reading
+from .reading import Reading
 from .values import Row
 
 ROUNDING, MEASURED = 2e-3, 0.05

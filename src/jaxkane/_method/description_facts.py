@@ -13,7 +13,7 @@ from .._scalars.components import is_exact
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, stack
 from .._scalars.types import Component
-from .kane import Reading
+from .reading import Reading
 
 Found = dict[tuple[Any, ...], Any]  # (number, kind, names ...) -> numbers; the number keeps the order of the reading
 

@@ -19,8 +19,9 @@ from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, stack
 from .._scalars.types import Component
 from .checks import check_system, is_concrete, met_or_refused
+from .derivatives import jvp
 from .diagnose import diagnosis
-from .kane import Instant, jvp
+from .kane import Instant
 from .rates import motion_rates, rates_and_equations
 from .values import as_array, as_row, checked_values, refuse_incomplete
 

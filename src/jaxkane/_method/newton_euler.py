@@ -30,7 +30,9 @@ from .._scalars.linear import as_vector, stack
 from .._scalars.record import recorded
 from .._scalars.types import Component
 from .body_parts import Described, Part, origin_of
-from .kane import Instant, Reading, Said, jvp
+from .derivatives import jvp
+from .kane import Instant
+from .reading import Parts, Reading
 from .values import Row
 
 
@@ -45,8 +47,8 @@ class Carried(NamedTuple):
     g: Float[Array, "b 3"]  # weight by mass [m/s^2]
 
 
-class _SaidOfPoints(Said):
-    """As `Said`, with the velocities of the bodies' points in the place of momenta."""
+class _SaidOfPoints(Parts):
+    """As `Parts`, with the velocities of the bodies' points in the place of momenta."""
 
     def __init__(self, reading: Reading, parts: tuple[Part, ...], *at: Any):
         super().__init__(reading, *at)

@@ -29,7 +29,8 @@ from .._scalars.components import add3, component, cross, is_exact
 from .._scalars.fuse import fused, is_native
 from .._scalars.linear import as_vector, is_written_out
 from .._scalars.types import Component
-from .kane import Instant, jvp
+from .derivatives import jvp
+from .kane import Instant
 from .rates import motion_rates
 from .reactions import Reactions
 from .values import Inputs, Row, as_row, inputs_of

@@ -26,9 +26,11 @@ from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, solve
 from .._scalars.types import Component, Triple
 from .._scalars.versions import compiled
+from .derivatives import unit
 from .equations import InputValues
-from .kane import Instant, Said, unit
+from .kane import Instant
 from .rates import motion_rates
+from .reading import Parts
 from .values import Row, as_row
 
 
@@ -84,7 +86,7 @@ class Reactions(Instant):
 
     def read(self, part: str, t: Component, q: Row, u: Row) -> Any:
         # The description itself: a record knows neither virtual velocities nor auxiliary speeds.
-        return getattr(Said(self, t, q, u), part)()
+        return getattr(Parts(self, t, q, u), part)()
 
     def unbalanced(self, partial: Any) -> Component:
         """R = sum F . V + T . W - V . dp/dt - W . dH/dt along one direction."""

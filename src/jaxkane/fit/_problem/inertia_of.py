@@ -12,7 +12,7 @@ from ..._common.lookup import not_there
 from ..._description.parameters import leaf_name
 from ..._description.system import System
 from ..._method.body_parts import origin_of
-from ..._method.kane import Reading
+from ..._method.reading import Reading
 from ..._scalars.versions import compiled
 from .free import Inertia
 
