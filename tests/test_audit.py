@@ -7,7 +7,7 @@ import pytest
 from test_events import TOP, Bead
 
 import jaxkane as jk
-from jaxkane._simulation.audit import _cumulative_integral
+from jaxkane._simulation.balance import _cumulative_integral
 from jaxkane.catalog import CATALOG
 
 RTOL = 1e-8

@@ -20,7 +20,7 @@ from jaxkane._method.formulas import JACOBIANS, Formulas
 from jaxkane._scalars.graph import Graph, unrolled
 from jaxkane._scalars.written import as_source
 from jaxkane.catalog import CATALOG
-from jaxkane.export._c import _HELPERS, C
+from jaxkane.export._c_language import HELPERS, C
 from jaxkane.export._names import identifiers
 from jaxkane.export._numpy import PYTHON
 
@@ -326,7 +326,7 @@ def in_c(f, x, folder):
     graph, nodes, outputs, _ = graph_of(f, x)
     lines, texts = as_source(graph, outputs, {int(k): f"x[{i}]" for i, k in enumerate(nodes.flat)}, C)
     lines += [f"y[{i}] = {text};" for i, text in enumerate(t for array in texts for t in array)]
-    helpers = "".join(text.format(type="double") for text in _HELPERS.values())
+    helpers = "".join(text.format(type="double") for text in HELPERS.values())
     body = "\n".join(lines)
     (folder / "f.c").write_text(
         f"#include <math.h>\n{helpers}void f(const double *x, double *y);\n"

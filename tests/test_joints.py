@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane.fit._problem.parameters import parameters_of
+from jaxkane.fit._problem.entries import parameters_of
 from jaxkane.joints import (
     Actuator,
     Coupling,

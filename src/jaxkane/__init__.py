@@ -7,11 +7,11 @@ from . import loads as loads
 from . import rotations as rotations
 from . import sensors as sensors
 from ._description.bodies import Body as Body
-from ._description.bodies import Force as Force
-from ._description.bodies import Motion as Motion
-from ._description.bodies import Torque as Torque
-from ._description.bodies import weight as weight
 from ._description.frames import Frame as Frame
+from ._description.loads import Force as Force
+from ._description.loads import Torque as Torque
+from ._description.motion import Motion as Motion
+from ._description.motion import weight as weight
 from ._description.parameters import learned as learned
 from ._description.parameters import parameter as parameter
 from ._description.points import Point as Point

@@ -8,7 +8,7 @@ import pytest
 import jaxkane as jk
 from jaxkane.fit import Free, Gain
 from jaxkane.fit._problem.bijections import Interval, log_gaussian_mass
-from jaxkane.fit._problem.parameters import parameters_of
+from jaxkane.fit._problem.entries import parameters_of
 
 
 class Springs(eqx.Module):

@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from .._description.bodies import Body, Motion
+from .._description.bodies import Body
 from .._description.frames import Frame
+from .._description.motion import Motion
 from .._description.vectors import Vector
 from ..catalog import WhippleBicycle
 from ._record import Record

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._description.bodies import Force, flatten_loads
+from .._description.loads import Force, flatten_loads
 from .._description.system import System
 from .._scalars.fuse import fused
 from .._scalars.linear import stack

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._description.bodies import Body, Motion
+from .._description.bodies import Body
 from .._description.frames import Frame
+from .._description.motion import Motion
 from .._description.points import Point
 from .._description.system import System
 from .._description.vectors import Vector

@@ -15,7 +15,7 @@ import jax
 
 from .._scalars.types import Component
 from .._scalars.versions import kept_from_a_trace
-from .bodies import Motion, now
+from .motion import Motion, now
 from .values import Values
 
 if TYPE_CHECKING:

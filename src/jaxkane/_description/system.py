@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from .._common.lookup import refuse_unknown
 from .._scalars.types import Component
-from .bodies import Motion
+from .motion import Motion
 from .parameters import check_fields, check_parameter, parameter_info, to_float
 from .prepared import METHODS, NAMES, Kind, checked_names, checked_units
 

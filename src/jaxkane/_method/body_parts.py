@@ -14,14 +14,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._common.lookup import refuse_unknown
-from .._description.bodies import UNNAMED, Body, Motion
+from .._common.memory import Memory
+from .._description.bodies import UNNAMED, Body
+from .._description.motion import Motion
 from .._description.points import Point
 from .._description.system import System
 from .._description.vectors import Vector
 from .._scalars.components import is_zero
 from .._scalars.jax_internals import Literal, concretely
-from .check_description import MOST_REMEMBERED, structure_of, with_trial_numbers
 from .reading import Reading
+from .trial_numbers import structure_of, with_trial_numbers
 
 TEN = ("m", "mx", "my", "mz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
 """Mass [kg], first moment [kg m], and inertia [kg m^2] as matrix entries, about the body's own point."""
@@ -83,11 +85,11 @@ def _is_fixed_in(point: Point, body: Body) -> bool:
     return still and turns  # what spins in its frame has no other points there than those of its axis
 
 
-_PARTS: dict[Any, tuple[tuple[Part, ...], tuple[int, ...]]] = {}
+_PARTS = Memory()  # by structure
 
 
 def described(system: System, bodies: Bodies) -> Described:
-    """A system with its bodies told apart: those named, by default all that have a mass.
+    """A system and those of its bodies that are named, by default all that have a mass.
 
     **Raises:** `ValueError` for a name that is no body's, or no parameter's that it can have, and for a body that spins
     in its frame about no axis of it.
@@ -95,8 +97,6 @@ def described(system: System, bodies: Bodies) -> Described:
     structure = structure_of(system)
     if structure not in _PARTS:
         _PARTS[structure] = _read_parts(system)
-        if len(_PARTS) > MOST_REMEMBERED:
-            _PARTS.pop(next(iter(_PARTS)), None)
     parts, leaves = _PARTS[structure]
     given = bodies
     if bodies is not None:

@@ -15,13 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
+from .._common.memory import Memory
 from .._description.system import System
 from .._scalars.numbers import derivative_in_numbers, in_numbers
-from .._scalars.versions import version_of
 from .description_facts import Found, configuration_residual, facts_of
+from .trial_numbers import structure_of, with_trial_numbers
 
-_CHECKED: dict[Any, None] = {}  # structures, the oldest first
-MOST_REMEMBERED = 1000
+_CHECKED = Memory()  # structures
 _SIZES = (-1.0, 1e-2, -20.0, 1e3)  # multiples of trial speeds of order 1
 
 
@@ -46,34 +46,6 @@ def check_description(system: System, t: Any, q: Any) -> None:
     are_given = q is not None and not any(isinstance(x, Tracer) for x in jax.tree.leaves((system, t, q)))
     if _Description(*numbers, rng=rng).check(are_given):
         _CHECKED[structure] = None
-        if len(_CHECKED) > MOST_REMEMBERED:
-            _CHECKED.pop(next(iter(_CHECKED)), None)
-
-
-def structure_of(system: System) -> tuple[Any, ...]:
-    """What a description is, apart from the values of its parameters."""
-    return (version_of(system), jax.tree.structure(system), *(np.shape(x) for x in jax.tree.leaves(system)))
-
-
-def with_trial_numbers(tree: tuple[System, Any, Any], rng: np.random.Generator) -> tuple[System, Any, Any]:
-    """Numbers for what is traced: positive parameters, small coordinates; arrays of length 1, as axes and quaternions
-    are, and unit matrices."""
-    system, t, q = tree
-
-    def parameter(x: Any) -> Any:
-        if not isinstance(x, Tracer):
-            return x
-        if np.ndim(x) == 2 and x.shape[0] == x.shape[1]:
-            return np.eye(len(x), dtype=x.dtype)
-        value = rng.uniform(0.5, 1.5, x.shape)
-        return np.asarray(value / np.linalg.norm(value) if value.ndim else value, x.dtype)
-
-    system = jax.tree.map(parameter, system)
-    if q is None or isinstance(q, Tracer):
-        n, dtype = len(system.coordinates), jnp.result_type(float) if q is None else q.dtype
-        q = rng.uniform(0.1, 0.5, n) * rng.choice((-1.0, 1.0), n)
-        q = q.astype(dtype)
-    return system, 0.3 if isinstance(t, Tracer) else t, np.asarray(q)
 
 
 class _Description:

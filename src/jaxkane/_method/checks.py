@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from .._description.bodies import flatten_residuals
+from .._description.motion import flatten_residuals
 from .._description.parameters import in_batches
 from .._description.system import State, System
 from .._scalars.fuse import fused

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from .._description.bodies import Force, Load, Motion
 from .._description.frames import Frame
+from .._description.loads import Force, Load
+from .._description.motion import Motion
 from .._description.points import Point
 from .._description.system import System
 from .._scalars.components import is_exact

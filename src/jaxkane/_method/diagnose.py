@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._description.bodies import Force
+from .._description.loads import Force
 from .._description.system import System
 from .._scalars.versions import compiled
 from .drift import constraint_rows, dependent_speeds_from

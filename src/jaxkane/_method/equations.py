@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._description.bodies import kinetic_energy_of
+from .._description.motion import kinetic_energy_of
 from .._description.system import System
 from .._scalars.components import matvec, sub
 from .._scalars.fuse import fused

@@ -9,11 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._common.lookup import refuse_unknown
+from .._common.memory import Memory
 from .._description.system import System
 from .._scalars.jax_internals import concretely
 from .._scalars.numbers import in_numbers
-from .check_description import MOST_REMEMBERED, structure_of, with_trial_numbers
 from .description_facts import configuration_residual
+from .trial_numbers import structure_of, with_trial_numbers
 
 
 class Plan(NamedTuple):
@@ -53,7 +54,7 @@ def found_of(system: System, named: Iterable[str]) -> tuple[tuple[str, ...], dic
     return plan.moved, plan.guess
 
 
-_EULER_PARAMETERS: dict[Any, list[tuple[int, ...]]] = {}  # structures, the oldest first
+_EULER_PARAMETERS = Memory()  # places of Euler parameters by structure
 
 
 def _euler_parameters(system: System) -> list[tuple[int, ...]]:
@@ -71,6 +72,4 @@ def _euler_parameters(system: System) -> list[tuple[int, ...]]:
             for i, square in enumerate(np.convolve(probe**2, np.ones(4), "valid") if len(probe) > 3 else ())
             if any(np.any(np.abs(values - abs(x)) < 1e-5) for x in (square - 1.0, square**0.5 - 1.0))
         ]
-        if len(_EULER_PARAMETERS) > MOST_REMEMBERED:
-            _EULER_PARAMETERS.pop(next(iter(_EULER_PARAMETERS)), None)
     return found

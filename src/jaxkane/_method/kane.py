@@ -25,7 +25,8 @@ from typing import Any
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._description.bodies import Load, Motion
+from .._description.loads import Load
+from .._description.motion import Motion
 from .._description.system import System
 from .._scalars.components import add, add3, component, cross, dot, is_exact, matvec, mul, scale3
 from .._scalars.linear import Rows, solve, solve_positive

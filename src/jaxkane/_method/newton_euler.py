@@ -22,7 +22,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._description.bodies import Body, Force
+from .._description.bodies import Body
+from .._description.loads import Force
 from .._description.system import System
 from .._scalars.components import ZERO3, add, add3, dot, mul, sub
 from .._scalars.fuse import fused

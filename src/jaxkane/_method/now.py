@@ -19,8 +19,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._common.lookup import not_there, refuse_unknown
-from .._description.bodies import Motion
 from .._description.frames import Frame
+from .._description.motion import Motion
 from .._description.points import Point
 from .._description.system import State, System, packed, unpacked
 from .._description.values import Values

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from .._description.bodies import Motion
 from .._description.frames import Frame
+from .._description.motion import Motion
 from .._description.points import Point
 from .._description.system import System
 from .._description.virtual import virtual

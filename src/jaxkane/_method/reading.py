@@ -8,7 +8,9 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from .._description.bodies import Body, Load, Motion, flatten_loads, flatten_residuals
+from .._description.bodies import Body
+from .._description.loads import Load, flatten_loads
+from .._description.motion import Motion, flatten_residuals
 from .._description.parameters import in_batches
 from .._description.system import System
 from .._scalars.components import is_exact, matvec, scale3

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._description.bodies import Body, Torque
+from .._description.bodies import Body
 from .._description.frames import Frame
+from .._description.loads import Torque
 from .._description.parameters import in_batches, parameter
 from .._description.points import Point
 from .._method.checks import is_concrete

@@ -16,8 +16,9 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._common.lookup import refuse_unknown
-from .._description.bodies import Body, Motion
+from .._description.bodies import Body
 from .._description.frames import Frame
+from .._description.motion import Motion
 from .._description.points import Point, inertial
 from .._description.vectors import Vector
 from .._method.kane import as_row

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import equinox as eqx
 
-from .._description.bodies import Body, Torque
+from .._description.bodies import Body
+from .._description.loads import Torque
 from .._description.parameters import parameter
 from .._scalars.types import Scalar
 from ._part import Part

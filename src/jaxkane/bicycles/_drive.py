@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from .._description.bodies import Force
+from .._description.loads import Force
 from .._description.parameters import parameter
 from .._scalars.types import Scalar
 from ..loads import smooth_abs

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from .._description.bodies import Torque
 from .._description.frames import Frame
+from .._description.loads import Torque
 from .._description.parameters import parameter
 from .._description.points import Point
 from .._scalars.types import Scalar

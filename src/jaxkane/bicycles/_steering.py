@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from .._description.bodies import Torque
+from .._description.loads import Torque
 from .._description.parameters import parameter
 from .._scalars.components import mul
 from .._scalars.types import Component, Scalar

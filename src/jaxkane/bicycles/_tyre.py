@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._description.bodies import Body, Force, Torque
+from .._description.bodies import Body
+from .._description.loads import Force, Torque
 from .._description.parameters import parameter
 from .._description.points import Point
 from .._description.vectors import Vector

@@ -7,8 +7,10 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 
 from .. import rotations
-from .._description.bodies import Body, Force, Motion, Torque
+from .._description.bodies import Body
 from .._description.frames import Frame
+from .._description.loads import Force, Torque
+from .._description.motion import Motion
 from .._description.parameters import parameter
 from .._description.points import Point, inertial
 from .._description.system import System

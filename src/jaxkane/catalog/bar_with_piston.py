@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import jax.numpy as jnp
 
-from .._description.bodies import Body, Force, Motion, weight
+from .._description.bodies import Body
+from .._description.loads import Force
+from .._description.motion import Motion, weight
 from .._description.parameters import parameter
 from .._description.points import inertial
 from .._description.system import System

@@ -9,8 +9,10 @@ from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
 
-from .._description.bodies import Body, Motion, Torque, weight
+from .._description.bodies import Body
 from .._description.frames import Frame
+from .._description.loads import Torque
+from .._description.motion import Motion, weight
 from .._description.parameters import parameter, parameter_info
 from .._description.points import Point, inertial
 from .._description.system import System

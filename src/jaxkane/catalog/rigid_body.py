@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from .. import rotations
-from .._description.bodies import Body, Force, Motion, Torque
+from .._description.bodies import Body
+from .._description.loads import Force, Torque
+from .._description.motion import Motion
 from .._description.parameters import parameter
 from .._description.points import Point, inertial
 from .._description.system import System

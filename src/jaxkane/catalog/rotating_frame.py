@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from .._description.bodies import Body, Motion, Torque
+from .._description.bodies import Body
+from .._description.loads import Torque
+from .._description.motion import Motion
 from .._description.parameters import parameter
 from .._description.points import inertial
 from .._description.system import System

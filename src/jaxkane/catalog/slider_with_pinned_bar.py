@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from .._description.bodies import Body, Force, Motion, weight
+from .._description.bodies import Body
+from .._description.loads import Force
+from .._description.motion import Motion, weight
 from .._description.parameters import parameter
 from .._description.points import inertial
 from .._description.system import System

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from .. import rotations
-from .._description.bodies import Body, Motion, weight
+from .._description.bodies import Body
+from .._description.motion import Motion, weight
 from .._description.parameters import parameter
 from .._description.points import inertial
 from .._description.system import System

@@ -10,8 +10,10 @@ from typing import Any, ClassVar
 
 import jax
 
-from .._description.bodies import Body, Force, Motion, Torque
+from .._description.bodies import Body
 from .._description.frames import Frame
+from .._description.loads import Force, Torque
+from .._description.motion import Motion
 from .._description.parameters import parameter
 from .._description.points import Point, inertial
 from .._description.system import System

@@ -3,72 +3,20 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import jax
-import numpy as np
+from typing import NamedTuple
 
 from .._description.system import System
 from .._method.formulas import FUNCTIONS, Formulas
-from .._scalars.graph import LIBRARY, needed
+from .._scalars.graph import needed
 from .._scalars.written import (
-    ARITHMETIC,
-    COMPARED,
-    COMPARISONS,
-    LOOSE,
-    SIGNED,
-    SUM,
-    TIGHT,
-    Form,
-    Language,
     as_source,
-    call,
 )
+from ._c_language import HELPERS, TYPES, C, array, as_comment, constant, folded, initial, without_end
+from ._c_test import COMPARE, trial
 from ._functions import chosen
 from ._names import C_WORDS, identifiers, variable_units
-
-TYPES = {"float64": "double", "float32": "float", "bool": "int"}
-_IN_LIBRARY = {"abs": "fabs", "rem": "fmod", **{name: name for name in (*LIBRARY, "sqrt", "floor")}}
-_TWO = ("rem", "pow", "atan2")
-_FORMS = {
-    **ARITHMETIC,
-    **COMPARISONS,
-    **{name: call(f"{word}{{s}}", 1 + (name in _TWO)) for name, word in _IN_LIBRARY.items()},
-    "max": call("larger", 2),
-    "min": call("smaller", 2),
-    "and": Form("{0} && {1}", COMPARED, (TIGHT, TIGHT)),
-    "or": Form("{0} || {1}", COMPARED, (TIGHT, TIGHT)),
-    "xor": Form("{0} != {1}", COMPARED, (TIGHT, TIGHT)),
-    "select": Form("{0} ? {1} : {2}", LOOSE, (SUM, SUM, SUM)),
-    "convert": Form("({type}){0}", SIGNED, (TIGHT,)),
-}
-# As JAX has them: not a number where one of the two is not, and -0 is less than 0.
-_HELPERS = {
-    "max": "static {type} larger({type} a, {type} b) {{\n"
-    "    return a != a || (a == b ? !signbit(a) : a > b) ? a : b;\n}}\n",
-    "min": "static {type} smaller({type} a, {type} b) {{\n"
-    "    return a != a || (a == b ? signbit(a) : a < b) ? a : b;\n}}\n",
-}
-
-
-def _constant(value: Any, dtype: str) -> str:
-    if dtype == "bool":
-        return str(int(value))
-    if not np.isfinite(value):
-        return "NAN" if np.isnan(value) else "INFINITY" if value > 0 else "-INFINITY"
-    return f"{np.float32(value)!s}f" if dtype == "float32" else repr(float(value))
-
-
-C = Language(
-    "C99",
-    _FORMS,
-    _constant,
-    lambda name, text, dtype: f"const {TYPES[dtype]} {name} = {text};",
-    TYPES,
-    {"float64": "", "float32": "f", "bool": ""},
-)
 
 
 class Written(NamedTuple):
@@ -153,7 +101,7 @@ class _Module:
         from .. import __version__
 
         return (
-            f"/* {_said(self.formulas.name)}: Kane's equations M u_dot = f, written by jaxkane {__version__}.\n"
+            f"/* {without_end(self.formulas.name)}: Kane's equations M u_dot = f, written by jaxkane {__version__}.\n"
             f"   Every function is a formula of its arguments; {self.type} throughout. */\n"
         )
 
@@ -169,11 +117,11 @@ class _Module:
         lines += ['extern "C" {', "#endif", "", "typedef struct {"]
         for a in self.formulas.of_kind("parameters"):
             member = self.members[a.name]
-            unit = _said(f" [{a.info.unit}]") if a.info.unit else ""
-            own = f" {_said(a.name)}" if member != a.name else ""
+            unit = without_end(f" [{a.info.unit}]") if a.info.unit else ""
+            own = f" {without_end(a.name)}" if member != a.name else ""
             own += f", {' x '.join(map(str, a.shape))}, row by row" if a.shape else ""
             size = f"[{max(1, len(a.elements))}]" if a.shape else ""
-            lines.append(f"    {self.type} {member}{size};{_as_comment((own + unit).strip(', '))}")
+            lines.append(f"    {self.type} {member}{size};{as_comment((own + unit).strip(', '))}")
         if not self.members:
             lines.append("    char none; /* there are no parameters */")
         lines += [f"}} {self.name}_parameters;", ""]
@@ -185,7 +133,7 @@ class _Module:
         for kind in ("q", "u", "inputs"):
             for i, each in enumerate(self.formulas.names(kind)):
                 unit = unit_of.get(each, "")
-                lines.append(_said(f"   {kind}[{i}]: {each}" + (f" [{unit}]" if unit else "")))
+                lines.append(without_end(f"   {kind}[{i}]: {each}" + (f" [{unit}]" if unit else "")))
             if not self.formulas.names(kind):
                 lines.append(f"   {kind}: none; may be null")
         lines += ["", "   What they write, matrices row by row; it must not overlap what they read: */", ""]
@@ -199,7 +147,7 @@ class _Module:
             for output, nodes in self.nodes[function].items()
         )
         if function == "dependent_speeds":
-            return _said(f"{shapes}: {', '.join(self.formulas.names('u_dep'))}")
+            return without_end(f"{shapes}: {', '.join(self.formulas.names('u_dep'))}")
         if function in FUNCTIONS:
             return shapes
         by = {"state_jacobian": "(q, u)", "input_jacobian": "the inputs"}.get(
@@ -210,10 +158,10 @@ class _Module:
     def source(self, header: str) -> str:
         outputs = [nodes for found in self.nodes.values() for nodes in found.values()]
         used = {self.formulas.graph.nodes[k].operation for k in needed(self.formulas.graph.nodes, outputs)}
-        helpers = [text.format(type=self.type) for operation, text in _HELPERS.items() if operation in used]
+        helpers = [text.format(type=self.type) for operation, text in HELPERS.items() if operation in used]
         values = self.formulas.values().values()
-        numbers = [_initial(x, self.formulas.dtype) for x in values] or ["0"]
-        default = f"const {self.name}_parameters {self.name}_default = {{\n    {_folded(numbers)}\n}};\n"
+        numbers = [initial(x, self.formulas.dtype) for x in values] or ["0"]
+        default = f"const {self.name}_parameters {self.name}_default = {{\n    {folded(numbers)}\n}};\n"
         parts = [self._comment(), f'#include "{header}"\n\n#include <math.h>\n', default, *helpers]
         return "\n".join([*parts, *(self._body(function) for function in self.functions)])
 
@@ -228,15 +176,15 @@ class _Module:
 
     def test(self, header: str) -> str:
         """A program that asks every function at one state, and compares."""
-        state, expected = _trial(self.formulas, self.functions)
+        state, expected = trial(self.formulas, self.functions)
         lines = [self._comment(), f'#include "{header}"\n\n#include <math.h>\n#include <stdio.h>\n']
-        t = _constant(state["t"], self.formulas.dtype)
+        t = constant(state["t"], self.formulas.dtype)
         for kind in ("q", "u", "inputs"):
-            lines.append(_array(f"const {self.type} {kind}", state[kind], self.formulas.dtype))
+            lines.append(array(f"const {self.type} {kind}", state[kind], self.formulas.dtype))
         calls = []
         for function in self.functions:
             for output, numbers in expected[function].items():
-                lines.append(_array(f"const {self.type} {function}_{output}", numbers, self.formulas.dtype))
+                lines.append(array(f"const {self.type} {function}_{output}", numbers, self.formulas.dtype))
                 lines.append(f"static {self.type} found_{function}_{output}[{max(1, numbers.size)}];")
             outputs = "".join(f", found_{function}_{output}" for output in expected[function])
             calls.append(f"    {self.name}_{function}({t}, q, u, inputs, &{self.name}_default{outputs});")
@@ -244,68 +192,10 @@ class _Module:
                 each = f"{function}_{output}"
                 calls.append(f'    wrong += compare("{each}", {numbers.size}, found_{each}, {each});')
         tolerance = "1e-11" if self.formulas.dtype == "float64" else "1e-3"
-        lines.append(_COMPARE.format(type=self.type, tolerance=tolerance))
+        lines.append(COMPARE.format(type=self.type, tolerance=tolerance))
         return "\n".join([*lines, "int main(void) {", "    int wrong = 0;", *calls, "    return wrong;", "}", ""])
-
-
-_COMPARE = """
-/* Prints the largest difference, as a part of the largest expected number. */
-static int compare(const char *name, int n, const {type} *found, const {type} *expected) {{
-    double difference = 0.0, size = 0.0;
-    int i;
-    for (i = 0; i < n; i++) {{
-        const double d = fabs((double)found[i] - (double)expected[i]);
-        if (found[i] == expected[i] || (found[i] != found[i] && expected[i] != expected[i])) continue;
-        if (!(d <= difference)) difference = d; /* also where it is not a number */
-        if (fabs((double)expected[i]) > size) size = fabs((double)expected[i]);
-    }}
-    printf("%-40s %.1e\\n", name, size > 0.0 ? difference / size : difference);
-    return !(difference <= {tolerance} * size);
-}}
-"""
-
-
-def _trial(formulas: Formulas, functions: Iterable[str]) -> tuple[dict[str, Any], dict[str, dict[str, np.ndarray]]]:
-    """Time, coordinates, speeds and inputs, and what JAX computes there for this system; all of it finite."""
-    state: dict[str, Any] = {}
-    expected: dict[str, dict[str, np.ndarray]] = {}
-    for seed in range(20):
-        rng = np.random.default_rng(seed)
-        draw = lambda n, rng=rng: rng.uniform(0.2, 0.8, n).astype(formulas.dtype)  # noqa: E731
-        state = {"t": draw(()), **{kind: draw(len(formulas.names(kind))) for kind in ("q", "u", "inputs", "u_dep")}}
-        args = [*state.values(), *formulas.values().values()]
-        with jax.enable_x64(formulas.dtype == "float64"):
-            for function in functions:
-                outputs = jax.tree.map(np.asarray, formulas.by_jax(function, *args))
-                expected[function] = dict(zip(formulas.nodes(function), outputs, strict=True))
-        if all(np.all(np.isfinite(x)) for found in expected.values() for x in found.values()):
-            break
-    return state, expected
-
-
-def _array(declaration: str, numbers: np.ndarray, dtype: str) -> str:
-    texts = [_constant(x, dtype) for x in numbers.flat] or ["0"]
-    return f"static {declaration}[] = {{\n    {_folded(texts)}\n}};"
-
-
-def _initial(x: np.ndarray, dtype: str) -> str:
-    texts = [_constant(v, dtype) for v in x.flat]
-    return f"{{{', '.join(texts) or '0'}}}" if x.shape else texts[0]
-
-
-def _folded(texts: Sequence[str]) -> str:
-    return ",\n    ".join(", ".join(texts[i : i + 6]) for i in range(0, len(texts), 6))
 
 
 def _is_read(word: str, text: str) -> bool:
     sign = "->" if word == "p" else "" if word == "t" else r"\["
     return re.search(rf"(?<!->)\b{word}\b{sign}", text) is not None
-
-
-def _as_comment(text: str) -> str:
-    return f" /* {text} */" if text else ""
-
-
-def _said(text: str) -> str:
-    """A text that cannot end a comment."""
-    return text.replace("*/", "* /").replace("\\", "/")

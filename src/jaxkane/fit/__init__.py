@@ -2,6 +2,7 @@
 
 from ._analysis.base_parameters import base_parameters as base_parameters
 from ._analysis.candidates import Candidate as Candidate
+from ._analysis.columns import Regressor as Regressor
 from ._analysis.compare import Comparison as Comparison
 from ._analysis.compare import compare as compare
 from ._analysis.design import Design as Design
@@ -23,7 +24,6 @@ from ._analysis.multistart import MultiStart as MultiStart
 from ._analysis.multistart import multi_start as multi_start
 from ._analysis.profile import Profile as Profile
 from ._analysis.profile import profile as profile
-from ._analysis.regressor import Regressor as Regressor
 from ._analysis.regressor import regressor as regressor
 from ._analysis.signs import contrary_signs as contrary_signs
 from ._analysis.smoothed import Smoothed as Smoothed

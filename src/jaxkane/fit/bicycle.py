@@ -13,9 +13,9 @@ from ..catalog._bicycle_file import read_bicycle_file
 from ._data.trial import Trial
 from ._optimize.optimizer import Optimizer
 from ._optimize.solve import solve
+from ._problem.entries import parameters_of
 from ._problem.free import Inertia, Prior
 from ._problem.model import Unknowns
-from ._problem.parameters import parameters_of
 from ._problem.problem import Problem
 from ._result.result import Fit
 

@@ -11,7 +11,8 @@ import numpy as np
 
 from .. import rotations
 from ..rotations import Matrix
-from ._joints import Joint, exact, exact_numbers
+from ._joints import Joint
+from ._numbers import exact, exact_numbers
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -9,7 +9,7 @@ import jax
 
 from .._common.lookup import not_there
 from ..rotations import Matrix
-from ._joints import Shape
+from ._shapes import Shape
 
 KINDS = "mass center inertia position anchor site gravity damping stiffness rest armature"
 KINDS += " gain offset position_gain velocity_gain"

@@ -9,10 +9,12 @@ import numpy as np
 from jax.core import Tracer
 
 from .._common.lookup import not_there
-from ._joints import Hinge, Joint, Shape, Slide, components, exact_numbers, is_structural_zero
+from ._joints import Joint
 from ._loops import with_dependent
 from ._mechanism import Field, Mechanism, class_of
+from ._numbers import components, exact_numbers, is_structural_zero
 from ._parts import Actuator, Coupling, Link, Loop, Site, matrix_of
+from ._shapes import Hinge, Shape, Slide
 from ._structure import MOMENTS, ActuatorShape, CouplingShape, LinkShape, LoopShape, SiteShape, Structure
 
 _POSITIVE_MOMENTS = frozenset(MOMENTS[:3])

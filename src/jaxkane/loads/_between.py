@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from .._description.bodies import Body, Force, Torque
+from .._description.bodies import Body
 from .._description.frames import Frame
+from .._description.loads import Force, Torque
 from .._description.points import Point
 from .._description.vectors import Vector
 from .._scalars.components import component, is_zero

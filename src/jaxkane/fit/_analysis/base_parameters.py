@@ -14,9 +14,10 @@ from ..._method.drift import has_configuration_constraints
 from .._result.base_parameters import BaseParameters
 from .base_structure import equations_at, random_states, structure_of
 from .base_words import with_lengths
+from .columns import Chosen, Names, Regressor, chosen_of
 from .equation_error import estimated
 from .instants import Instants, Motions, instants_of
-from .regressor import Chosen, Names, Regressor, check_linear, chosen_of
+from .linearity import check_linear
 
 
 def base_parameters(

@@ -22,8 +22,8 @@ from ..._method.assembly import assemble
 from ..._method.drift import has_configuration_constraints
 from ..._scalars.versions import compiled
 from .._result.base_parameters import BaseParameters, sum_in_words
+from .columns import Chosen, values_by_name
 from .instants import Instants
-from .regressor import Chosen, values_by_name
 
 _ORDER = ("Ixx", "Ixy", "Ixz", "Iyz", "Izz", "mx", "my", "mz", "Iacross", "Iyy", "m")
 """Of a body's parameters: what comes late is counted among what comes early, where it can be."""

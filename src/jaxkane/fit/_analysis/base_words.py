@@ -11,8 +11,8 @@ import numpy as np
 from ..._description.parameters import leaf_name
 from .._result.base_parameters import BaseParameters, sum_in_words
 from .base_structure import equations_at
+from .columns import Chosen
 from .instants import Instants
-from .regressor import Chosen
 
 
 def with_lengths(found: BaseParameters, chosen: Chosen, states: Instants) -> tuple[str, ...]:

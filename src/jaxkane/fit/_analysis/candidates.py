@@ -12,10 +12,10 @@ import numpy as np
 
 from ..._common.lookup import refuse_unknown
 from ..._description.system import System
+from .._problem.entries import as_items, parameters_of
 from .._problem.free import Delay
 from .._problem.model import Unknowns
 from .._problem.names import Names
-from .._problem.parameters import as_items, parameters_of
 from .._problem.part import Part
 from .._problem.problem import Problem
 from .._problem.simulation import Simulation

@@ -19,7 +19,7 @@ from ..._common.lookup import refuse_unknown
 from ..._description.system import System
 from .._data.trial import Trial
 from .._data.windows import Windows, state_names
-from .._problem.parameters import parameters_of
+from .._problem.entries import parameters_of
 from .._problem.problem import Problem
 from .information import Goal, covariance_of, goal_of
 

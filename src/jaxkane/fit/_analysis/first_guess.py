@@ -16,14 +16,16 @@ from ..._method.body_parts import described
 from ..._method.checks import check_bodies
 from ..._scalars.versions import compiled
 from .._data.trial import Trial
-from .._problem.parameters import Parameters, parameters_of
+from .._problem.entries import parameters_of
+from .._problem.parameters import Parameters
 from .._result.base_parameters import BaseParameters
 from .._result.bodies import bodies_in_words
 from .base_parameters import states_for, structure_of_states
 from .base_structure import equations_at
+from .columns import Chosen
 from .equation_error import estimated
 from .instants import Motions, instants_of, max_spacing
-from .regressor import Chosen, check_linear
+from .linearity import check_linear
 
 _PULL = 1e-2  # of a free number towards its start, in standard deviations: decides where the data are silent
 _TRIED = 7  # spacings of knots

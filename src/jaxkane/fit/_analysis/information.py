@@ -13,8 +13,9 @@ from jaxtyping import Array
 
 from ..._description.system import packed
 from .._data.windows import Windows
-from .._problem.model import Model, Unknowns, by_next, each, jacobian_of, starts_of
+from .._problem.model import Model, Unknowns
 from .._problem.problem import Problem
+from .._problem.programs import by_next, each, jacobian_of, starts_of
 
 Goal = Callable[[Any, Model, Windows], tuple[Array, tuple[Array, Windows, Array]]]
 """Of coefficients, model and windows: the criterion, and with it the information about the scaled parameters (p, p),

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._data.windows import Windows
-from .model import Model, Unknowns, blocks_of, starts_of
+from .model import Model, Unknowns
 from .problem import Problem, refuse_other
+from .programs import blocks_of, starts_of
 
 
 def half_cost(model: Model, windows: Windows, by_trial: Array) -> Callable[[Unknowns], Array]:

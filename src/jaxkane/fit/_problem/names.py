@@ -15,9 +15,9 @@ from ..._method.free_coordinates import found_of
 from ..._method.now import output_names
 from .._data.trial import Trial
 from .._data.windows import state_names
+from .entries import where_of
 from .free import Delay
 from .model import Nuisance
-from .parameters import where_of
 
 Names = Sequence[str] | Mapping[str, float | None]
 """Names, or names with the standard deviation of a Gaussian prior around the initial guess (None: no prior)."""

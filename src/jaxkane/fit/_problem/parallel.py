@@ -19,7 +19,8 @@ from jaxtyping import Array
 from ..._scalars.jax_internals import process_allgather
 from .._data.windows import Windows
 from .blocks import Blocks
-from .model import Model, Seen, Unknowns, blocks_of, costs_of
+from .model import Model, Seen, Unknowns
+from .programs import blocks_of, costs_of
 
 
 def blocks_of_all(

@@ -18,12 +18,14 @@ from ..._simulation.trajectory import Trajectory
 from .._data.trial import Trial
 from .._data.windows import Place, Windows, cut
 from .blocks import Blocks
+from .entries import parameters_of
 from .free import Prior
-from .model import Model, Seen, Unknowns, blocks_of, costs_of, rides_of, starts_of
+from .model import Model, Seen, Unknowns
 from .names import Names, checked_trials, held_and_delayed, nuisance_of, starts_found
 from .noise import noise_of
 from .parallel import blocks_of_all, check_same, costs_of_all
-from .parameters import Parameters, parameters_of
+from .parameters import Parameters
+from .programs import blocks_of, costs_of, rides_of, starts_of
 from .simulation import Simulation
 
 STEP_TOLERANCE = 0.05, 0.25

@@ -1,0 +1,247 @@
+"""What a fit is asked to free, checked, as entries of its parameters. Knows systems' leaves and no dynamics."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from ..._common.lookup import hint
+from ..._description.parameters import declared, leaf_name, learned_part
+from ..._description.system import System
+from ..._description.units import unit_of, units_of
+from ..._method.now import output_names
+from .bijections import Interval, PossibleBody
+from .free import Delay, Free, Gain, Inertia, Intensity, Offset, Prior, Shared, Sigma, Where
+from .leaves import find_leaves, one_leaf
+from .parameters import Entry, Parameters, checked_prior
+
+
+def as_items(free: Any) -> list[Any]:
+    """What a fit takes as `free`, one by one."""
+    if isinstance(free, (str, Free, Inertia, Intensity, Sigma, Gain, Offset, Delay)) or callable(free):
+        return [free]
+    return list(free)
+
+
+def parameters_of(
+    system: System,
+    free: Sequence[Any] | Any,
+    noise: Mapping[str, float] | None = None,
+    channels: Sequence[str] = (),
+) -> Parameters:
+    """The free parameters of a system, and of its process noise and sensors.
+
+    **Raises:** `ValueError` that names a parameter, input, disturbed speed or channel that does not exist, is named
+    twice, starts outside its bounds, or as a body that cannot be.
+    """
+    free = as_items(free)
+    parts: list[tuple[list[Entry], Any, list[float], list[float], list[Prior | None]]] = []
+    for item in free:
+        if isinstance(item, Shared):
+            parts.append(_of_all_trials(system, item, noise))
+        elif isinstance(item, (Intensity, Sigma)):
+            parts.append(_of_noise(system, item, noise, channels))
+        elif isinstance(item, Inertia):
+            parts.append(_of_body(system, item))
+        else:
+            parts.extend(_of_leaves(system, item if isinstance(item, Free) else Free(item)))
+    if not parts:
+        raise ValueError("`free` names no parameter: give names such as ('IBxx', 'steer_damping').")
+    entries = [e for part in parts for e in part[0]]
+    names = [e.name for e in entries]
+    places = [place for e in entries for place in [*[t[:2] for t in e.targets], *([e.role] if e.role else [])]]
+    twice = [e.name for e in entries if any(places.count(t[:2]) > 1 for t in e.targets) or places.count(e.role) > 1]
+    twice += [name for name in names if names.count(name) > 1]
+    if twice:
+        raise ValueError(f"`free` names {', '.join(sorted(set(twice)))} twice, or ties it too: {', '.join(names)}.")
+    priors = [prior if prior else (0.0, math.inf) for part in parts for prior in part[4]]
+    array = lambda numbers: jnp.asarray(np.array(numbers, float), jnp.result_type(float))  # noqa: E731
+    return Parameters(
+        entries=tuple(entries),
+        bijections=tuple(part[1] for part in parts),
+        sizes=tuple(len(part[0]) for part in parts),
+        start=array([s for part in parts for s in part[2]]),
+        scale=array([s for part in parts for s in part[3]]),
+        prior_mean=array([mean for mean, _ in priors]),
+        prior_deviation=array([deviation for _, deviation in priors]),
+    )
+
+
+def _of_all_trials(system: System, item: Shared, noise: Mapping[str, float] | None):
+    kind, where = type(item).__name__.lower(), where_of(system, item)
+    if noise is not None and (kind, where) == ("delay", "sensor"):
+        raise ValueError(
+            f"Delay({item.what!r}): a filter of process noise compares each measurement with the motion at its time. "
+            "Let the sensor's delay be a state of the system, `jaxkane.sensors.delayed`."
+        )
+    label = f"{kind} of {'start of ' if where == 'start' else ''}{item.what}"
+    unit = item.unit or (units_of(system).get(item.what, "") if isinstance(item, Offset) else "")
+    entry = Entry(item.name or label, unit, role=(f"{kind} of {where}", item.what))
+    return _scalar(entry, item, item.start, positive=False)
+
+
+def _of_noise(system: System, item: Intensity | Sigma, noise: Mapping[str, float] | None, channels: Sequence[str]):
+    kind = type(item).__name__.lower()
+    what, of = (item.of, noise or {}) if isinstance(item, Intensity) else (item.channel, channels)
+    if noise is None:
+        raise ValueError(
+            f"{type(item).__name__}({what!r}) is estimated by its likelihood, and this is a fit of least squares: give "
+            "`noise`, the intensities of what disturbs the motion by name, or {} where nothing does."
+        )
+    if what not in of:
+        where = "`noise`" if isinstance(item, Intensity) else "the measured channels"
+        raise ValueError(f"{type(item).__name__}({what!r}): {hint(what, tuple(of), f'{where} has')}")
+    start = float(noise[what] if item.start is None else item.start)
+    if not 0 < start < math.inf:
+        raise ValueError(f"{kind} of {what} starts at {start}: it is searched for among positive numbers.")
+    if item.bounds is not None:
+        lower, upper = item.bounds
+        if lower is not None and lower < 0:
+            raise ValueError(f"{kind} of {what}: nothing below zero is possible, got the bounds {item.bounds}.")
+        item = dataclasses.replace(item, bounds=(lower or 0.0, upper))
+    known = unit_of(what, units_of(system)) if kind == "intensity" else ""
+    known = f"({known})" if set(known) & set(" /^") else known
+    unit = (f"{known}^2 s" if what in system.inputs else f"{known}^2/s") if known else ""
+    entry = Entry(item.name or f"{kind} of {what}", item.unit or unit, role=(kind, what))
+    return _scalar(entry, item, start, positive=True)
+
+
+def where_of(system: System, item: Shared) -> Where:
+    """Whether it is of an input, of a sensor or of the starts.
+
+    **Raises:** `ValueError` where there is nothing of that name.
+    """
+    title, kind, of = type(system).__name__, type(item).__name__, item.of
+    if of not in (None, "input", "sensor", "start") or (kind, of) == ("Delay", "start"):
+        known = "'input' or 'sensor'" if kind == "Delay" else "'input', 'sensor' or 'start'"
+        raise ValueError(f"{kind}({item.what!r}): `of` is {known}, or None; got {of!r}.")
+    if of in (None, "input") and item.what in system.inputs:
+        return "input"
+    starts = (*system.coordinates, *system.speeds, *system.states) if of != "input" else ()
+    sensors = (*starts, *system.dependent_speeds, *output_names(system)) if of in (None, "sensor") else ()
+    among, named = {
+        None: ((*system.inputs, *sensors), "input or channel"),
+        "input": (system.inputs, "input"),
+        "sensor": (sensors, "channel"),
+        "start": (starts, "coordinate, independent speed or state"),
+    }[of]
+    if item.what not in among:
+        raise ValueError(f"{title} has no {named} {item.what!r}; {hint(item.what, among, 'it has')}")
+    return of or "sensor"
+
+
+def _of_leaves(system: System, item: Free):
+    chosen, leaves = find_leaves(system, item.where)
+    followers = [follower for name, factor in item.tied.items() for follower in _followers(system, name, factor)]
+    parts = []
+    for i in chosen:
+        path, leaf = leaves[i]
+        many = leaf.size > 1 or len(chosen) > 1
+        if followers and many:
+            raise ValueError(f"{leaf_name(path)} has several entries; only a number can have others tied to it.")
+        for place, index in enumerate(np.ndindex(leaf.shape)):
+            label = item.name if item.name and not many else leaf_name(path)
+            label += str(list(index)) if leaf.ndim else ""
+            start = float(leaf[index]) if item.start is None else float(item.start)
+            info = declared(system, path)
+            targets = ((i, place, 1.0), *followers)
+            entry = Entry(label, item.unit or info.unit, targets, part=learned_part(system, path))
+            parts.append(_scalar(entry, item, start, info.positive))
+    return parts
+
+
+def _followers(system: System, name: str, factor: float) -> list[tuple[int, int, float]]:
+    """(leaf, place, factor) of every entry of what is tied."""
+    chosen, leaves = find_leaves(system, name)
+    for path in (leaves[i][0] for i in chosen):
+        if not math.isfinite(factor) or (factor <= 0 and declared(system, path).positive):
+            must = "positive, as the parameter is declared" if math.isfinite(factor) else "a finite number"
+            raise ValueError(f"`tied`: the factor of {leaf_name(path)} must be {must}; got {factor}.")
+    return [(i, place, float(factor)) for i in chosen for place in range(leaves[i][1].size)]
+
+
+def _scalar(entry: Entry, item: Free | Shared | Intensity | Sigma, start: float, positive: bool):
+    name = entry.name
+    lower, upper = _checked_bounds(name, item.bounds, positive)
+    if not math.isfinite(start):
+        raise ValueError(f"{name} starts at {start}.")
+    if (lower is not None and not start > lower) or (upper is not None and not start < upper):
+        raise ValueError(f"{name} starts at {start:.6g}, which is not inside its bounds ({lower}, {upper}).")
+    prior = checked_prior(name, item.prior) if item.prior is not None else None
+    scale = abs(start) or (prior[1] if prior is not None and math.isfinite(prior[1]) else 1.0)
+    if item.scale is not None:
+        if not 0 < item.scale < math.inf:
+            raise ValueError(f"{name}: the scale must be positive and finite, got {item.scale}.")
+        scale = float(item.scale)
+    ends = (-math.inf if lower is None else lower, math.inf if upper is None else upper)
+    numbers = [jnp.asarray(float(x), jnp.result_type(float)) for x in (start, *ends, scale)]
+    return [entry], Interval(*numbers, bounded=(lower is not None, upper is not None)), [start], [scale], [prior]
+
+
+def _checked_bounds(name: str, bounds: Any, positive: bool) -> tuple[float | None, float | None]:
+    """(lower, upper), None where there is none; infinite ones are none."""
+    if bounds is None:
+        return (0.0, None) if positive else (None, None)
+    lower, upper = (end if b is None else float(b) for b, end in zip(bounds, (-math.inf, math.inf), strict=True))
+    if not lower < upper:
+        raise ValueError(
+            f"{name}: nothing lies between the bounds {bounds}; they are (lower, upper), or None for none."
+        )
+    return (None if lower == -math.inf else lower), (None if upper == math.inf else upper)
+
+
+_PRODUCTS = ((0, 1), (0, 2), (1, 2))
+
+
+def _of_body(system: System, item: Inertia):
+    """One `PossibleBody` and its entries. A value is found by (leaf, places)."""
+    if (item.matrix is None) == (item.moments is None):
+        raise ValueError("Inertia: give `moments` (and `products`), or `matrix`.")
+    names: list[str | None] = [item.mass, *item.center]
+    spots: list[Any] = [None if name is None else (one_leaf(system, name), (0,)) for name in names]
+    wheel = None
+    if item.matrix is not None:
+        leaf = one_leaf(system, item.matrix, (3, 3))
+        pairs = [(0, 0), (1, 1), (2, 2), *_PRODUCTS]
+        names += [f"{item.matrix}[{a}, {b}]" for a, b in pairs]
+        spots += [(leaf, tuple({3 * a + b, 3 * b + a})) for a, b in pairs]
+    else:
+        moments = item.moments or ("", "", "")
+        given = sum(name is not None for name in item.products)
+        if given == 2 or (given and len(set(moments)) < 3):
+            raise ValueError(
+                "Inertia: name all three `products`, or the one that a plane of symmetry leaves, or none where the "
+                "axes are principal, as a wheel's are."
+            )
+        if len(set(moments)) < 3:
+            a, b = next((a, b) for a, b in _PRODUCTS if moments[a] == moments[b])
+            wheel = (a, b)
+        names += [*moments, *item.products]
+        spots += [None if name is None else (one_leaf(system, name), (0,)) for name in (*moments, *item.products)]
+    leaves = jax.tree.leaves(system)
+    values = [0.0 if s is None else float(np.ravel(leaves[s[0]])[s[1][0]]) for s in spots]
+    values[0] = values[0] if spots[0] is not None else 1.0
+    unknown = sorted(set(item.fixed) - {name for name in names[:4] if name})
+    if unknown:
+        raise ValueError(f"Inertia: `fixed` may name the mass and the place of its centre, not {', '.join(unknown)}.")
+    still = {i for i in range(4) if names[i] is None or names[i] in item.fixed} | ({4 + wheel[1]} if wheel else set())
+    moves = tuple(i for i in range(10) if spots[i] is not None and i not in still)
+    try:
+        body = PossibleBody.of(values, moves, wheel)
+    except ValueError as error:
+        raise ValueError(f"Inertia of {', '.join(n for n in names[4:7] if n)}: {error}") from None
+    units = ["kg", "m", "m", "m", *[item.unit] * 6]
+    entries, start, scale, priors = [], [], [], []
+    for i in moves:
+        name, (leaf, places) = str(names[i]), spots[i]
+        entries.append(Entry(name, units[i], tuple((leaf, place, 1.0) for place in places)))
+        start.append(values[i])
+        scale.append(abs(values[i]) or float(body.scale[i]) if i < 4 else abs(values[i]) or max(values[4:7]))
+        priors.append(checked_prior(name, item.prior[name]) if name in item.prior else None)
+    return entries, body, start, scale, priors

@@ -1,0 +1,183 @@
+"""Motion, loads and constraints of a tree of links, from its structure. Knows kinematics and no dynamics."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+from .._description.bodies import Body
+from .._description.frames import Frame
+from .._description.loads import Force
+from .._description.motion import Motion
+from .._description.points import Point, inertial
+from .._description.system import System
+from .._scalars.components import ZERO3, add, component, dot, is_zero, mul, sub
+from .._scalars.types import Component, Triple
+from ..rotations import Matrix
+from ._shapes import Placed, Shape
+from ._structure import MOMENTS, ActuatorShape, Structure
+
+
+class Tree(System):
+    """A system that reads what it is from its `structure`, and numbers from fields named by kind, as "mass.forearm"."""
+
+    structure: ClassVar[Structure]
+
+    def _read(self, name: str) -> Component:
+        return getattr(self, name, 0.0)
+
+    def _triple(self, name: str) -> Triple:
+        return self._read(f"{name}.x"), self._read(f"{name}.y"), self._read(f"{name}.z")
+
+    def _of(self, joint: Shape, q: Any, u: Any) -> tuple[list[Component], list[Component]]:
+        """The joint's own coordinates and speeds."""
+        return [q[name] for name in joint.names(joint.coordinates)], [u[name] for name in joint.names(joint.speeds)]
+
+    def q_dot(self, t, q, u):
+        return [rate for joint in self.structure.joints for rate in joint.rates(*self._of(joint, q, u))]
+
+    def motion(self, t, q, u):
+        N, O = inertial()
+        carried: dict[str | None, tuple[Frame, Point]] = {None: (N, O)}
+        bodies, points, placed = [], {}, {}
+        for link in self.structure.links:
+            F, P = carried[link.parent]
+            P = _moved(P, F, self._triple(f"position.{link.name}"))
+            F = _turned(F, link.orientation, link.name)
+            for joint in link.joints:
+                at = placed[joint.name] = joint.move(F, P, *self._of(joint, q, u), self._triple(f"anchor.{joint.name}"))
+                F, P = at.moved, at.end
+            carried[link.name] = F, P
+            if link.has_mass:
+                G = _moved(P, F, self._triple(f"center.{link.name}"))
+                bodies.append(Body(self._read(f"mass.{link.name}"), self._inertia(link.name), G, F, name=link.name))
+            else:
+                points[link.name] = P.fixed(F.vector(0.0, 0.0, 0.0))
+        for joint in self.structure.joints:
+            armature = self._read(f"armature.{joint.name}")
+            if not is_zero(armature):
+                bodies += joint.rotors(N, placed[joint.name].end, armature, self._of(joint, q, u)[1])
+        sites = {}
+        for site in self.structure.sites:
+            F, P = carried[site.link]
+            points[site.name] = P.fixed(F.vector(*self._triple(f"site.{site.name}")))
+            sites[site.name] = _turned(F, site.orientation, site.name), points[site.name]
+        frames = {at.moved.name: at.moved for at in placed.values() if at.moved is not at.frame}
+        motion = TreeMotion(bodies, self._closed(sites, q, u)[1], points=points, frames=frames)
+        motion.placed, motion.sites = placed, sites
+        return motion
+
+    def loads(self, t, q, u, motion: Any, inputs):
+        gravity = motion.N.vector(*self._triple("gravity"))
+        falls = not all(is_zero(x) for x in gravity.components)
+        weighed = [body for body in motion.bodies if falls and not is_zero(body.mass)]  # rotors have none
+        loads: list[Any] = [Force(body.mass * gravity, body.center) for body in weighed]
+        for joint in self.structure.joints:
+            forces = self._forces(joint, *self._of(joint, q, u), inputs)
+            if not all(is_zero(x) for x in forces):
+                loads += joint.loads(motion.placed[joint.name], forces)
+        return loads
+
+    def configuration_constraints(self, t, q):
+        own = lambda joint: [q[name] for name in joint.names(joint.coordinates)]  # noqa: E731
+        norms = [x for joint in self.structure.joints for x in joint.norm(own(joint))]
+        if not (self.structure.loops or self.structure.couplings):
+            return norms
+        return [*self._apart(t, q, left_out=False), *norms]
+
+    def implied_constraints(self, t, q):
+        structure = self.structure
+        all_kept = all(len(loop.kept) == loop.size for loop in structure.loops)
+        if all_kept and all(coupling.is_kept for coupling in structure.couplings):
+            return []
+        return self._apart(t, q, left_out=True)
+
+    def _apart(self, t: Any, q: Any, left_out: bool) -> list[Any]:
+        """How far what closes the loops is from closing them: the residuals that count, or those that follow."""
+        still = dict.fromkeys((*self.speeds, *self.dependent_speeds), 0.0)
+        return self._closed(self.motion(t, q, tuple(still.values())).sites, q, still, left_out)[0]
+
+    def _forces(self, joint: Shape, q: list[Component], u: list[Component], inputs: Any) -> list[Component]:
+        """Forces along the joint's speeds [N or N m]: of its spring, damper and actuators."""
+        damping, stiffness = self._read(f"damping.{joint.name}"), self._read(f"stiffness.{joint.name}")
+        forces = [mul(-1.0, mul(damping, w)) for w in u]
+        if not is_zero(stiffness):
+            rest = self._triple(f"rest.{joint.name}") if len(u) == 6 else (self._read(f"rest.{joint.name}"),)
+            forces = [sub(f, mul(stiffness, x)) for f, x in zip(forces, joint.stretch(q, rest), strict=True)]
+        for actuator in self.structure.actuators:
+            if actuator.joint == joint.name:
+                drive = self._drive(actuator, q, u, inputs[actuator.name])
+                forces = [add(f, mul(g, drive)) for f, g in zip(forces, actuator.gear, strict=True)]
+        return forces
+
+    def _drive(self, actuator: ActuatorShape, q: list[Component], u: list[Component], control: Component) -> Component:
+        gain, offset, stiff, damp = (
+            self._read(f"{kind}.{actuator.name}") for kind in ("gain", "offset", "position_gain", "velocity_gain")
+        )
+        terms = [mul(gain, control), offset, mul(-1.0, mul(damp, dot(actuator.gear, u)))]
+        return _total([*terms, mul(-1.0, mul(stiff, mul(actuator.gear[0], q[0])))])
+
+    def _inertia(self, link: str) -> Matrix:
+        xx, yy, zz, xy, xz, yz = (self._read(f"inertia.{link}.{ij}") for ij in MOMENTS)
+        return ((xx, xy, xz), (xy, yy, yz), (xz, yz, zz))
+
+    def _closed(
+        self, sites: dict[str, tuple[Frame, Point]], q: Any, u: Any, left_out: bool = False
+    ) -> tuple[list[Any], list[Any]]:
+        """What closes the loops: residuals of the configuration, and of the velocities; or those that are left out,
+        since they follow."""
+        h: list[Any] = []
+        c: list[Any] = []
+        for loop in self.structure.loops:
+            (A, P), (B, Q) = sites[loop.first], sites[loop.second]
+            apart = Q.position_from(P).components_in(A)
+            parting = (Q.velocity - P.velocity).components_in(A)
+            if loop.rigid:
+                x, y, z = (axis.components_in(A) for axis in (B.x, B.y, B.z))
+                apart = (*apart, z[1], x[2], y[0])  # cosines between axes that are across
+                parting = (*parting, *(B.angular_velocity - A.angular_velocity).components_in(A))
+            rows = [i for i in range(loop.size) if (i in loop.kept) != left_out]
+            h += [apart[i] for i in rows]
+            c += [parting[i] for i in rows]
+        for coupling in self.structure.couplings:
+            if coupling.is_kept != left_out:
+                value, slope = _polynomial(coupling.coefficients, q[coupling.second] if coupling.second else 0.0)
+                h.append(q[coupling.first] - value)
+                rate = mul(slope, u[f"{coupling.second}_rate"]) if coupling.second else 0.0
+                c.append(sub(u[f"{coupling.first}_rate"], rate))
+        return h, c
+
+
+class TreeMotion(Motion):
+    """A motion that knows the frames and points at its joints and sites."""
+
+    __slots__ = ("placed", "sites")
+
+    placed: dict[str, Placed]
+    sites: dict[str, tuple[Frame, Point]]
+
+
+def _moved(P: Point, F: Frame, r: Triple) -> Point:
+    return P if all(is_zero(x) for x in r) else P.fixed(F.vector(*r))
+
+
+def _turned(F: Frame, orientation: Matrix | None, name: str) -> Frame:
+    return F if orientation is None else Frame(f"{name}, placed", F, orientation, ZERO3)
+
+
+def _polynomial(coefficients: tuple[float, ...], x: Component) -> tuple[Component, Component]:
+    """Value and slope."""
+    value: Component = 0.0
+    slope: Component = 0.0
+    for a in reversed(coefficients):
+        slope = add(mul(slope, x), value)
+        value = add(mul(value, x), a)
+    return value, slope
+
+
+def _total(terms: Sequence[Component]) -> Component:
+    """The sum, exact zeros dropped."""
+    result: Component = 0.0
+    for term in terms:
+        result = add(result, component(term))
+    return result
