@@ -19,7 +19,7 @@ from PIL import Image
 
 import jaxkane as jk
 from jaxkane._animate._record import record
-from jaxkane._animate._scene import project, which_way_is_up
+from jaxkane._animate._view import project, which_way_is_up
 
 needs_a_browser = pytest.mark.skipif(browser.PROGRAM is None, reason=browser.WHY_NOT)
 NODE = shutil.which("node")

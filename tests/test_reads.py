@@ -23,7 +23,7 @@ import pytest
 import jaxkane as jk
 from jaxkane._scalars.fuse import fused
 from jaxkane._scalars.versions import version_of
-from jaxkane.fit._problem.problem import cost
+from jaxkane.fit._problem.linearization import cost
 
 RTOL = 1e-12
 TS = np.linspace(0.0, 0.2, 3)

@@ -8,7 +8,7 @@ import pytest
 
 import jaxkane as jk
 from jaxkane._description.system import packed
-from jaxkane._method.now import rates_are_native
+from jaxkane._method.right_hand_side import rates_are_native
 from jaxkane._scalars import native
 from jaxkane._simulation.stages import WrittenOut
 

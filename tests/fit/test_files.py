@@ -21,7 +21,7 @@ from jaxkane.fit import (
     profile,
     read_trials,
 )
-from jaxkane.fit._problem.problem import cost, linearize
+from jaxkane.fit._problem.linearization import cost, linearize
 from jaxkane.sweep import grid
 
 

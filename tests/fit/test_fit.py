@@ -23,7 +23,7 @@ from jaxkane.fit import (
     minimize,
 )
 from jaxkane.fit._problem.blocks import Blocks, eliminate
-from jaxkane.fit._problem.problem import linearize
+from jaxkane.fit._problem.linearization import linearize
 
 TRUTH = DoublePendulum(mass=1.2, length=0.7)
 GUESS = DoublePendulum(mass=1.0, length=0.8)

@@ -25,7 +25,7 @@ from jaxkane.fit import (
 )
 from jaxkane.fit._optimize.steps import moved, settled
 from jaxkane.fit._problem.blocks import eliminate
-from jaxkane.fit._problem.problem import linearize
+from jaxkane.fit._problem.linearization import linearize
 
 
 @dataclasses.dataclass(frozen=True)

@@ -16,11 +16,13 @@ import numpy as np
 
 from .._description.system import System
 from .._simulation.trajectory import Trajectory
+from ._builder import Builder, turned_by
 from ._figures import bodies_and_points, figure_of
 from ._gif import write_gif
 from ._record import Record, record
-from ._scene import FIXED, UPRIGHT, Builder, Scene, turned_by, view_of, which_way_is_up
+from ._scene import FIXED, Scene
 from ._sketch import COLORS, Figure
+from ._view import UPRIGHT, view_of, which_way_is_up
 
 _FRAMES_PER_SECOND = 50.0
 _MOST_FRAMES = 3000

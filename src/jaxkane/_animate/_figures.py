@@ -11,8 +11,8 @@ from .._description.frames import Frame
 from .._description.motion import Motion
 from .._description.vectors import Vector
 from ..catalog import WhippleBicycle
+from ._builder import Builder
 from ._record import Record
-from ._scene import Builder
 from ._sketch import CYCLE, Figure, Sketch
 
 _AROUND = np.linspace(0.0, 2.0 * np.pi, 33)[:-1]

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ._scene import Scene, project
+from ._scene import Scene
 from ._sketch import COLORS
+from ._view import project
 
 _FINE = 2  # drawn so many times larger, then reduced: smooth lines
 

@@ -31,9 +31,9 @@ from .equations import (
     kinetic_energy,
     partial_velocities,
 )
-from .now import rates
 from .rates import motion_rates
 from .reading import Reading
+from .right_hand_side import rates
 from .values import as_row
 
 

@@ -11,29 +11,24 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Self
 
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array
 
-from .._common.lookup import not_there, refuse_unknown
+from .._common.lookup import not_there
 from .._description.frames import Frame
 from .._description.motion import Motion
 from .._description.points import Point
-from .._description.system import State, System, packed, unpacked
+from .._description.system import System
 from .._description.values import Values
 from .._description.vectors import Vector
-from .._scalars.components import add3, component, cross, is_exact
-from .._scalars.fuse import fused, is_native
-from .._scalars.linear import as_vector, is_written_out
+from .._scalars.components import add3, cross, is_exact
 from .._scalars.types import Component
 from .derivatives import jvp
 from .kane import Instant
-from .rates import motion_rates
 from .reactions import Reactions
-from .values import Inputs, Row, as_row, inputs_of
+from .values import Inputs, Row, inputs_of
 
 
 class Now(Inputs):
@@ -125,145 +120,3 @@ def read_at(now: Instant, u_dot: Row, read: Read) -> Any:
     # dv/dt in N = derivative of the components + omega x v
     answers = [add3(rate, cross(w, v)) for rate, w, v in zip(rates, turning, values, strict=True)]
     return reading(now.t, q, u, iter(answers))[0]
-
-
-def _state_rates(system: System, t: Component, q: Row, u: Row, motion: Motion, now: Now) -> Row:
-    names, label = system.states, f"{type(system).__name__}.state_rates"
-    return named_row(system.state_rates(t, q, u, [now[name] for name in names], motion, now), names, label)
-
-
-def named_row(rates: Any, names: Sequence[str], label: str) -> Row:
-    """Numbers in the order of `names`, or by name in a dict, as a row of components.
-
-    **Raises:** `ValueError` or `TypeError` for what is not one number for each name.
-    """
-    if isinstance(rates, Mapping):
-        refuse_unknown(rates, names, f"{label} names what is no state:")
-        missing = [name for name in names if name not in rates]
-        if missing:
-            raise ValueError(f"{label} gives no rate of {', '.join(missing)}.")
-        rates = [rates[name] for name in names]
-    if isinstance(rates, (float, int)) or (hasattr(rates, "shape") and not rates.shape):
-        rates = (rates,)  # the rate of a single state needs no tuple
-    return as_row(rates, names, label)
-
-
-def _outputs(system: System, t: Component, q: Row, u: Row, motion: Motion, now: Now) -> dict[str, Component]:
-    return flatten_outputs(system, system.outputs(t, q, u, motion, now))
-
-
-def flatten_outputs(system: System, given: Any) -> dict[str, Component]:
-    """Outputs by name, those of nested dicts joined by dots.
-
-    **Raises:** `TypeError` for what is no number; `ValueError` for a name that stands for something else already.
-    """
-    label = f"{type(system).__name__}.outputs"
-    found = _flat(label, given)
-    taken = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.inputs, *system.states)
-    twice = [name for name in found if name in taken]
-    if twice:
-        raise ValueError(
-            f"{label}: {', '.join(twice)} is the name of a coordinate, a speed, an input or a state already, and "
-            f"trajectories are read by name. Call what a sensor says of it otherwise: {'measured_' + twice[0]!r}."
-        )
-    return found
-
-
-def _flat(label: str, given: Any) -> dict[str, Component]:
-    if not isinstance(given, Mapping):
-        hint = " Does it end without a `return`?" if given is None else ""
-        raise TypeError(f"{label} returns numbers by name, in a dict; got {given!r}.{hint}")
-    found: dict[str, Component] = {}
-    for name, value in given.items():
-        if not isinstance(name, str) or not name:
-            raise TypeError(f"{label}: the name of an output is a string, got {name!r}.")
-        inner = {f"{name}.{k}": x for k, x in _flat(label, value).items()} if isinstance(value, Mapping) else None
-        for key, x in ({name: value} if inner is None else inner).items():
-            if key in found:
-                raise ValueError(f"{label}: the name {key!r} stands for two outputs.")
-            found[key] = x if inner is not None else _number(label, key, x)
-    return found
-
-
-def _number(label: str, name: str, value: Any) -> Component:
-    if isinstance(value, Vector):
-        raise TypeError(f"{label}: {name!r} is a Vector; give its components, as in `a, b, c = v.to(frame)`.")
-    try:
-        return component(value)
-    except TypeError as error:
-        raise TypeError(f"{label}: {name!r} is one number: {error}") from None
-
-
-def rates(system: System, t: Array, q: Array, u: Array, values: dict[str, Array]) -> State:
-    """The right-hand side: the time derivatives of coordinates, independent speeds and states of the first order, from
-    arrays that are known to fit; `values` of inputs and states by name."""
-    if not system.states:
-        return State(*motion_rates(system, t, q, u, values))
-    x = as_vector([values[name] for name in system.states], q)
-    return unpacked(system, packed_rates(system, t, packed(State(q, u, x)), values))
-
-
-def packed_rates(system: System, t: Array, y: Array, inputs: Mapping[str, Any]) -> Array:
-    """The right-hand side as a solver asks for it: of a packed state (n_q + n_u + n_x,), packed, so that one array goes
-    through the steps."""
-    if is_written_out(len(system.speeds)):
-        return _packed_rates(system, t, y, dict(inputs))
-    state = unpacked(system, y)
-    values = values_of(system, state.x, inputs)
-    q_dot, u_dot = motion_rates(system, t, state.q, state.u, values)
-    x_dot = first_order_rates(system, t, state.q, state.u, values, u_dot) if system.states else None
-    return packed(State(q_dot, u_dot, x_dot))
-
-
-def rates_are_native(system: System, t: Array, y: Array, inputs: Mapping[str, Any]) -> bool:
-    """Whether `packed_rates` of these is one native kernel."""
-    return is_written_out(len(system.speeds)) and is_native(_packed_rates, system, t, y, dict(inputs))
-
-
-def values_of(system: System, x: Array | None, inputs: Mapping[str, Any]) -> dict[str, Any]:
-    """Inputs and states by name, as `loads` reads them; `x` (..., n_x)."""
-    return {**inputs, **{name: x[..., i] for i, name in enumerate(system.states)}} if x is not None else dict(inputs)
-
-
-@fused
-def _packed_rates(system, t, y, inputs):
-    state = unpacked(system, y)
-    now = Instant(system, t, state.q, state.u, values_of(system, state.x, inputs))
-    u_dot = now.accelerations()
-    x_dot = read_at(now, u_dot, _state_rates) if system.states else ()
-    return as_vector((*now.q_dot, *u_dot, *x_dot), y)
-
-
-@fused
-def first_order_rates(system, t, q, u, inputs, u_dot):
-    """x_dot (n_x,) at the accelerations u_dot (n,)."""
-    now = Instant(system, t, q, u, inputs)
-    return as_vector(read_at(now, as_row(u_dot, system.speeds, "u_dot"), _state_rates), q)
-
-
-def has_outputs(system: System) -> bool:
-    """Whether a system says anything beside its coordinates, speeds, inputs and states."""
-    return type(system).outputs is not System.outputs
-
-
-def outputs_at(system: System, t: Array, q: Array, u: Array, inputs: Mapping[str, Array]) -> dict[str, Array]:
-    """Outputs by name, from arrays that are known to fit; `inputs` holds the states too."""
-    if not has_outputs(system):
-        return {}
-    inputs = dict(inputs)
-    return _outputs_now(system, t, q, u, inputs, motion_rates(system, t, q, u, inputs)[1])
-
-
-@fused
-def _outputs_now(system, t, q, u, inputs, u_dot):
-    now = Instant(system, t, q, u, inputs)
-    found = read_at(now, as_row(u_dot, system.speeds, "u_dot"), _outputs)
-    return {name: as_vector([x], q)[0] for name, x in found.items()}
-
-
-def output_names(system: System) -> tuple[str, ...]:
-    """The names of a system's outputs, in the order of the alphabet."""
-    if not has_outputs(system):
-        return ()
-    q, u = (jnp.zeros(len(names)) for names in (system.coordinates, system.speeds))
-    return tuple(jax.eval_shape(lambda t, q, u: outputs_at(system, t, q, u, {}), jnp.zeros(()), q, u))

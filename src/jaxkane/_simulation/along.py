@@ -17,9 +17,10 @@ from .._description.points import Point
 from .._description.system import System
 from .._method.equations import InputValues, _arrays, _dependent_accelerations
 from .._method.kane import Instant
-from .._method.now import outputs_at, rates
+from .._method.outputs import outputs_at
 from .._method.rates import motion_rates
 from .._method.reactions import forces_now, multipliers_now
+from .._method.right_hand_side import rates
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector
 from .._scalars.nan import nan_where

@@ -19,7 +19,8 @@ from .._method.checks import configuration_is_met
 from .._method.drift import correction, has_configuration_constraints, projected
 from .._method.equations import _dependent_speeds
 from .._method.kane import Instant
-from .._method.now import outputs_at, packed_rates, rates_are_native, values_of
+from .._method.outputs import outputs_at
+from .._method.right_hand_side import packed_rates, rates_are_native, values_of
 from .._method.values import checked_inputs
 from .._scalars.fuse import fused
 from .._scalars.nan import all_finite, derivative_free_where_not_finite, flat, nan_derivative_where, nan_where

@@ -12,7 +12,7 @@ from jax.core import Tracer
 from .._description.system import State, System
 from .._method.checks import check_state, check_system, is_concrete, with_possible_bodies
 from .._method.diagnose import diagnosis
-from .._method.now import values_of
+from .._method.right_hand_side import values_of
 from .._scalars.jax_internals import nothing_is_traced
 from .._scalars.types import Inputs
 from .modes import for_reverse_mode, goes_forward

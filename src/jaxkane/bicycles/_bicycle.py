@@ -22,7 +22,7 @@ from .._description.motion import Motion
 from .._description.points import Point, inertial
 from .._description.vectors import Vector
 from .._method.kane import as_row
-from .._method.now import named_row
+from .._method.right_hand_side import named_row
 from .._scalars.components import add
 from .._scalars.types import Component
 from ..catalog._bicycle_file import refuse_other_units

@@ -9,7 +9,7 @@ import numpy as np
 from .._description.system import System
 from .._method.checks import is_concrete
 from .._method.description_facts import configuration_residual
-from .._method.now import rates as rates_of
+from .._method.right_hand_side import rates as rates_of
 from .._scalars.jax_internals import concretely
 from .._scalars.versions import on_forget, version_of
 

@@ -17,7 +17,8 @@ from .._description.values import Values
 from .._method.checks import check_system, is_concrete
 from .._method.description_facts import configuration_residual
 from .._method.equations import dependent_speeds
-from .._method.now import output_names, outputs_at, rates, values_of
+from .._method.outputs import output_names, outputs_at
+from .._method.right_hand_side import rates
 from .._method.values import as_array, checked_inputs, refuse_incomplete
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, solve, stack
@@ -27,6 +28,7 @@ from .._scalars.versions import compiled
 from ._cyclic import cyclic_coordinates
 from ._eig import Eig, eig, eigvals
 from ._solve import jacobian
+from ._steadiness import check_state, inputs_by_name, is_wrong
 from ._steady import SteadyMotion
 
 Outputs = Sequence[str] | Mapping[str, Callable[..., Any]] | None
@@ -131,10 +133,10 @@ def linearize(
     known = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.states, *own)
     refuse_unknown(rows, (*known, *functions), f"{name}: outputs are functions, or by name; it has no output", "it has")
     if is_concrete(*origin):
-        _check_state(*origin, steady)
+        check_state(*origin, steady)
         wrong = jnp.array(False)
     else:
-        wrong = _is_wrong(*origin, steady)
+        wrong = is_wrong(*origin, steady)
     # Numbers in the place of what is none, so that its NaN does not meet the zeros of who does not read it.
     at = tuple(jnp.where(jnp.all(jnp.isfinite(y)), y, 0.1) for y in (t, q, u, x, w))
     model = _derivatives((system, *at), _Choice(dependent, kept, rows), _Functions(functions))
@@ -191,7 +193,7 @@ def _at_deviation(x, w, at, T, choice: _Choice, functions: _Functions):
     q = q + sum((moved[k] * T[:, i] for i, k in enumerate(names) if k in moved), jnp.zeros_like(q))
     u = jnp.stack([u[i] + moved[k] if k in moved else u[i] for i, k in enumerate(system.speeds)])
     x1 = [x1[i] + moved[k] if k in moved else x1[i] for i, k in enumerate(system.states)]
-    values = _values(system, w) | dict(zip(system.states, x1, strict=True))
+    values = inputs_by_name(system, w) | dict(zip(system.states, x1, strict=True))
     rate = rates(system, t, q, u, values)
     of_states = () if rate.x is None else rate.x
     all_names = (*names, *system.speeds, *system.states)
@@ -226,63 +228,3 @@ def _tangents(system: System, t, q, choice: _Choice):
             for i, x in zip(d, move, strict=True):
                 T[i][j] = x
     return stack(T).astype(q.dtype)
-
-
-def _values(system: System, w) -> dict[str, Any]:
-    return {k: w[i] for i, k in enumerate(system.inputs)}
-
-
-@compiled
-def _rates(system, t, q, u, x, w):
-    rate = rates(system, t, q, u, values_of(system, x, _values(system, w)))
-    return rate.q, rate.u, x if rate.x is None else rate.x, configuration_residual(system, t, q)
-
-
-def _tolerances(system: System, u) -> tuple[float, Any]:
-    """How far coordinates may be off the constraints, and rates from zero."""
-    tol = float(jnp.finfo(u.dtype).eps) ** 0.4
-    return tol, tol * (1.0 + jnp.max(jnp.abs(u), initial=0.0))
-
-
-def _still(system: System) -> np.ndarray:
-    """Places of the coordinates that stand still in a steady motion."""
-    cyclic = cyclic_coordinates(system)
-    return np.array([i for i, k in enumerate(system.coordinates) if k not in cyclic], int)
-
-
-def _is_wrong(system: System, t, q, u, x, w, steady: bool):
-    """Whether a state is off the constraints, not finite or, where that is asked, not steady."""
-    q_dot, u_dot, x_dot, h = _rates(system, t, q, u, x, w)
-    tol, slack = _tolerances(system, u)
-    moving = jnp.concatenate([u_dot, q_dot[_still(system)], x_dot]) if steady else jnp.zeros(0, q.dtype)
-    fine = jnp.all(jnp.abs(h) <= tol) & jnp.all(jnp.abs(moving) <= slack)
-    return jax.lax.stop_gradient(~(fine & jnp.all(jnp.isfinite(jnp.concatenate([q, u, x, w, t[None]])))))
-
-
-def _check_state(system: System, t, q, u, x, w, steady: bool) -> None:
-    name = type(system).__name__
-    q_dot, u_dot, x_dot, h = map(np.asarray, _rates(system, t, q, u, x, w))
-    tol, slack = _tolerances(system, u)
-    named = (
-        (system.coordinates, q),
-        (system.speeds, u),
-        (system.states, x),
-        (system.inputs, w),
-        (("t",), t[None]),
-    )
-    bad = [k for names, y in named for k, value in zip(names, np.asarray(y), strict=True) if not np.isfinite(value)]
-    if bad:
-        raise ValueError(f"{name}: {', '.join(bad)} is not finite: there is no linear model there.")
-    if h.size and not np.abs(h).max() <= tol:
-        raise ValueError(f"{name}: the coordinates violate the configuration constraints by {h}. Use assemble.")
-    if not steady:
-        return
-    found = {f"{k} is accelerated by": y for k, y in zip(system.speeds, u_dot, strict=True)}
-    found |= {f"{system.coordinates[i]} changes with": q_dot[i] for i in _still(system)}
-    found |= {f"{k} changes with": y for k, y in zip(system.states, x_dot, strict=True)}
-    moving = [f"{k} {float(x):.3g}" for k, x in found.items() if not abs(x) <= float(slack)]
-    if moving:
-        raise ValueError(
-            f"{name}: this motion is not steady: {', '.join(moving)}. Find one with equilibrium or steady_turn; or ask "
-            "for the linear model of an instant with linearize(..., steady=False)."
-        )

@@ -15,7 +15,7 @@ from .._description.system import State, System, names_of
 from .._method.checks import check_system, is_concrete
 from .._method.description_facts import configuration_residual
 from .._method.equations import dependent_speeds
-from .._method.now import rates
+from .._method.right_hand_side import rates
 from .._method.values import as_array, checked_values
 from .._scalars.nan import nan_where
 from .._scalars.types import Component

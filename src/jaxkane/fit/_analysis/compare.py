@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from .._data.trial import Trial
-from .._problem.problem import refuse_other
+from .._problem.arguments import refuse_other
 from .._result.result import Fit
 from .._result.tables import plain, table
 from .held_back import applied_to

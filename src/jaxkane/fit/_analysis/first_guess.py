@@ -6,15 +6,12 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.optimize import least_squares
 
 from ..._description.system import System
 from ..._method.body_parts import described
 from ..._method.checks import check_bodies
-from ..._scalars.versions import compiled
 from .._data.trial import Trial
 from .._problem.entries import parameters_of
 from .._problem.parameters import Parameters
@@ -24,10 +21,11 @@ from .base_parameters import states_for, structure_of_states
 from .base_structure import equations_at
 from .columns import Chosen
 from .equation_error import estimated
-from .instants import Motions, instants_of, max_spacing
+from .instants import Motions, instants_of
 from .linearity import check_linear
+from .nearest import column_values, nearest, values_with_slopes
+from .splines import max_spacing
 
-_PULL = 1e-2  # of a free number towards its start, in standard deviations: decides where the data are silent
 _TRIED = 7  # spacings of knots
 
 
@@ -116,7 +114,7 @@ def first_guess(
     check_linear(chosen, np.zeros((), jnp.result_type(float)), None)
     structure = structure_of_states(chosen)
     base, spacing = _best(system, chosen, structure, motions, sigma, spacing)
-    x, strain = _nearest(chosen, parameters, base)
+    x, strain = nearest(chosen, parameters, base)
     at = jnp.asarray(x, parameters.start.dtype)
     found, values = parameters.apply(system, at)[0], np.asarray(parameters.values(at))
     return FirstGuess(
@@ -124,7 +122,7 @@ def first_guess(
         dict(zip(parameters.names, values.tolist(), strict=True)),
         dict(zip(parameters.names, np.asarray(parameters.start).tolist(), strict=True)),
         base,
-        base.of(_told(chosen, found)),
+        base.of(column_values(chosen, found)),
         strain,
         spacing,
         _why_impossible(found),
@@ -146,7 +144,9 @@ def _chosen_by(system: System, parameters: Parameters) -> Chosen:
     every = Chosen(described(system, None), (), (), ())
     # At the start and beside it: the moment of inertia about a joint does not change with a centre that is there.
     at = [jnp.full_like(parameters.start, x) for x in (0.0, 0.37)]
-    slopes = np.max([np.abs(_with_slopes(every, parameters, x)[1][0]) for x in at], axis=0)  # (all of all bodies, p)
+    slopes = np.max(
+        [np.abs(values_with_slopes(every, parameters, x)[1][0]) for x in at], axis=0
+    )  # (all of all bodies, p)
     size = slopes.max(axis=1, initial=0.0, keepdims=True)
     moved: np.ndarray = slopes > 1e-9 * np.where(size > 0, size, 1.0)
     bodies: dict[str, tuple[str, ...]] = {}
@@ -167,21 +167,6 @@ def _chosen_by(system: System, parameters: Parameters) -> Chosen:
     ]
     units = [entry.unit for entry in own for _ in entry.targets]
     return Chosen(described(system, bodies), tuple(places), tuple(names), tuple(units))
-
-
-def _told_of(chosen: Chosen, parameters: Parameters, x: Any) -> Any:
-    return _values(chosen.of(parameters.apply(chosen.system, x)[0]))
-
-
-def _values(chosen: Chosen) -> Any:
-    return chosen.values(jnp.zeros(()), jnp.full(len(chosen.system.coordinates), 0.3))
-
-
-_told_values = compiled(_values)
-
-
-def _told(chosen: Chosen, system: System) -> np.ndarray:
-    return np.asarray(_told_values(chosen.of(system)))
 
 
 def _refuse_lengths(chosen: Chosen, parameters: Parameters) -> None:
@@ -225,45 +210,6 @@ def _best(
             break
     assert best is not None
     return best, chosen_spacing
-
-
-def _nearest(chosen: Chosen, parameters: Parameters, base: BaseParameters) -> tuple[np.ndarray, float]:
-    """Free numbers (p,) whose base parameters are nearest to those that were found, and how far they are."""
-    eigenvalues, V = np.linalg.eigh(base.information)
-    root = np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] * V.T
-    if base.held is not None:
-        # As firmly held as the best that is told.
-        hold = np.zeros(len(base.places))
-        hold[base.held] = 10.0 * np.sqrt(max(eigenvalues.max(initial=0.0), 1e-300))
-        root = np.vstack([root, hold])
-    known = np.isfinite(np.asarray(parameters.prior_deviation))
-
-    def residuals(x: Any) -> np.ndarray:
-        told, priors = look(x)[0]
-        return np.concatenate([root @ (base.of(told) - base.estimates), _PULL * x, priors[known]])
-
-    def slopes(x: Any) -> np.ndarray:
-        told, priors = look(x)[1]
-        return np.vstack([root @ base.matrix @ told, _PULL * np.eye(len(x)), priors[known]])
-
-    seen: dict[bytes, Any] = {}
-
-    def look(x: Any) -> Any:
-        if x.tobytes() not in seen:
-            seen.clear()
-            seen[x.tobytes()] = jax.device_get(_with_slopes(chosen, parameters, jnp.asarray(x, parameters.start.dtype)))
-        return seen[x.tobytes()]
-
-    jac: Any = slopes
-    found = least_squares(residuals, np.zeros(len(parameters.names)), jac, method="trf", x_scale=1.0, max_nfev=200)
-    return found.x, float(np.linalg.norm(residuals(found.x)[: len(root)]))
-
-
-@compiled
-def _with_slopes(chosen, parameters, x):
-    """The told values and the residuals of the priors, and how both change with the free numbers."""
-    both = lambda x: (_told_of(chosen, parameters, x), parameters.prior_residuals(x))  # noqa: E731
-    return both(x), jax.jacfwd(both)(x)
 
 
 def _why_impossible(system: System) -> str:

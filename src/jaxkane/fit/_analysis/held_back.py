@@ -13,8 +13,9 @@ from .._data.trial import Trial
 from .._optimize.least_squares import LeastSquares
 from .._optimize.minimize import minimize
 from .._optimize.steps import solve_nuisance, uninterrupted
+from .._problem.arguments import refuse_other
 from .._problem.model import Unknowns
-from .._problem.problem import Problem, refuse_other
+from .._problem.problem import Problem
 from .._result.result import Fit
 
 

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from .._optimize.steps import solve_nuisance
+from .._problem.arguments import refuse_other
 from .._problem.model import Unknowns
-from .._problem.problem import Problem, refuse_other
+from .._problem.problem import Problem
 from .._result.identifiability import Identifiability, identifiability_at
 
 

@@ -14,21 +14,15 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.interpolate import make_interp_spline, make_lsq_spline
+from scipy.interpolate import make_interp_spline
 
 from ..._common.lookup import refuse_unknown
 from ..._description.system import System
-from ..._method.equations import coordinate_rates
-from ..._scalars.versions import compiled
 from ..._simulation.trajectory import Trajectory
 from .._data.trial import Trial
-
-_DEGREE = 5
-_MOST_OF_A_SAMPLE = 4.0  # knots are no closer than so many samples
-_RATIO = 1.25  # between spacings that are tried
+from .splines import DEGREE, covered, max_spacing, speeds_and_rates, spline
 
 
 @dataclasses.dataclass(frozen=True)
@@ -153,13 +147,13 @@ def _of_trajectory(system: System, ride: Trajectory) -> Instants:
         raise ValueError("A batch of trajectories: give them one by one, or as Instants.")
     t, q, u = (np.asarray(x) for x in (ride.t, ride.q, ride.u))
     there = np.all(np.isfinite(np.column_stack([t, q, u])), axis=1)
-    if there.sum() < 3 * (_DEGREE + 1):
+    if there.sum() < 3 * (DEGREE + 1):
         raise ValueError(
-            f"A trajectory of {there.sum()} times; {3 * (_DEGREE + 1)} are the least to take accelerations from: save "
+            f"A trajectory of {there.sum()} times; {3 * (DEGREE + 1)} are the least to take accelerations from: save "
             "more of them."
         )
     u_dot = np.full(u.shape, np.nan)
-    u_dot[there] = make_interp_spline(t[there], u[there], _DEGREE)(t[there], 1)
+    u_dot[there] = make_interp_spline(t[there], u[there], DEGREE)(t[there], 1)
     u_dot[np.flatnonzero(there)[[*range(3), *range(-3, 0)]]] = np.nan  # at its ends a spline is worst
     return Instants(t, q, u, u_dot, {name: np.asarray(ride[name]) for name in (*system.inputs, *system.states)})
 
@@ -176,81 +170,14 @@ def _of_trial(system: System, trial: Trial, spacing: float | None) -> Instants:
     refuse_unknown(trial.inputs, system.inputs, f"{trial.name}: {type(system).__name__} has no input named", "it has")
     if spacing is None:
         spacing = max_spacing(trial, channels)
-    splines = {name: _spline(trial, name, y, spacing) for name, y in channels.items()}
-    inputs = {name: _spline(trial, name, y, spacing)(trial.t) for name, y in trial.inputs.items()}
+    splines = {name: spline(trial, name, y, spacing) for name, y in channels.items()}
+    inputs = {name: spline(trial, name, y, spacing)(trial.t) for name, y in trial.inputs.items()}
     inputs |= {name: splines[name](trial.t) for name in system.states if name in splines}
     at = lambda order: np.column_stack([splines[name](trial.t, order) for name in system.coordinates])  # noqa: E731
     q, q_dot, q_ddot = at(0), at(1), at(2)
-    u, u_dot = (np.array(x) for x in _speeds(system, *map(jnp.asarray, (trial.t, q, q_dot, q_ddot))))
+    u, u_dot = (np.array(x) for x in speeds_and_rates(system, *map(jnp.asarray, (trial.t, q, q_dot, q_ddot))))
     for i, name in enumerate(system.speeds):
         if name in splines:
             u[:, i], u_dot[:, i] = splines[name](trial.t), splines[name](trial.t, 1)
-    u_dot[~_covered(trial.t, channels, spacing)] = np.nan
+    u_dot[~covered(trial.t, channels, spacing)] = np.nan
     return Instants(trial.t, q, u, u_dot, inputs)
-
-
-@compiled
-def _speeds(system, t, q, q_dot, q_ddot):
-    """Independent speeds and their rates (n, n_u), from the coordinates' rates, which are affine in them."""
-    zero = jnp.zeros(len(system.speeds), q.dtype)
-
-    def speeds(t, q, q_dot):
-        rates = lambda u: coordinate_rates(system, t, q, u)  # noqa: E731
-        return jnp.linalg.pinv(jax.jacfwd(rates)(zero)) @ (q_dot - rates(zero))
-
-    def along(t, q, q_dot, q_ddot):
-        return jax.jvp(speeds, (t, q, q_dot), (jnp.ones_like(t), q_dot, q_ddot))
-
-    return jax.vmap(along)(t, q, q_dot, q_ddot)
-
-
-def max_spacing(trial: Trial, channels: Mapping[str, np.ndarray]) -> float:
-    """The largest spacing [s] of knots at which every channel is met within its standard deviation."""
-    span = trial.t[-1] - trial.t[0]
-    spacing, least = span / 2, _MOST_OF_A_SAMPLE * float(np.median(np.diff(trial.t)))
-    for name, y in channels.items():
-        seen = np.isfinite(y)
-        while spacing > least:
-            misfit = (_spline(trial, name, y, spacing)(trial.t[seen]) - y[seen]) / trial.sigma[name][seen]
-            if np.mean(misfit**2) <= 1.0:
-                break
-            spacing /= _RATIO
-    return max(spacing, least)
-
-
-def _spline(trial: Trial, name: str, y: np.ndarray, spacing: float) -> Any:
-    """The spline of least squares, whose knots are as far apart; without those between which nothing was measured."""
-    seen = np.isfinite(y)
-    t, y = trial.t[seen], y[seen]
-    if len(t) < 3 * (_DEGREE + 1):
-        raise ValueError(
-            f"{trial.name}: {name} has {len(t)} samples; {3 * (_DEGREE + 1)} are the least to take accelerations from."
-        )
-    steps = np.abs(np.diff(y))
-    usual = np.median(steps)
-    if usual < 0.8 and np.any(np.abs(steps - 2 * np.pi) < 0.2 + 2 * usual):
-        raise ValueError(
-            f"{trial.name}: {name} jumps by a whole turn at t = {t[steps.argmax()]:g} s: make it one curve by "
-            "np.unwrap."
-        )
-    weights = None if name not in trial.sigma else 1.0 / trial.sigma[name][seen]
-    n = max(1, round((t[-1] - t[0]) / spacing))
-    inner, last = [], 0
-    for knot in np.linspace(t[0], t[-1], n + 1)[1:-1]:
-        upto = int(np.searchsorted(t, knot))
-        if upto - last >= 2 and len(t) - upto >= 2:
-            inner.append(knot)
-            last = upto
-    knots = np.r_[[t[0]] * (_DEGREE + 1), inner, [t[-1]] * (_DEGREE + 1)]
-    return make_lsq_spline(t, y, knots, _DEGREE, w=weights)
-
-
-def _covered(t: np.ndarray, channels: Mapping[str, np.ndarray], spacing: float) -> np.ndarray:
-    """Where every channel was measured, and has no end nor a gap of a spacing within a spacing."""
-    fine = np.ones(t.shape, bool)
-    for y in channels.values():
-        seen = t[np.isfinite(y)]
-        fine &= (t >= seen[0] + spacing) & (t <= seen[-1] - spacing)
-        for i in np.flatnonzero(np.diff(seen) > spacing):
-            fine &= (t <= seen[i] - spacing) | (t >= seen[i + 1] + spacing)
-    return fine

@@ -9,8 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._problem.arguments import refuse_other
 from .._problem.blocks import Eliminated, eliminate
-from .._problem.problem import Problem, refuse_other
+from .._problem.problem import Problem
 from .._result.result import Fit
 
 LOG_2PI = math.log(2 * math.pi)

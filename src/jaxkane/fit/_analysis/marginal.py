@@ -17,8 +17,9 @@ from .._data.trial import Trial
 from .._optimize.least_squares import LeastSquares
 from .._optimize.minimize import minimize
 from .._optimize.steps import uninterrupted
+from .._problem.arguments import refuse_other
 from .._problem.blocks import eliminate
-from .._problem.problem import Problem, refuse_other
+from .._problem.problem import Problem
 from .._result.result import Fit
 from .laplace import LOG_2PI, log_likelihood, log_nuisance_priors
 

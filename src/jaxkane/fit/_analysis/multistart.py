@@ -13,8 +13,10 @@ from tqdm import tqdm
 from .._optimize.least_squares import LeastSquares
 from .._optimize.minimize import minimize
 from .._optimize.optimizer import Optimizer
+from .._problem.arguments import refuse_other
+from .._problem.linearization import cost
 from .._problem.model import Unknowns
-from .._problem.problem import Problem, cost, refuse_other
+from .._problem.problem import Problem
 from .._result.result import Fit
 
 

@@ -10,7 +10,7 @@ from ..._common.lookup import hint
 from .._optimize.least_squares import LeastSquares
 from .._optimize.minimize import minimize
 from .._optimize.steps import uninterrupted
-from .._problem.problem import refuse_other
+from .._problem.arguments import refuse_other
 from .._result.result import Fit
 
 

@@ -17,9 +17,9 @@ from ..._method.equations import _dependent_speeds
 from ..._scalars.versions import compiled
 from .._data.windows import state_names
 from .._problem import kalman
+from .._problem.arguments import refuse_other
 from .._problem.filtered import brought_back, filtered
 from .._problem.model import Model, Unknowns
-from .._problem.problem import refuse_other
 from .._problem.programs import each, starts_of
 from .._result.result import Fit
 

@@ -10,12 +10,14 @@ from tqdm import tqdm
 from ..._common.lookup import refuse_unknown
 from .._optimize.least_squares import LeastSquares
 from .._optimize.solve import solve
-from .._problem.problem import Problem, refuse_other
+from .._problem.arguments import refuse_other
+from .._problem.problem import Problem
 from .._result.result import Fit
 from .candidates import Candidate, candidates_of, posed_with
 from .held_back import folds_of
+from .standing import Standing
 from .suspected import Suspects
-from .trying import Standing, Trying
+from .trying import Trying
 
 
 def suspects(

@@ -15,8 +15,9 @@ from jaxtyping import Array, Bool, Float
 from ..._scalars.versions import compiled
 from .._problem.blocks import eliminate
 from .._problem.density import half_cost
+from .._problem.linearization import Linearization, cost, linearize
 from .._problem.model import Unknowns
-from .._problem.problem import Linearization, Problem, cost, linearize
+from .._problem.problem import Problem
 from .optimizer import Iterate, Optimizer
 from .steps import usable
 

@@ -15,8 +15,9 @@ from jaxtyping import Array, Float
 
 from ..._common.digest import digest
 from .._problem.blocks import Eliminated, eliminate
+from .._problem.linearization import Linearization, linearize
 from .._problem.model import Unknowns
-from .._problem.problem import Linearization, Problem, linearize
+from .._problem.problem import Problem
 from .optimizer import Iterate, Optimizer
 from .steps import moved, solve_nuisance, usable
 

@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Array
 
 from .._problem.blocks import eliminate
+from .._problem.linearization import Linearization, linearize
 from .._problem.model import Unknowns
-from .._problem.problem import Linearization, Problem, linearize
+from .._problem.problem import Problem
 from .minimize import minimize
 from .optimizer import Iterate, Optimizer
 from .steps import moved, settled, usable

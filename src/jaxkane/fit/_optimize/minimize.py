@@ -9,8 +9,10 @@ from collections.abc import Callable
 import numpy as np
 from tqdm import tqdm
 
+from .._problem.arguments import refuse_other
+from .._problem.linearization import linearize
 from .._problem.model import Unknowns
-from .._problem.problem import Problem, linearize, refuse_other
+from .._problem.problem import Problem
 from .._result.result import Fit
 from .checkpoint import Checkpoint
 from .optimizer import Iterate, Optimizer

@@ -6,8 +6,9 @@ import abc
 import dataclasses
 from typing import Any, ClassVar
 
+from .._problem.linearization import Linearization
 from .._problem.model import Unknowns
-from .._problem.problem import Linearization, Problem
+from .._problem.problem import Problem
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,8 +12,9 @@ from jaxtyping import Array
 
 from ..._simulation.trajectory import Status, reason
 from .._problem.blocks import Eliminated, eliminate
+from .._problem.linearization import Linearization, linearize
 from .._problem.model import Unknowns
-from .._problem.problem import Linearization, Problem, linearize
+from .._problem.problem import Problem
 
 
 def moved(point: Unknowns, x: Array, eliminated: Eliminated) -> Unknowns:

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._data.windows import Windows
+from .arguments import refuse_other
 from .model import Model, Unknowns
-from .problem import Problem, refuse_other
+from .problem import Problem
 from .programs import blocks_of, starts_of
 
 

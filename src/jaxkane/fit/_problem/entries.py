@@ -15,7 +15,7 @@ from ..._common.lookup import hint
 from ..._description.parameters import declared, leaf_name, learned_part
 from ..._description.system import System
 from ..._description.units import unit_of, units_of
-from ..._method.now import output_names
+from ..._method.outputs import output_names
 from .bijections import Interval, PossibleBody
 from .free import Delay, Free, Gain, Inertia, Intensity, Offset, Prior, Shared, Sigma, Where
 from .leaves import find_leaves, one_leaf

@@ -12,7 +12,7 @@ from ..._common.lookup import hint, refuse_unknown
 from ..._description.system import System
 from ..._method.drift import has_configuration_constraints
 from ..._method.free_coordinates import found_of
-from ..._method.now import output_names
+from ..._method.outputs import output_names
 from .._data.trial import Trial
 from .._data.windows import state_names
 from .entries import where_of

@@ -17,15 +17,16 @@ from ..._method.checks import check_system
 from ..._simulation.trajectory import Trajectory
 from .._data.trial import Trial
 from .._data.windows import Place, Windows, cut
-from .blocks import Blocks
+from .arguments import check_windows, refuse_other
 from .entries import parameters_of
 from .free import Prior
-from .model import Model, Seen, Unknowns
+from .linearization import simulated
+from .model import Model, Unknowns
 from .names import Names, checked_trials, held_and_delayed, nuisance_of, starts_found
 from .noise import noise_of
-from .parallel import blocks_of_all, check_same, costs_of_all
+from .parallel import check_same
 from .parameters import Parameters
-from .programs import blocks_of, costs_of, rides_of, starts_of
+from .programs import rides_of, starts_of
 from .simulation import Simulation
 
 STEP_TOLERANCE = 0.05, 0.25
@@ -80,7 +81,7 @@ class Problem:
         posed = {key: value for key, value in locals().items() if key not in ("cls", "trials")}
         trials = (trials,) if isinstance(trials, Trial) else tuple(trials)
         channels = checked_trials(system, trials)
-        _check_windows(window, continuity)
+        check_windows(window, continuity)
         driven = tuple(name for name in system.inputs if any(name in trial.inputs for trial in trials))
         nuisance = nuisance_of(system, channels, driven, posed)
         deviations = jnp.concatenate([nuisance.start_deviation, nuisance.trial_deviation])
@@ -291,104 +292,3 @@ class Problem:
         return dataclasses.replace(
             self, model=eqx.tree_at(lambda m: m.parameters, self.model, self.parameters.with_priors(priors))
         )
-
-
-def _check_windows(window: float | None, continuity: Mapping[str, float] | None) -> None:
-    if window is not None and not window > 0:
-        raise ValueError(f"`window` is a length of time [s], got {window}.")
-    if continuity is not None and window is None:
-        raise ValueError("`continuity` binds the windows of a trial together: give their length, `window` [s].")
-
-
-def refuse_other(given: Any, wanted: type, name: str, instead: str) -> None:
-    """What is asked before a fit takes a `Problem`, what is asked after it takes a `Fit`.
-
-    **Raises:** `TypeError` for anything else.
-    """
-    if not isinstance(given, wanted):
-        raise TypeError(f"{name} takes a {wanted.__name__}, as in {instead}; got {type(given).__name__}.")
-
-
-class Linearization(eqx.Module):
-    """A problem at a point: its blocks, and what was seen of every window."""
-
-    blocks: Blocks
-    seen: Seen
-
-    @property
-    def simulated(self) -> Array:
-        """(W, n_c, n_t)."""
-        return self.seen.simulated
-
-    @property
-    def status(self) -> Array:
-        """Of every window (W,)."""
-        return self.seen.status
-
-    @property
-    def cost(self) -> float:
-        """Sum of squares, with process noise minus twice the log likelihood; NaN or infinite where a window could not
-        be simulated."""
-        return float(self.blocks.cost if self.seen.value is None else jnp.sum(self.seen.value))
-
-    @property
-    def costs(self) -> np.ndarray:
-        """The part of every window (W,) in the cost; infinite where it is not `good`."""
-        own = jnp.sum(self.blocks.R[:, :, -1] ** 2, axis=1) if self.seen.value is None else self.seen.value
-        return np.where(self.good, np.asarray(own), np.inf)
-
-    @property
-    def squares(self) -> float:
-        """The rows' sum of squares: what relative tolerances refer to, and what promises are counted from. It is the
-        cost, but with process noise about twice the number of measurements, where the cost may have any sign."""
-        return float(self.blocks.cost)
-
-    @property
-    def good(self) -> np.ndarray:
-        """Whether a window (W,) has finite residuals and derivatives."""
-        return np.all(np.isfinite(np.asarray(self.blocks.R)), axis=(1, 2))
-
-
-def linearize(problem: Problem, point: Unknowns) -> Linearization | None:
-    """Residuals and their exact derivatives, by forward mode through the simulation; None where no start is found."""
-    found = _starts(problem, point)
-    if found is None:
-        return None
-    blocks: Any = blocks_of_all if problem.processes else blocks_of
-    return Linearization(*blocks(problem.model, problem.windows, problem.by_trial, point, *found))
-
-
-def cost(problem: Problem, point: Unknowns) -> float:
-    """Sum of squares, with process noise minus twice the log likelihood, without derivatives; NaN or infinite where a
-    window could not be simulated."""
-    found = _starts(problem, point)
-    if found is None:
-        return float("nan")
-    return float(jnp.sum(_costs(problem, point, found[0])[0]))
-
-
-def simulated(problem: Problem, point: Unknowns) -> np.ndarray:
-    """What the sensors would have said (W, n_c, n_t), with process noise followed by its deviations (W, 2 n_c, n_t);
-    NaN where that cannot be simulated."""
-    found = _starts(problem, point)
-    if found is None:
-        several = 1 if problem.model.noise is None else 2
-        return np.full(np.tile(problem.windows.measured, (1, several, 1)).shape, np.nan)
-    return all_of(_costs(problem, point, found[0])[1])
-
-
-def all_of(seen: Seen) -> np.ndarray:
-    """What `simulated` gives, of what was seen."""
-    parts = [x for x in (seen.simulated, seen.deviation) if x is not None]
-    return np.concatenate(parts, axis=1)
-
-
-def _costs(problem: Problem, point: Unknowns, starts: Array) -> tuple[Array, Seen]:
-    return (costs_of_all if problem.processes else costs_of)(problem.model, problem.windows, point, starts)
-
-
-def _starts(problem: Problem, point: Unknowns) -> tuple[Array, Array] | None:
-    try:
-        return starts_of(problem.model, problem.windows, point)
-    except eqx.EquinoxRuntimeError:  # Newton's linear solver raises on what is not finite
-        return None

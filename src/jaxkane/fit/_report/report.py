@@ -18,7 +18,7 @@ from .._analysis.held_back import CrossValidation, cross_validate
 from .._analysis.profile import Profile
 from .._analysis.signs import contrary_signs
 from .._analysis.suspected import Suspects
-from .._problem.problem import refuse_other
+from .._problem.arguments import refuse_other
 from .._result.identifiability import combination
 from .._result.result import STATUS, Fit, known_values
 from . import pictures

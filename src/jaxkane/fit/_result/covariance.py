@@ -11,9 +11,10 @@ from scipy import stats
 
 from ..._scalars.versions import compiled
 from .._problem.blocks import Blocks, eliminate
+from .._problem.linearization import Linearization
 from .._problem.model import Unknowns
 from .._problem.parameters import Parameters
-from .._problem.problem import Linearization, Problem
+from .._problem.problem import Problem
 
 
 def clusters_of(problem: Problem) -> tuple[str, int]:

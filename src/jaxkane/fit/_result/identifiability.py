@@ -11,8 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._problem.blocks import eliminate
+from .._problem.linearization import Linearization
 from .._problem.model import Unknowns
-from .._problem.problem import Linearization, Problem
+from .._problem.problem import Problem
 
 
 @dataclasses.dataclass(frozen=True)

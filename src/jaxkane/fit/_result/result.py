@@ -17,9 +17,10 @@ import numpy as np
 from ..._common.lookup import refuse_unknown
 from ..._description.system import System
 from .._problem.leaves import leaf_names
+from .._problem.linearization import Linearization, all_of
 from .._problem.model import Unknowns
 from .._problem.parameters import Parameters
-from .._problem.problem import STEP_TOLERANCE, Linearization, Problem, all_of
+from .._problem.problem import STEP_TOLERANCE, Problem
 from .._problem.state_file import described, write_state
 from . import covariance, notes, residuals
 from .bodies import bodies_in_words

@@ -10,9 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..._common.digest import differences
+from .._problem.arguments import refuse_other
 from .._problem.blocks import Blocks
+from .._problem.linearization import Linearization, cost
 from .._problem.model import Seen, Unknowns
-from .._problem.problem import Linearization, Problem, cost, refuse_other
+from .._problem.problem import Problem
 from .._problem.state_file import described, read_state, tree_of
 from .result import Fit
 
