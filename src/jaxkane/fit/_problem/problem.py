@@ -20,7 +20,6 @@ from .._data.windows import Place, Windows, cut
 from .arguments import check_windows, refuse_other
 from .entries import parameters_of
 from .free import Prior
-from .linearization import simulated
 from .model import Model, Unknowns
 from .names import Names, checked_trials, held_and_delayed, nuisance_of, starts_found
 from .noise import noise_of
@@ -28,13 +27,7 @@ from .parallel import check_same
 from .parameters import Parameters
 from .programs import rides_of, starts_of
 from .simulation import Simulation
-
-STEP_TOLERANCE = 0.05, 0.25
-"""By how much halving the step of integration may move all residuals together, of a window and of all windows: it
-bounds the bias of an estimate in its standard errors."""
-
-HALVINGS = 8
-"""Of a step between two samples, at most: what needs more is stiff or chaotic."""
+from .step_halving import finer
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,7 +103,7 @@ class Problem:
         if processes:
             check_same(model, windows)
         problem = cls(model, windows, windows.by_trial, trials, places, posed, processes)
-        return problem.finer(problem.start) if problem.chooses_steps else problem
+        return finer(problem, problem.start) if problem.chooses_steps else problem
 
     @property
     def cost_name(self) -> str:
@@ -120,71 +113,16 @@ class Problem:
     @property
     def chooses_steps(self) -> bool:
         """Whether fixed steps of integration are halved until they are fine enough: nobody has given any."""
-        return self._steps and self.posed["simulation"].step is None
+        return self.has_steps and self.posed["simulation"].step is None
 
     @property
-    def _steps(self) -> bool:
+    def has_steps(self) -> bool:
         """Whether something follows from fixed steps: the motion, or what noise adds to it."""
         return self.model.settings.step is not None or self.model.noise is not None
-
-    def finer(self, point: Unknowns) -> Problem:
-        """With steps halved where that changes what is simulated at a point by more than a share of the noise.
-
-        An input that is linear between its samples has a kink at every sample, on which error control spends ten
-        steps; a step from kink to kink meets none. Measured (the rides of a steered bicycle, 100 Hz, 1 s): 1300 steps
-        at a tolerance of 1e-7 against 100 of Bosh3, which differ by 0.002 of the measurements' deviation.
-        """
-        first, problem, before = self.windows.step, self, simulated(self, point)
-        going, last = np.full(len(self.places), True), np.full(len(self.places), np.inf)
-        for halvings in range(HALVINGS):
-            half = jnp.where(jnp.asarray(going), problem.windows.step / 2, problem.windows.step)
-            halved = problem.with_steps(half)
-            after = simulated(halved, point)
-            apart = problem._apart(before, after)
-            going &= ~(apart <= self.step_tolerance)
-            # What halving does not bring nearer has no step: it is chaotic, or ends too early with each.
-            going &= (halvings < 2) | (np.isfinite(apart) & (apart <= last / 2))
-            if not going.any():
-                break
-            problem = problem.with_steps(jnp.where(jnp.asarray(going), half, problem.windows.step))
-            before, last = np.where(going[:, None, None], after, before), apart
-        lost = ~np.all(np.isfinite(np.where(self._weight_of(before) > 0, before, 0.0)), axis=(1, 2))
-        return problem.with_steps(jnp.where(jnp.asarray(lost), first, problem.windows.step))
-
-    @property
-    def step_tolerance(self) -> float:
-        """By how much halving the step may move all residuals of one window together, in standard deviations."""
-        one, together = STEP_TOLERANCE
-        return min(one, together / len(self.places) ** 0.5)
-
-    def step_errors(self, point: Unknowns, now: np.ndarray | None = None) -> np.ndarray:
-        """By how much halving the step moves all residuals of every window (W,) together, in standard deviations; NaN
-        where a window is not simulated to its end, or where the step follows from tolerances.
-
-        `now`: what is simulated at the point, where that is known.
-        """
-        if not self._steps:
-            return np.full(len(self.places), np.nan)
-        now = simulated(self, point) if now is None else now
-        return self._apart(now, simulated(self.with_steps(self.windows.step / 2), point))
 
     def with_steps(self, step: Array) -> Problem:
         """The same problem with other steps of integration (W,) [s]; nothing is compiled anew."""
         return dataclasses.replace(self, windows=eqx.tree_at(lambda w: w.step, self.windows, step))
-
-    def _apart(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """The norm (W,) of a difference of simulations, in standard deviations; infinite where one of the two ended
-        earlier, NaN where both did."""
-        weight = self._weight_of(a)
-        lost = [np.any((weight > 0) & ~np.isfinite(x), axis=(1, 2)) for x in (a, b)]
-        with np.errstate(invalid="ignore"):
-            moved = np.linalg.norm(np.where(weight > 0, (b - a) * weight, 0.0), axis=(1, 2))
-        return np.where(lost[0] & lost[1], np.nan, np.where(lost[0] | lost[1], np.inf, moved))
-
-    def _weight_of(self, simulated: np.ndarray) -> np.ndarray:
-        """One over the standard deviations of what `simulated` gives."""
-        weight = np.asarray(self.windows.weight)
-        return np.tile(weight, (1, simulated.shape[1] // weight.shape[1], 1))
 
     @property
     def system(self) -> System:

@@ -20,7 +20,8 @@ from .._analysis.signs import contrary_signs
 from .._analysis.suspected import Suspects
 from .._problem.arguments import refuse_other
 from .._result.identifiability import combination
-from .._result.result import STATUS, Fit, known_values
+from .._result.result import Fit
+from .._result.text import STATUS, known_values
 from . import pictures
 
 Row = Sequence[str]

@@ -10,30 +10,20 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from ..._common.lookup import refuse_unknown
 from ..._description.system import System
-from .._problem.leaves import leaf_names
 from .._problem.linearization import Linearization, all_of
 from .._problem.model import Unknowns
 from .._problem.parameters import Parameters
-from .._problem.problem import STEP_TOLERANCE, Problem
+from .._problem.problem import Problem
 from .._problem.state_file import described, write_state
+from .._problem.step_halving import STEP_TOLERANCE, step_errors
 from . import covariance, notes, residuals
-from .bodies import bodies_in_words
 from .identifiability import Identifiability, identifiability_at, residual_variance
+from .nuisance import nuisance_by_trial
 from .residuals import ByTrial, ResidualTest, residual_test
-
-STATUS = {
-    "converged": "converged",
-    "steps": "stopped after the last step, before it converged",
-    "stuck": "stuck: no step lowers the cost",
-    "interrupted": "interrupted: this is the best so far",
-    "applied": "not fitted: these are the parameters of another fit",
-}
+from .text import STATUS, summary, table, title
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -65,7 +55,7 @@ class Fit:
     problem: Problem
     point: Unknowns
     linearization: Linearization
-    step_errors: np.ndarray  # (W,), see `Problem.step_errors`
+    step_errors: np.ndarray  # (W,), see `step_halving.step_errors`
     history: tuple[float, ...]
     status: str
     method: str
@@ -81,7 +71,7 @@ class Fit:
         errors = np.full(len(problem.places), np.nan)
         if status != "interrupted":
             try:
-                errors = problem.step_errors(point, all_of(at.seen))
+                errors = step_errors(problem, point, all_of(at.seen))
             except KeyboardInterrupt:
                 status = "interrupted"
         return cls(problem, point, at, errors, tuple(history), status, method)
@@ -255,20 +245,7 @@ class Fit:
 
     @property
     def nuisance(self) -> dict[str, dict[str, Any]]:
-        problem, n = self.problem, self.problem.model.nuisance
-        starts = np.asarray(problem.windows.start)[:, problem.model.unknown_places] + np.asarray(self.point.z)
-        owner = np.array([k for k, _, _ in problem.places])
-        found = {}
-        seen = self.linearization.seen
-        b = self.point.b if seen.unknowns is None else seen.unknowns  # with process noise a window is a trial
-        given = np.isfinite(np.asarray(n.start_deviation)) & (problem.model.noise is not None)
-        for k, name in enumerate(self.trial_names):
-            found[name] = {}
-            for j, (kind, what) in enumerate(n.trial):
-                value = float(b[k, j]) + (1.0 if kind.startswith("gain") else 0.0)
-                found[name][f"{kind.split()[0]} of {what}"] = value
-            found[name] |= {f"start of {s}": starts[owner == k, j] for j, s in enumerate(n.start) if not given[j]}
-        return found
+        return nuisance_by_trial(self.problem, self.point, self.linearization.seen)
 
     @functools.cached_property
     def notes(self) -> tuple[str, ...]:
@@ -293,58 +270,14 @@ class Fit:
 
     def table(self, truth: Mapping[str, float] | System | None = None) -> str:
         """Name, start, estimate and standard error of every parameter; and the truth, where it is known."""
-        known = known_values(self, truth)
-        head = f"{'parameter':<22}{'start':>12}{'estimate':>12}{'std. error':>12}"
-        lines = [head + (f"{'truth':>12}{'error':>9}" if known else "")]
-        errors, start = self.standard_errors, self.start
-        parameters = self.parameters
-        for name, unit, part in zip(self.names, parameters.units, parameters.learned, strict=True):
-            if part:
-                continue
-            value = self.estimates[name]
-            line = f"{name:<22}{start[name]:>12.5g}{value:>12.5g}{errors[name]:>12.2g}"
-            if name in known:
-                right = known[name]
-                line += f"{right:>12.5g}{(value / right - 1 if right else value):>9.2{'%' if right else 'g'}}"
-            lines.append(f"{line}  {unit}".rstrip())
-        for part in dict.fromkeys(filter(None, parameters.learned)):
-            own = [name for name, p in zip(self.names, parameters.learned, strict=True) if p == part]
-            size = [float(np.sqrt(np.mean([at[name] ** 2 for name in own]))) for at in (start, self.estimates)]
-            lines.append(f"{part:<22}{size[0]:>12.5g}{size[1]:>12.5g}  rms of {len(own)} learned numbers")
-        return "\n".join(lines)
+        return table(self, truth)
 
     def __str__(self) -> str:
-        name = self.problem.cost_name
-        end = f"{name} {self.history[0]:.6g} -> {self.cost:.6g} by {self.method}: {STATUS[self.status]}"
-        bodies = bodies_in_words(self.parameters, self.point.x)
-        return "\n".join([self.title, self.table(), *bodies, end, *self.notes])
+        return summary(self)
 
     @property
     def title(self) -> str:
-        n_r, n_unknown = self.problem.size
-        return (
-            f"{type(self.problem.system).__name__}: {len(self.problem.trials)} trials, "
-            f"{len(self.problem.places)} windows, {n_r} residuals, {len(self.names)} parameters, "
-            f"{n_unknown - len(self.names)} nuisance values"
-        )
+        """How much was fitted, in a line."""
+        return title(self)
 
     __repr__ = __str__
-
-
-def known_values(fit: Fit, truth: Mapping[str, float] | System | None) -> dict[str, float]:
-    """The true values of free parameters, from a system that has them or by name.
-
-    **Raises:** `ValueError` for a name that is neither free nor a parameter; `TypeError` for another kind of system.
-    """
-    if truth is None:
-        return {}
-    system = fit.problem.system
-    if isinstance(truth, Mapping):
-        refuse_unknown(truth, (*fit.names, *leaf_names(system)), "`truth` names")
-        return {name: float(truth[name]) for name in fit.names if name in truth}
-    if type(truth) is not type(system):
-        title = type(system).__name__
-        raise TypeError(f"`truth` is a {title}, or values by name; got {type(truth).__name__}.")
-    leaves = jax.tree.leaves(truth)
-    targets = {e.name: e.targets[0] for e in fit.parameters.entries if e.targets}
-    return {name: float(jnp.ravel(leaves[leaf])[place]) for name, (leaf, place, _) in targets.items()}
