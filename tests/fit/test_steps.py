@@ -8,18 +8,7 @@ import scipy.special
 from scipy import stats
 from systems import Cart
 
-from jaxkane.fit import (
-    BFGS,
-    Free,
-    GradientDescent,
-    LeastSquares,
-    Problem,
-    Simulation,
-    Trial,
-    fit,
-    laplace,
-    minimize,
-)
+from jaxkane.fit import BFGS, Free, GradientDescent, LeastSquares, Problem, Simulation, Trial, fit, laplace, minimize
 from jaxkane.fit._problem.step_halving import step_errors, step_tolerance
 
 H, SIGMA = 0.25, 0.001

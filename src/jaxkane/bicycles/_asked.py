@@ -15,7 +15,8 @@ from ._part import Part, called
 from ._tyre import Tyre
 
 if TYPE_CHECKING:
-    from ._bicycle import Bicycle, BicycleMotion
+    from ._bicycle import Bicycle
+    from ._kinematics import BicycleMotion
 
 _ORDER = "rider, control, steering, drive, extra"
 

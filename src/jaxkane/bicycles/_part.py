@@ -12,7 +12,8 @@ from .._description.parameters import check_parameter, parameter_info
 from .._scalars.types import Component
 
 if TYPE_CHECKING:
-    from ._bicycle import Bicycle, BicycleMotion
+    from ._bicycle import Bicycle
+    from ._kinematics import BicycleMotion
 
 
 NAMES = ("coordinates", "speeds", "dependent_speeds", "dependent_coordinates", "inputs", "states")

@@ -10,9 +10,7 @@ from typing import NamedTuple
 from .._description.system import System
 from .._method.formulas import FUNCTIONS, Formulas
 from .._scalars.graph import needed
-from .._scalars.written import (
-    as_source,
-)
+from .._scalars.written import as_source
 from ._c_language import HELPERS, TYPES, C, array, as_comment, constant, folded, initial, without_end
 from ._c_test import COMPARE, trial
 from ._functions import chosen

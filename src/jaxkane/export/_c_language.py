@@ -8,18 +8,7 @@ from typing import Any
 import numpy as np
 
 from .._scalars.graph import LIBRARY
-from .._scalars.written import (
-    ARITHMETIC,
-    COMPARED,
-    COMPARISONS,
-    LOOSE,
-    SIGNED,
-    SUM,
-    TIGHT,
-    Form,
-    Language,
-    call,
-)
+from .._scalars.written import ARITHMETIC, COMPARED, COMPARISONS, LOOSE, SIGNED, SUM, TIGHT, Form, Language, call
 
 TYPES = {"float64": "double", "float32": "float", "bool": "int"}
 _IN_LIBRARY = {"abs": "fabs", "rem": "fmod", **{name: name for name in (*LIBRARY, "sqrt", "floor")}}
