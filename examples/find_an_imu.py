@@ -135,6 +135,16 @@ def ratio(fit, first, second):
     return a / b, float(slopes @ covariance[np.ix_([i, j], [i, j])] @ slopes) ** 0.5
 
 
+def check(alone):
+    """All three run off together, and far less is known of each than of the ratio."""
+    assert any(note.startswith("steer_damping and gain of steer_torque trade off") for note in alone.notes)
+    assert np.abs(alone.correlation).min() > 0.8
+    size = np.array([alone.estimates[name] for name in alone.names])
+    apart = alone.covariance / np.outer(size, size)
+    i, j = (alone.names.index(name) for name in ("steer_damping", "gain of steer_torque"))
+    assert apart[i, i] + apart[j, j] - 2 * apart[i, j] < 0.1 * min(apart[i, i], apart[j, j])
+
+
 def picture(fit, path):
     figure, axes = plt.subplot_mosaic([["bicycle", "steer"], ["bicycle", "imu.gx"]], figsize=(10, 4.5), layout="tight")
     draw_bicycle(axes["bicycle"], fit)
@@ -179,6 +189,7 @@ def main(folder):
     alone = motor_and_fork(recording)
     print(f"\nThe motor's gain and the fork's inertia too\n{alone}")
     value, error = ratio(alone, "steer_damping", "gain of steer_torque")
+    check(alone)
     print(f"\ndamping / gain: {value:.2f} with a standard deviation of {error:.2f} N m s/rad")
     picture(found, folder / "find_an_imu.png")
     print("picture:", folder / "find_an_imu.png")

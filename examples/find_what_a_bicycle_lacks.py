@@ -73,7 +73,7 @@ def main():
     first = fit_bicycle(rides, Bicycle.from_parameters(recording.parameters), "steer_damping", **options)
     speeds = np.array([ride.initial["speed"][0] for ride in rides])
     by_speed = [np.flatnonzero(speeds == v).tolist() for v in np.unique(speeds)]
-    found = suspects(first, CANDIDATES, depth=4, refits=3, plausible=PLAUSIBLE, folds=by_speed, progress=True)
+    found = suspects(first, CANDIDATES, depth=4, refits=1, plausible=PLAUSIBLE, folds=by_speed, progress=True)
     print(f"\n{found}\n\n{found.fit}\n")
     print(compare({"damping": first, "and what was found": found.fit}, plausible=PLAUSIBLE))
     page = save_report(found.fit, arguments.out / "find_what_a_bicycle_lacks.html", suspects=found)

@@ -49,6 +49,21 @@ FREE = {
 }
 
 
+def check(fits, left_out):
+    """What is said of these rides. No test fits them once more."""
+    first, four, five = (fits[what] for what in list(FREE)[:3])
+    assert first.status == four.status == "converged"
+    assert first.cost < 3920 < 20000 < first.history[0]
+    assert abs(first.estimates["steer_damping"] - 0.545) < 0.01
+    assert any("not noise" in note for note in first.notes)
+    assert four.cost < 2730
+    # What no fork can be is said, and what no such bicycle has.
+    assert any("Not a possible body" in note and "fork" in note for note in four.notes)
+    assert any(note.startswith("c went to 0.26 times") and "implausible" in note for note in four.notes)
+    assert any(note.startswith("IBxx went to") and "implausible" in note for note in five.notes)
+    assert left_out.score > 0.85
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("figures"), help="folder of the report (default: figures)")
@@ -62,6 +77,7 @@ def main():
         print(f"\n{what[0].upper()}{what[1:]}\n{fits[what]}")
     first = fits["the damping alone"]
     left_out = cross_validate(first)
+    check(fits, cross_validate(fits["gain, damping, IHzz and trail"]))
     likelihood = profile(first, "steer_damping")
     low, high = likelihood.interval
     print(f"\nThe damping, by its profile likelihood: {low:.3f} to {high:.3f} N m s/rad")

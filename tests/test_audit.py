@@ -32,6 +32,7 @@ def test_energy_balance_of_ten_seconds(name):
     assert audit.drift < RTOL
 
 
+@pytest.mark.slow
 def test_work_that_the_times_do_not_resolve_is_not_blamed_on_the_motion():
     # Exercise 5.1 comes to rest within a second: 100 times a second are too few for the damper's work.
     audit = jk.audit(*run("BarWithPiston", rtol=1e-10, atol=1e-10))
@@ -48,6 +49,7 @@ def test_inputs_do_work():
     assert audit.energy_balance < 1e-7
 
 
+@pytest.mark.slow
 def test_a_free_body_keeps_its_momenta():
     audit = jk.audit(*run("RigidBody", 2.0, 21))
     text = str(audit)

@@ -139,6 +139,7 @@ class Geared(jk.System):
         return jk.Motion(bodies, [1e-9 * u["a"] + u["b"]])
 
 
+@pytest.mark.slow
 def test_one_residual_is_conditioned_by_the_speeds_beside_it():
     """C_dep alone is (1 x 1) and has the condition number 1, whatever it is."""
     ride = jk.simulate(Geared(), jk.State(jnp.zeros(2), jnp.array([1e-9])), jnp.linspace(0.0, 0.1, 6))

@@ -184,6 +184,7 @@ def test_what_was_commanded_is_an_output():
     assert "applied_drive_torque" not in told
 
 
+@pytest.mark.slow
 def test_gains_are_those_of_the_feedback():
     """A - B K, 1e-12."""
     plain = straight(BENCHMARK, 3.0)

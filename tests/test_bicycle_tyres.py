@@ -43,7 +43,8 @@ def slow_eigenvalues(bicycle):
     return jax.vmap(one)(SPEEDS)
 
 
-@pytest.mark.parametrize("relaxation", [None, pytest.param(0.1, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("relaxation", [None, 0.1])
 def test_stiff_tyres_roll_ideally(relaxation):
     """1e-6 by extrapolation from 1e7 and 1e8 N/rad; the difference itself falls as one over the stiffness."""
     whipple = slow_eigenvalues(Bicycle.benchmark())

@@ -21,6 +21,7 @@ def test_without_parts_it_is_the_bicycle_of_the_catalogue():
     )
 
 
+@pytest.mark.slow
 def test_crowns_change_only_what_gravity_does_in_roll_and_steer():
     """K0 of the benchmark changes in roll by the normal loads times the crown radii, 94 kg * 0.02 m."""
     tyre = Tyre(crown=0.02)
@@ -53,6 +54,7 @@ class Seat(Part):
         return ()
 
 
+@pytest.mark.slow
 def test_riding_straight_takes_a_drive_against_drag_and_a_seat_that_gives_way():
     """1e-7, the smoothing of the drag at rest: density / 2 area v^2 rR, and weight over stiffness."""
     bicycle = Bicycle.benchmark().with_parts(drive=Drag(area=0.6), extra=[Seat()])

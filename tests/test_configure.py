@@ -126,6 +126,7 @@ def test_programs_of_simulations_are_kept_for_the_next_process(first, cache, pyt
     assert len(second) == 1  # and nothing else was printed
 
 
+@pytest.mark.slow
 def test_errors_are_errors_with_a_cache(cache, python):
     python(f"jk.configure(cache={str(cache)!r}, verbose=False)\n" + REFUSALS)
 

@@ -435,7 +435,8 @@ _BY_FORMULA = jax.jit(jax.vmap(slopes(lambda x, _: _formulas(*x), "forward"), in
 _number = lambda low, high: st.floats(low, high, allow_nan=False)  # noqa: E731
 
 
-@pytest.mark.parametrize("mode", [pytest.param("forward", marks=pytest.mark.slow), "reverse"])
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
 @settings(max_examples=8, deadline=None, derandomize=True)
 @given(_number(0.5, 1.5), _number(-1.0, 2.0), _number(5.0, 15.0))
 def test_members_of_a_batch_end_at_their_own_times(mode, h, v, g):

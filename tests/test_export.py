@@ -181,7 +181,7 @@ def test_c_gives_the_numbers_and_derivatives_of_the_library(name, tmp_path):
 
 
 @needs_compiler
-@pytest.mark.parametrize("dtype", ["float64", "float32"])
+@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
 def test_the_test_program_passes_and_finds_what_is_wrong(dtype, tmp_path):
     files = jk.export.c(Odd(), tmp_path / "odd.c", dtype=dtype)
 

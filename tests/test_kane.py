@@ -200,6 +200,7 @@ def test_float32_stays_float32():
     assert jax.grad(lambda u: jk.accelerations(bike, 0.0, q, u).sum())(u).dtype == jnp.float32
 
 
+@pytest.mark.slow
 def test_more_than_three_dependent_speeds_and_a_long_chain_use_lapack():
     """Systems that are not written out as scalars to the end: linear algebra goes to LAPACK, derivatives still work."""
 

@@ -107,6 +107,7 @@ def test_load_cells_in_a_joint():
         jk.outputs(broken, 0.0, [0.0, 0.0], [0.0, 0.0])
 
 
+@pytest.mark.slow
 def test_a_mounting_is_smooth_at_zero():
     def matrix(r):
         N, _ = jk.inertial()

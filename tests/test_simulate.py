@@ -45,6 +45,7 @@ def test_energy_and_front_contact_over_five_seconds():
     np.testing.assert_allclose(ride["yaw_rate"], ride.u_dep[:, 0])
 
 
+@pytest.mark.slow
 def test_steps_of_any_solver_agree():
     fine = jk.simulate(PENDULUM, START, TS, solver=diffrax.Dopri8(), rtol=1e-11, atol=1e-11)
     steps = jk.simulate(PENDULUM, START, TS, step=1e-3)
@@ -231,7 +232,7 @@ NAMES = {"auto": "ForwardMode", "both": "DirectAdjoint", "reverse": "RecursiveCh
     [
         ("auto", "forward"),
         pytest.param("both", "forward", marks=pytest.mark.slow),
-        ("reverse", "reverse"),
+        pytest.param("reverse", "reverse", marks=pytest.mark.slow),
         ("both", "reverse"),
     ],
 )

@@ -32,7 +32,7 @@ MODES = {
 
 
 WAYS = {"eig": lambda A: eig(A).values, "eigvals": eigvals}
-QUICK = {("eig", "forward over forward"), ("eig", "reverse over reverse"), ("eigvals", "forward over reverse")}
+QUICK = {("eig", "reverse over reverse"), ("eigvals", "forward over reverse")}
 
 
 @pytest.mark.parametrize(
@@ -53,6 +53,7 @@ def test_second_derivatives_have_closed_forms(way, mode):
             np.testing.assert_allclose(x, y, rtol=rtol, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_third_derivatives_and_vectors_against_differences():
     """Of a general matrix: a parameter moves all of it; vectors as LAPACK scales them."""
     rtol = 1e-7
@@ -185,6 +186,7 @@ def softest(length, damper=1.0):
     return critical_speeds(Pushed(length=length, damper=damper), jnp.linspace(-20.0, 5.0, 6), at)["mode 1"]
 
 
+@pytest.mark.slow
 def test_a_critical_value_that_is_not_there_has_no_derivative():
     """Hanging, a spring of -m g l makes it unstable; with a damper that drives it, nothing makes it stable."""
     both = jax.jit(jax.value_and_grad(softest))
@@ -192,6 +194,7 @@ def test_a_critical_value_that_is_not_there_has_no_derivative():
     assert np.isnan(both(0.5, -1.0)).all()
 
 
+@pytest.mark.slow
 def test_a_critical_value_among_those_given_and_one_beside_none():
     """Exactly at a given value the sign is that of rounding; beside a value without a motion nothing can be told."""
     hanging = jk.State(jnp.zeros(1), jnp.zeros(1))

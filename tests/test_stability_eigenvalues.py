@@ -103,6 +103,7 @@ def test_derivatives_of_eigenvalues_with_respect_to_all_parameters():
     agree(jax.jit(jax.jacrev(parts))(BIKE), differences(parts, 4e-4), rtol)
 
 
+@pytest.mark.slow
 def test_where_modes_coalesce_there_is_no_derivative():
     """Not a silent zero: NaN for the two that meet, numbers for the others, and words."""
 

@@ -108,6 +108,7 @@ def precession(g, nutation, spin):
     return (-b - jnp.sqrt(b**2 - 4 * a * c)) / (2 * a)
 
 
+@pytest.mark.slow
 def test_steady_precession_of_the_top_and_its_derivatives():
     rtol = 1e-11
 

@@ -77,6 +77,7 @@ class Rod(jk.System):
         return jk.weight(motion, -9.81 * motion.N.y)
 
 
+@pytest.mark.slow
 def test_a_member_without_mass_leaves_the_gradient_of_the_others():
     def ends(length, masses):
         start, ts = jk.State({"angle": 0.3}, {}), jnp.linspace(0.0, 0.5, 3)

@@ -158,6 +158,7 @@ def test_the_audit_knows_their_power(cart):
     assert np.abs(kept.energy_error).max() < 1e-6 * np.abs(kept.work).max()
 
 
+@pytest.mark.slow
 def test_a_lag_and_the_start_of_a_state_are_identified(cart):
     rng = np.random.default_rng(0)
     true = jk.simulate(Cart(lag=0.13, gain=1.2), START, ts, {"command": 5.0})
@@ -203,6 +204,7 @@ class Falling(jk.System):
         return {"ground": q["height"]}
 
 
+@pytest.mark.slow
 def test_an_event_ends_the_states_too():
     def end(height):
         ride = jk.simulate(Falling(), jk.State([height], [0.0], [0.0]), ts)
@@ -216,6 +218,7 @@ def test_an_event_ends_the_states_too():
     assert np.isnan(after)
 
 
+@pytest.mark.slow
 def test_starts_of_all_kinds(cart):
     assert jk.assemble(cart, {"place": 0.1}, x={"force": 2.0}).x.tolist() == [2.0, 0.0]
     assert jk.assemble(cart, {"place": 0.1}).x.tolist() == [0.0, 0.0]

@@ -43,6 +43,7 @@ def test_every_number_is_a_possible_body_and_back(moves, wheel):
         np.testing.assert_allclose(back(jnp.asarray(x)), x, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_intervals_and_their_inverse():
     free = (
         Free("IBxx", bounds=(5.0, 20.0)),

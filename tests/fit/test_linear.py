@@ -256,6 +256,7 @@ def evidence():
     return of
 
 
+@pytest.mark.slow
 def test_the_evidence_knows_priors_and_no_scales(evidence):
     prior = (1.0, 0.5)
     drift = Free("drift", prior=(0.0, 2.0))
@@ -332,6 +333,7 @@ class Doubled(Track):
         return {"double": 2.0 * q["x"]}
 
 
+@pytest.mark.slow
 def test_outputs_are_channels_of_their_own():
     x, push = 0.4 * t**2, {"push": np.sin(3.0 * t)}
     fixed = {"simulation": Simulation(step=0.1), "optimizer": LeastSquares(rtol=1e-14, damping=1e-7)}

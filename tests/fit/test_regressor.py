@@ -207,6 +207,7 @@ def test_dependent_speeds():
     assert named == pytest.approx(expected, abs=tolerance)
 
 
+@pytest.mark.slow
 def test_batches_derivatives_and_traces():
     tolerance = 1e-10
     truth, at = swings()
@@ -528,6 +529,7 @@ def test_bodies_that_can_be():
     jk.accelerations(guess.system, 0.0, exact.q[0], exact.u[0])  # which refuses bodies that cannot be
 
 
+@pytest.mark.slow
 def test_a_first_guess_may_start_with_a_centre_at_the_joint():
     """There the moment of inertia about the joint does not change with it, and elsewhere it does."""
     truth, at = swings()
@@ -569,6 +571,7 @@ class Lagging(Swing):
         return [(now["torque1"] - x["motor"]) / 0.1]
 
 
+@pytest.mark.slow
 def test_states_of_the_first_order_act_from_the_right_side():
     truth, _ = swings()
     system = Lagging(**{name: getattr(truth, name) for name in FREE if name[0] != "k"})

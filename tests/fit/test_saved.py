@@ -95,6 +95,7 @@ class Rewritten(Track):
         return (jk.Force(push, motion["cart"]), jk.Force(steady, motion["cart"]))
 
 
+@pytest.mark.slow
 def test_a_fit_of_changed_code_comes_back_only_where_its_cost_is_the_same(result, path):
     for kind in (Slow, Rewritten):
         kind.__name__ = "Track"
@@ -103,6 +104,7 @@ def test_a_fit_of_changed_code_comes_back_only_where_its_cost_is_the_same(result
         load(path, pose(Slow()))
 
 
+@pytest.mark.slow
 def test_a_fit_of_another_problem_is_refused(path):
     for other, message in (
         (pose(free=["gain"]), r"free parameters \(gain, drift there, gain here\)"),
@@ -152,6 +154,7 @@ def test_a_problem_before_a_fit_and_a_fit_after_it(result):
     np.testing.assert_allclose(seen.singular_values, result.singular_values, rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_options_of_the_optimizer_and_of_the_simulation_are_two(result):
     coarse = fit(Track(gain=3.0), TRIALS, FREE, unknown=("x",), optimizer=LeastSquares(rtol=0.5, damping=3.0))
     assert coarse.status == "converged"

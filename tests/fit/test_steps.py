@@ -52,6 +52,7 @@ def by_exact_motion(trial):
     return found.x, np.sqrt(np.diag(np.linalg.inv(found.jac.T @ found.jac)))
 
 
+@pytest.mark.slow
 def test_few_samples_a_period_have_no_bias(trial, by_exact_motion):
     best, errors = by_exact_motion
     found = fit(GUESS, trial, NAMES, optimizer=LeastSquares())
@@ -106,6 +107,7 @@ def test_more_fixed_steps_than_any_default_allows(trial):
     assert found.ok, found.message
 
 
+@pytest.mark.slow
 def test_the_evidence_by_quadrature(trial, by_exact_motion):
     (k, c), errors = by_exact_motion
     priors = {"stiffness": (395.0, 4.0), "damping": (2.0, 0.5)}
@@ -132,7 +134,9 @@ def beyond():
 
 
 @pytest.mark.parametrize(
-    "method", [LeastSquares(), GradientDescent(), pytest.param(BFGS(), marks=pytest.mark.slow)], ids=lambda m: m.name
+    "method",
+    [GradientDescent(), *(pytest.param(m, marks=pytest.mark.slow) for m in (LeastSquares(), BFGS()))],
+    ids=lambda m: m.name,
 )
 def test_no_method_converges_where_nothing_can_be_simulated(beyond, method):
     found = minimize(beyond, method)

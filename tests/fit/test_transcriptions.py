@@ -244,6 +244,7 @@ def test_the_delay_of_what_is_held():
     assert abs(found.estimates["delay of push"] - 0.033) < 3 * error < 0.01
 
 
+@pytest.mark.slow
 def test_tied_parameters_and_gains():
     trial = record(np.arange(0.0, 4.0, 0.05), 4)
     twice = Trial(trial.t, trial.measured, {"push": 0.5 * trial.inputs["push"]}, sigma=0.01)

@@ -152,6 +152,7 @@ def test_many_first_guesses(problem, result):
     assert "4 of 4 initial guesses end at the best" in str(found)
 
 
+@pytest.mark.slow
 def test_the_density_is_that_of_the_residuals(problem, result):
     density = log_density(problem, over="x")
     both, there = jax.jit(jax.value_and_grad(density)), result.point
@@ -257,6 +258,7 @@ def test_a_rate_against_its_coordinate_and_a_column_of_zeros(trials):
     assert doubled_trials(posed) == ["run 1 has the samples of run 1: what is measured once counts twice."]
 
 
+@pytest.mark.slow
 def test_what_runs_to_its_bound_is_told_so(trials):
     bounds = (Free("damping", start=1.0, bounds=(0.8, None)), "stiffness")  # it is 0.4
     found = minimize(Problem.of(GUESS, trials, bounds, **UNKNOWN), LeastSquares())
@@ -270,6 +272,7 @@ def test_what_runs_to_its_bound_is_told_so(trials):
     assert "bound" in report(found)
 
 
+@pytest.mark.slow
 def test_what_trades_off_is_told_in_units(trials):
     # Without a push only the ratios of mass, stiffness and damping show.
     quiet = [Trial(t.t, t.measured, sigma=0.01, name=t.name) for t in trials]
