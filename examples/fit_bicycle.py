@@ -81,7 +81,11 @@ def fit_simulated():
     print("Three rides, four parameters that start 20 % off. Compiling takes a while the first time.")
     result = fit_bicycle(rides, first_guess, tuple(OFF), window=2.5, steps=60, progress=True)
     print(f"\n{result}\n\n{result.table(truth)}")
-    return result, {name: float(getattr(truth, name)) for name in OFF}
+    known = {name: float(getattr(truth, name)) for name in OFF}
+    assert result.ok, result.message
+    for name, value in known.items():  # within 2 %, and three standard errors
+        assert abs(result.estimates[name] - value) < min(0.02 * abs(value), 3.0 * result.standard_errors[name]), name
+    return result, known
 
 
 def draw(result, truth, path):

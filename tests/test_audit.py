@@ -43,6 +43,7 @@ def test_work_that_the_times_do_not_resolve_is_not_blamed_on_the_motion():
     assert jk.audit(*run("BarWithPiston", end=2.5, rtol=1e-10, atol=1e-10)).energy_balance < RTOL
 
 
+@pytest.mark.slow
 def test_inputs_do_work():
     audit = jk.audit(*run("DoublePendulum", 2.0, 401, {"shoulder_torque": lambda t, s: jnp.sin(t) - s["theta1_dot"]}))
     assert np.abs(audit.work).max() > 0.1

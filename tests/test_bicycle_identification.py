@@ -82,9 +82,9 @@ def errors(found):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", range(3))
-def test_a_leaning_rider_and_the_relaxation_length_are_found(seed):
+def test_a_leaning_rider_and_the_relaxation_length_are_found():
     """Inside three standard errors of the truth; of 20 seeds 18 at least were."""
-    found = identified(seed)
-    assert all(abs(error) < 3.0 for error in errors(found).values()), errors(found)
-    assert all(found.standard_errors[name] < 0.1 * found.estimates[name] for name in PLACES)
+    for seed in range(3):  # by one program
+        found = identified(seed)
+        assert all(abs(error) < 3.0 for error in errors(found).values()), errors(found)
+        assert all(found.standard_errors[name] < 0.1 * found.estimates[name] for name in PLACES)

@@ -117,7 +117,9 @@ def assembled(model):
     return bicycle.with_parts(**tyres)
 
 
-@pytest.mark.parametrize("model", SYMBRIM["models"])
+@pytest.mark.parametrize(
+    "model", [pytest.param(name, marks=[pytest.mark.slow] if name == "arms" else []) for name in SYMBRIM["models"]]
+)
 def test_accelerations_are_those_of_symbrim(model):
     """1e-11 asked."""
     bicycle = assembled(model)

@@ -131,6 +131,7 @@ print("alive")
 """
 
 
+@pytest.mark.slow
 def test_the_process_stays_alive():
     run = subprocess.run([sys.executable, "-c", CRASHES], capture_output=True, text=True, timeout=300, check=False)
     assert run.stdout.strip() == "alive", run.stderr[-2000:]

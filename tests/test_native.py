@@ -54,7 +54,10 @@ OPERATIONS = dict(
 }  # fmt: skip
 
 
-@pytest.fixture(scope="module", params=[jnp.float64, jnp.float32], ids=["float64", "float32"])
+SINGLE = pytest.param(jnp.float32, marks=pytest.mark.slow)
+
+
+@pytest.fixture(scope="module", params=[jnp.float64, SINGLE], ids=["float64", "float32"])
 def plainly(request):
     """Rows, and every operation of each by plain JAX."""
     x = jnp.asarray(np.random.default_rng(0).normal(size=(LARGEST, 3)), request.param)

@@ -300,6 +300,7 @@ def test_gradients_of_the_bicycle():
     np.testing.assert_allclose(f(x)[1], numeric, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_float32_and_what_follows_from_it():
     pendulum = jax.tree.map(lambda x: x.astype(jnp.float32), PENDULUM)
     start = jax.tree.map(lambda x: x.astype(jnp.float32), START)

@@ -133,6 +133,7 @@ def test_inertia_about_another_point():
         jk.mass_matrix(AboutWhatSlides(wrong=True), 0.0, *at)
 
 
+@pytest.mark.slow
 def test_degrees_go_by_the_units_that_were_declared():
     class Cart(jk.System):
         coordinates, speeds, inputs = ("q0", "q1"), ("u0", "u1"), ("push",)

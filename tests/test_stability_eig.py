@@ -107,7 +107,7 @@ def test_what_is_no_number_stays_with_its_matrix():
     assert np.isnan(found[1:3]).all()
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 7])
+@pytest.mark.parametrize("n", [pytest.param(1, marks=pytest.mark.slow), 2, pytest.param(3, marks=pytest.mark.slow), 7])
 def test_a_batch_is_what_its_members_are(n):
     """Whether by QR or by LAPACK, with one leading axis or two, in single precision too."""
     A = np.random.default_rng(n).standard_normal((2, CHUNK + 4, n, n))

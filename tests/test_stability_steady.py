@@ -208,6 +208,7 @@ def beside_capsize():
     return steady_turn(BIKE, {"steer": 0.01}, {"rear_wheel_rate": -20.08}, hold={"roll": 0.05})
 
 
+@pytest.mark.slow
 def test_handlebar_forward_from_capsize_to_rest(beside_capsize):
     """From the capsize speed, over a largest lean, to rest with the frame upright and the wheel turned by 76.76 deg."""
     atol = 1e-11

@@ -1,6 +1,8 @@
-"""Bicycles: four parameters of a simulated one, the damping of a measured one."""
+"""Bicycles: three parameters of an unstable one, the damping of a measured one.
 
-import equinox as eqx
+Four parameters of a simulated one: `examples/fit_bicycle.py`, which asserts that they are found.
+"""
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -20,37 +22,11 @@ from jaxkane.fit import (
 )
 
 SIGMA = {"roll": 0.005, "steer": 0.005, "roll_rate": 0.03, "steer_rate": 0.05}
-OFF = {"IBxx": 1.2, "zB": 0.8, "c": 1.2, "IFyy": 0.8}
 
 
 def waves(rng, t, size, frequencies):
     phases = rng.uniform(0.0, 2.0 * np.pi, len(frequencies))
     return size * sum(np.sin(2.0 * np.pi * f * t + p) for f, p in zip(frequencies, phases, strict=True))
-
-
-@pytest.mark.slow
-def test_four_parameters_of_a_simulated_bicycle():
-    within = 0.02
-    truth, rng, rides = WhippleBicycle.benchmark(), np.random.default_rng(1), []
-    t = np.linspace(0.0, 5.0, 501)
-    for speed in (4.4, 5.2, 6.0):
-        inputs = {
-            "steer_torque": waves(rng, t, 1.0, (0.4, 0.9, 1.7, 2.9)),
-            "roll_torque": waves(rng, t, 12.0, (0.3, 0.7, 1.3)),
-        }
-        start = jk.assemble(truth, {"roll": 0.02}, {"rear_wheel_rate": -speed / truth.rR, "roll_rate": 0.1})
-        ride = jk.simulate(truth, start, t, inputs)
-        measured = {name: np.asarray(ride[name]) + rng.normal(0.0, s, t.size) for name, s in SIGMA.items()}
-        rides.append(Trial(t, measured, inputs, sigma=SIGMA, initial={"speed": speed}, name=f"{speed} m/s"))
-    guess = truth
-    for name, factor in OFF.items():
-        guess = eqx.tree_at(lambda b, name=name: getattr(b, name), guess, factor * getattr(truth, name))
-    result = fit_bicycle(rides, guess, tuple(OFF), window=2.5, steps=100)
-    assert result.ok, result.message
-    for name in OFF:
-        error = result.estimates[name] - float(getattr(truth, name))
-        assert abs(error) < within * abs(float(getattr(truth, name))), name
-        assert abs(error) < 3.0 * result.standard_errors[name], name
 
 
 @pytest.fixture(scope="module")

@@ -182,6 +182,7 @@ def test_the_matrix_does_not_depend_on_what_is_to_be_found(kernels):
     assert guessed.units[-1] == "N m s/rad"
 
 
+@pytest.mark.slow
 def test_weights_that_are_written_by_hand_are_found_or_refused():
     _truth, at = swings()
     i = (0.0, at.q[3], at.u[3], at.u_dot[3])
@@ -401,6 +402,7 @@ def test_deviations_cover_the_truth():
         assert np.all(np.abs(np.mean(z, axis=0)) < 0.7)
 
 
+@pytest.mark.slow
 def test_what_data_do_not_tell_is_named_and_stays():
     """The second arm hangs still: its inertia is told by nothing."""
     truth, at = swings()
