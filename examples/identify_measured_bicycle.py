@@ -21,8 +21,6 @@ Takes:    a minute or two, half of it compilation.
 import argparse
 from pathlib import Path
 
-import jax
-
 import jaxkane as jk
 from jaxkane.catalog import WhippleBicycle
 from jaxkane.fit import (
@@ -34,8 +32,6 @@ from jaxkane.fit import (
     profile,
     save_report,
 )
-
-jax.config.update("jax_enable_x64", True)
 
 FREE = {
     "the damping alone": ("steer_damping",),
@@ -68,6 +64,7 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("figures"), help="folder of the report (default: figures)")
     arguments = parser.parse_args()
+    jk.configure()
     recording = jk.data.steer_by_wire()
     rides, bicycle = recording.trials, WhippleBicycle.from_parameters(recording.parameters)
     biases, hold = ("roll_torque", "steer_torque"), ("steer_torque",)  # a command, kept until the next
