@@ -132,7 +132,7 @@ def test_the_program_of_a_motion_without_events_is_small():
     moving, fixed = eqx.partition(arguments, eqx.is_array)
     solve = ride.solve.__wrapped__
     program = jax.make_jaxpr(lambda x: eqx.filter(solve(*eqx.combine(x, fixed)), eqx.is_array))(moving)
-    assert equations(program.jaxpr) <= 1700
+    assert equations(program.jaxpr) <= 1380
 
 
 # A record is the function that it was made from.

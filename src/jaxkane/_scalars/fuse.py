@@ -39,7 +39,7 @@ from .jax_internals import (
 )
 from .native import Scalars
 from .pieces import in_pieces, replaced
-from .repetition import PROGRAM, foreign, is_plain, without_repetition
+from .repetition import PROGRAM, foreign, is_plain, reads_of, without_repetition
 from .versions import naming_what_is_kept, on_forget, settling, version_of
 
 _MOST_LANES = 128  # in XLA's hands: with more, intermediates no longer stay in the cache
@@ -149,6 +149,7 @@ class _Program:
         self.evaluate = jaxpr_as_fun(self.program)
         self.in_avals, self.out_avals = self.program.in_avals, self.program.out_avals
         self.is_plain = is_plain(self.program.jaxpr)
+        self.reads = reads_of(self.program.jaxpr)
         # A memory for each instance, since a cached method would keep the instance itself alive.
         self.tangent = functools.cache(self._tangent)
         self.transposed = functools.cache(self._transposed)
@@ -239,9 +240,12 @@ class _Program:
 
     def groups(self, where: Where) -> tuple[tuple[int, ...], ...]:
         """The arguments as a native kernel takes them: steady numbers that all lanes share are one array, since each
-        argument takes XLA as long as some forty operations of a kernel, and a loop makes the array once."""
+        argument takes XLA as long as some forty operations of a kernel, and a loop makes the array once. What is not
+        read is not passed, so that XLA need not compute it either."""
         groups: dict[Any, list[int]] = {}
         for i, (aval, has) in enumerate(zip(_specs(self.in_avals), where, strict=True)):
+            if not self.reads[i]:
+                continue
             together = i in self.steady and aval.shape == () and not any(has)
             groups.setdefault(aval.dtype if together else i, []).append(i)
         return tuple(map(tuple, groups.values()))

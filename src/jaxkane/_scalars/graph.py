@@ -86,11 +86,11 @@ class Graph:
         return float.fromhex(node.operands[0]) if node.dtype != "bool" else node.operands[0]
 
     def reading_groups(self, groups: Sequence[Sequence[int]]) -> Graph:
-        """The same, of arguments in groups: several numbers are one array."""
+        """The same, of arguments in groups: several numbers are one array. What is in no group is not read."""
         place = {i: (g, e, len(group)) for g, group in enumerate(groups) for e, i in enumerate(group)}
         graph = Graph()
         for node in self.nodes:
-            if node.operation == "input":
+            if node.operation == "input" and node.operands[0] in place:
                 argument, element, size = node.operands
                 g, e, n = place[argument]
                 node = node._replace(operands=(g, e + element, n * size))

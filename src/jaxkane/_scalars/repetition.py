@@ -112,6 +112,14 @@ def opened(equation: Any) -> ClosedJaxpr | None:
     return equation.params["jaxpr"] if equation.primitive.name in CALLS else None
 
 
+def reads_of(program: Jaxpr) -> tuple[bool, ...]:
+    """Which of its inputs a program reads at all; the first, if it reads none."""
+    read = {v for e in program.eqns for v in e.invars if not isinstance(v, Literal)}
+    read.update(v for v in program.outvars if not isinstance(v, Literal))
+    found = tuple(v in read for v in program.invars)
+    return found if any(found) else (True, *found[1:])
+
+
 def is_plain(program: Jaxpr) -> bool:
     """Whether a program can be one compiled function."""
     return not any(foreign(program))

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from .._description.system import State, System, unpacked
@@ -128,5 +129,5 @@ def at_zero(
 
     first = (t, y)
     start = (first, jnp.zeros_like(t), jnp.array(True))
-    ((t, y), _, smooth), _ = jax.lax.scan(stage, start, jnp.arange(3))
+    ((t, y), _, smooth), _ = jax.lax.scan(stage, start, np.arange(3))  # pyright: ignore[reportArgumentType]
     return End(t, y, smooth)

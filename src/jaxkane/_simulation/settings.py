@@ -9,6 +9,7 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -17,6 +18,9 @@ from jaxtyping import Array
 from .._description.system import State, System
 from .._method.values import by_names, refuse_incomplete
 from .signals import real_array, samples_of
+
+SCALARS_UP_TO = 64
+"""Beyond so many numbers an array is none for a program of scalars."""
 
 ADJOINTS = {
     "auto": diffrax.RecursiveCheckpointAdjoint,
@@ -41,6 +45,7 @@ class Settings(eqx.Module):
     progress: bool = eqx.field(static=True)
     project: bool = eqx.field(static=True)
     stabilize: float = eqx.field(static=True)
+    rising: bool = eqx.field(static=True, default=False)  # the times are known to rise
 
 
 def settings_for(
@@ -55,8 +60,10 @@ def settings_for(
     adjoint: str | diffrax.AbstractAdjoint = "auto",
     max_steps: int | None = 16384,
     progress: bool = False,
+    rising: bool = False,
 ) -> Settings:
-    """The options of `simulate`, with defaults that follow the type of the times."""
+    """The options of `simulate`, with defaults that follow the type of the times; `rising`: whether these are known to
+    rise, as they do where `checked_times` saw their values."""
     default = 1e-8 if ts.dtype == jnp.float64 else 1e-5
     if isinstance(adjoint, str) and adjoint not in ADJOINTS:
         raise ValueError(f"adjoint is one of {', '.join(ADJOINTS)}, or a diffrax adjoint; got {adjoint!r}.")
@@ -81,6 +88,7 @@ def settings_for(
         progress=progress,
         project=project,
         stabilize=float(stabilize),
+        rising=rising,
     )
 
 
@@ -100,8 +108,12 @@ def refuse_held(solver: Any, signals: Any) -> None:
 def of_any_accuracy(settings: Settings, dtype: Any) -> Settings:
     """The same, whose tolerances and step are arguments of a program, and no part of it."""
     numbers = {name: getattr(settings, name) for name in ("rtol", "atol", "step")}
-    arrays = {name: x if x is None else jnp.asarray(x, dtype) for name, x in numbers.items()}
-    return dataclasses.replace(settings, **arrays)
+
+    def array(x: Any) -> Any:
+        # A number goes by way of NumPy, which compiles nothing for it.
+        return x.astype(dtype) if isinstance(x, jax.Array) else jax.device_put(np.asarray(x, dtype))
+
+    return dataclasses.replace(settings, **{name: x if x is None else array(x) for name, x in numbers.items()})
 
 
 def _check_number(label: str, value: Any, fits: Callable[[float], bool], what: str) -> None:

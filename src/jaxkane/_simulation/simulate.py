@@ -85,6 +85,7 @@ def simulate(
         adjoint=adjoint,
         max_steps=max_steps,
         progress=progress,
+        rising=not isinstance(ts, Tracer),
     )
     given = (system, state, ts, with_one_times(signals))
     if adjoint == "auto" and goes_forward(given):

@@ -26,14 +26,27 @@ class Quantities(NamedTuple):
 
 
 class Limits(eqx.Module):
-    """What ends a motion: the `directions` in which quantities count (see `first_crossing`); `resolution` [s]: how far
-    behind a crossing the last step may end; `rounding` [s]: what is no time; `shortest` [s]: a step that is not halved
-    at the bound."""
+    """What ends a motion: its `end` [s], and quantities in these `directions` (see `first_crossing`).
+
+    `numbers` (3,) [s]: how far behind a crossing the last step may end (`resolution`); what is no time (`rounding`);
+    and a step that is not halved at the bound (`shortest`).
+    """
 
     directions: tuple[int, ...] = eqx.field(static=True)
-    resolution: Array
-    rounding: Array
-    shortest: Array
+    end: Array
+    numbers: Array
+
+    @property
+    def resolution(self) -> Array:
+        return self.numbers[0]
+
+    @property
+    def rounding(self) -> Array:
+        return self.numbers[1]
+
+    @property
+    def shortest(self) -> Array:
+        return self.numbers[2]
 
 
 class Stopping(NamedTuple):
@@ -42,14 +55,15 @@ class Stopping(NamedTuple):
     -infinity; and the end of the first step over the bound, else infinity."""
 
     inner: Any
-    start: Quantities
+    start: Quantities | None
     which: Array
     until: Array
     last: Array
 
 
 class ToStops(diffrax.AbstractStepSizeController[Any, Any]):
-    """A controller whose last step ends where a quantity vanishes.
+    """A controller that begins with a given step, and whose last step ends at the last time, or where a quantity
+    vanishes. The solution then ends as one with an event.
 
     The motion is watched through the cubic between both ends of a step: their values and rates. Where that passes zero
     the step is taken back, and made anew to just beyond that time; so long, until the step that ends there is one that
@@ -61,100 +75,127 @@ class ToStops(diffrax.AbstractStepSizeController[Any, Any]):
     A step over the bound is halved; where it is as short as the shortest, the motion ends before it. It also ends where
     the first step over the bound did, if shorter ones do not pass it: so near to it, what is found is by chance.
 
-    `watch`: (t, y, args) -> `Quantities`.
+    `watch`: (t, y, args) -> `Quantities`; None where there are none.
     """
 
     controller: diffrax.AbstractStepSizeController[Any, Any]
-    watch: Callable[..., Quantities]
+    watch: Callable[..., Quantities] | None
+    first: Array
     limits: Limits
 
     def wrap(self, direction: Any) -> ToStops:
         return eqx.tree_at(lambda c: c.controller, self, self.controller.wrap(direction))
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):  # type: ignore[override]
-        end, inner = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        end, inner = self.controller.init(terms, t0, t1, y0, self.first, args, func, error_order)
         start = self._watched(t0, y0, args)
-        # What would have vanished within a rounding error of the start is on zero there.
-        on_zero = jnp.abs(start.values) <= jnp.abs(start.rates) * self.limits.rounding
-        start = start._replace(values=jnp.where(on_zero, jnp.zeros_like(start.values), start.values))
+        if start is not None:
+            start = _begun(self.limits, start)
         return end, Stopping(inner, start, *(jnp.full_like(t0, x) for x in (-1.0, -jnp.inf, jnp.inf)))
 
     def adapt_step_size(self, t0: Any, t1: Any, y0, y1_candidate, args, y_error, error_order, controller_state):  # type: ignore[override]
         state: Stopping = controller_state
-        keep, next_t0, next_t1, jumped, inner, result = self.controller.adapt_step_size(
+        following: Any = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, state.inner
         )
-        # What is left of a step that was taken back is gone at once: a fixed step stays on its grid.
-        going_on = keep & (t1 < state.until)
-        next_t1 = jnp.where(going_on, state.until, next_t1)
-        inner = _where(going_on, state.inner, inner)
-
-        still = jax.lax.stop_gradient((t0, t1))
+        keep, next_t0, next_t1, jumped, inner, result = following
         now = self._watched(t1, y1_candidate, args)
-        found = _decision(self.limits, state.start, now, *still, state.which, state.last, keep)
-        state = Stopping(
-            inner=_where(found.taken_back, state.inner, inner),
-            start=found.start,
-            which=found.which,
-            until=jnp.where(found.again & ~found.over, jnp.maximum(state.until, t1), state.until),
-            last=found.last,
-        )
+        step = Step(t0, t1, next_t0, next_t1, jnp.asarray(keep))
+        found = _decision(self.limits, state._replace(inner=None), now, step)
+        state = found.state._replace(inner=_where(found.unchanged, state.inner, inner))
         result = diffrax.RESULTS.where(found.again, diffrax.RESULTS.successful, result)
         result = diffrax.RESULTS.where(found.ends, diffrax.RESULTS.event_occurred, result)
         result = diffrax.RESULTS.where(found.lost, diffrax.RESULTS.dt_min_reached, result)
-        next_t0 = jnp.where(found.taken_back, t0, next_t0)
-        next_t1 = jnp.where(found.again, found.end, next_t1)
-        return keep & ~found.taken_back, next_t0, next_t1, jumped, state, result
+        return found.keep, found.next_t0, found.next_t1, jumped, state, result
 
-    def _watched(self, t: Any, y: Any, args: Any) -> Quantities:
+    def _watched(self, t: Any, y: Any, args: Any) -> Quantities | None:
         # Where steps end has no derivative, and compiling one would take its time.
         still = lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x  # noqa: E731
-        return self.watch(*jax.tree.map(still, (t, y, args)))
+        return None if self.watch is None else self.watch(*jax.tree.map(still, (t, y, args)))
+
+
+class Step(NamedTuple):
+    """A step from `t0` to `t1`, and what the inner controller makes of it: the next step, and whether this is kept."""
+
+    t0: Array
+    t1: Array
+    next_t0: Array
+    next_t1: Array
+    keep: Array
 
 
 class _Decision(NamedTuple):
-    """What becomes of a step: whether it is made `again`, to `end`; is `over` the bound; `ends` the motion; is `lost`,
-    since a quantity is no number behind it; is `taken_back`, for one of these. And the state of the controller that
-    follows, as `Stopping` has it."""
+    """What becomes of a step: whether it is kept; the next one; whether it is made `again`; `ends` the motion; is
+    `lost`, since a quantity is no number behind it; whether the inner controller's state is `unchanged`; and the state
+    that follows."""
 
+    keep: Array
+    next_t0: Array
+    next_t1: Array
     again: Array
-    over: Array
     ends: Array
     lost: Array
-    taken_back: Array
-    end: Array
-    start: Quantities
-    which: Array
-    last: Array
+    unchanged: Array
+    state: Stopping
 
 
 @fused
-def _decision(limits: Limits, start: Quantities, now: Quantities, t0, t1, which, last, kept) -> _Decision:
-    # One function of scalars: as sixty operations it would be as many programs, and a third of XLA's work.
-    h = t1 - t0
+def _begun(limits: Limits, start: Quantities) -> Quantities:
+    # What would have vanished within a rounding error of the start is on zero there.
+    on_zero = jnp.abs(start.values) <= jnp.abs(start.rates) * limits.rounding
+    return start._replace(values=jnp.where(on_zero, jnp.zeros_like(start.values), start.values))
+
+
+@fused
+def _decision(limits: Limits, state: Stopping, now: Quantities | None, step: Step) -> _Decision:
+    # One function of scalars: as a hundred operations it would be as many programs, and half of XLA's work.
+    # What is left of a step that was taken back is gone at once: a fixed step stays on its grid.
+    going_on = step.keep & (step.t1 < state.until)
+    step = step._replace(next_t1=jnp.where(going_on, state.until, step.next_t1))
+    none = jnp.zeros_like(step.keep)
+    found = _Decision(step.keep, step.next_t0, step.next_t1, none, none, none, going_on, state)
+    if now is not None:
+        found = _watching(limits, state, now, step, going_on)
+    # As diffrax does it, a last step is none of a rounding error, and one that was not kept is halved.
+    near = found.next_t1 > limits.end - 100 * jnp.finfo(limits.end.dtype).eps * jnp.abs(limits.end)
+    last = jnp.where(found.keep, limits.end, found.next_t0 + 0.5 * (limits.end - found.next_t0))
+    arrived = found.keep & (found.next_t0 >= limits.end)
+    return found._replace(next_t1=jnp.where(near, last, found.next_t1), ends=found.ends | arrived)
+
+
+def _watching(limits: Limits, state: Stopping, now: Quantities, step: Step, going_on: Array) -> _Decision:
+    start: Any = state.start
+    t0, t1 = jax.lax.stop_gradient((step.t0, step.t1))
+    h, kept = t1 - t0, step.keep
     unknown = kept & functools.reduce(operator.or_, [x != x for x in now.values], jnp.array(False))
     lost = unknown & (h <= limits.resolution)
     kept &= ~unknown
     first, x = _first(limits, start, now, h)
     crossed = kept & (x <= 1)
     over = kept & (start.bound * now.bound < 0)
-    at_bound = (over & (h <= limits.shortest)) | (kept & ~over & (t1 >= last))
+    at_bound = (over & (h <= limits.shortest)) | (kept & ~over & (t1 >= state.last))
     at_start = crossed & (x == 0) & ~over
     there = crossed & ((1 - x) * h <= limits.resolution) & ~over & ~at_start & ~at_bound
     at_start &= ~at_bound
     again = ((crossed | over) & ~there & ~at_start & ~at_bound) | (unknown & ~lost)
     beyond = jnp.where(over | unknown, 0.5 * h, jnp.minimum(x, 1.0) * h + 0.5 * limits.resolution)
     taken_back = again | at_start | at_bound | lost
+    which = jnp.where(there | at_start, first, jnp.where(at_bound, float(len(limits.directions)), state.which))
     return _Decision(
+        keep=step.keep & ~taken_back,
+        next_t0=jnp.where(taken_back, step.t0, step.next_t0),
+        next_t1=jnp.where(again, t0 + beyond, step.next_t1),
         again=again,
-        over=over,
         ends=there | at_start | at_bound,
         lost=lost,
-        taken_back=taken_back,
-        end=t0 + beyond,
-        start=_where(kept & ~taken_back, now, start),
-        which=jnp.where(there | at_start, first, jnp.where(at_bound, float(len(limits.directions)), which)),
-        last=jnp.where(over, jnp.minimum(last, t1), last),
+        unchanged=going_on | taken_back,
+        state=Stopping(
+            inner=None,
+            start=_where(kept & ~taken_back, now, start),
+            which=which,
+            until=jnp.where(again & ~over, jnp.maximum(state.until, t1), state.until),
+            last=jnp.where(over, jnp.minimum(state.last, t1), state.last),
+        ),
     )
 
 

@@ -87,7 +87,7 @@ def sweep(
     if isinstance(state, State) and isinstance(system, System):
         state = as_state(system, state)
     ts = checked_times(ts, getattr(state.q, "dtype", float) if isinstance(state, State) else float)
-    settings = settings_for(ts, progress=False, **options)
+    settings = settings_for(ts, progress=False, rising=is_concrete(ts), **options)
     members, shared, n = members_of(system, state, inputs, table, ts)
     found = table if table is not None else Table({}, ("member",), (n,))
     job = Job(shared, ts, settings, reduce, None if client is not None else mesh_of(devices))
