@@ -95,7 +95,7 @@ class Unreal(Sailing):
 
 
 def test_where_nothing_is_finite_nothing_is_called_cyclic():
-    with pytest.raises(ValueError, match="Unreal: which coordinates are cyclic cannot be told"):
+    with pytest.raises(ValueError, match="Unreal: which coordinates are cyclic cannot be found"):
         cyclic_coordinates(Unreal())
 
 

@@ -81,7 +81,7 @@ def encoder(
 def marker(point: Point | Body, origin: Point, frame: Frame) -> Named:
     """Where a point is, as a tracking system reports it: "x", "y", "z" [m].
 
-    **Arguments:** `origin`, `frame`: of the tracking system, from which and along whose axes the place is told.
+    **Arguments:** `origin`, `frame`: of the tracking system, from which and along whose axes the place is measured.
     """
     return _along(_point(point).position_from(origin), frame)
 

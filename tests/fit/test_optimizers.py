@@ -23,7 +23,7 @@ from jaxkane.fit import (
     multi_start,
     save_report,
 )
-from jaxkane.fit._optimize.steps import moved, settled
+from jaxkane.fit._optimize.steps import moved, refined
 from jaxkane.fit._problem.blocks import eliminate
 from jaxkane.fit._problem.linearization import linearize
 
@@ -124,8 +124,8 @@ def test_a_trial_in_which_a_step_leads_too_far_holds_up_no_other():
     before = linearize(problem, begun)
     whole = linearize(problem, moved(begun, jnp.zeros(1), eliminate(before.blocks, 0.0)))
     assert whole.costs[0] < 1e-2 * before.costs[0] < before.costs[1] < whole.costs[1]
-    point, at = settled(problem, begun, before, steps=1, rtol=1e-2)
+    point, at = refined(problem, begun, before, steps=1, rtol=1e-2)
     assert at.costs == pytest.approx([whole.costs[0], before.costs[1]])
-    point, at = settled(problem, begun, before, steps=20, rtol=1e-12)
+    point, at = refined(problem, begun, before, steps=20, rtol=1e-12)
     assert at.cost < 1e-6 * before.cost
     assert linearize(problem, point).cost == pytest.approx(at.cost, abs=1e-12)

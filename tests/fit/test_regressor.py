@@ -1,4 +1,5 @@
-"""The equations of motion as a matrix times bodies' parameters, which sums of these can be told, and a first guess."""
+"""The equations of motion as a matrix times bodies' parameters, which sums of these motions determine, and a first
+guess."""
 
 import dataclasses
 import functools
@@ -285,7 +286,7 @@ def test_single_precision():
     np.testing.assert_allclose(found.matrix, exact.matrix, rtol=1e-4, atol=1e-4)
 
 
-# ---- what can be told
+# ---- what motions determine
 
 
 def test_double_pendulum_as_in_textbooks():
@@ -297,7 +298,7 @@ def test_double_pendulum_as_in_textbooks():
     assert not found.ratios_only
     assert found.count == 6
     assert "link1.m" in found.without_influence
-    assert "of 20 parameters 6 sums can be told" in str(found)
+    assert "of 20 parameters 6 sums can be determined" in str(found)
     _truth, _ = swings()
     np.testing.assert_allclose(found.of(found.values)[0], 4e-4 + 0.1 * 0.11**2 + 0.14 * 0.172719204**2)
 
@@ -414,7 +415,7 @@ def test_what_data_do_not_tell_is_named_and_stays():
     torque = {"torque1": rng.normal(0.0, 0.3, len(at))}
     still = Instants(at.t, q, u, u_dot, torque)
     found = base_parameters(truth, still, bodies=ARMS, parameters=FRICTION, sigma={"rate1": 0.01, "rate2": 0.01})
-    assert "not told by these data" in str(found)
+    assert "not determined by these data" in str(found)
     assert any("link2.Izz" in text for text in found.undetermined)
     assert found.estimates[list(found.texts).index("link2.Izz")] == pytest.approx(2e-3 + 0.1 * 0.15**2)
     assert np.isinf(found.deviations[list(found.texts).index("link2.Izz")])

@@ -216,7 +216,7 @@ def test_what_data_cannot_tell_is_said(rubbing):
     )
     verdicts = {row.name: row.verdict for row in found.rows}
     assert verdicts["unused"] == "unused is not seen by these data"
-    assert verdicts["offset of torque"] == "offset of torque cannot be told from what is free"
+    assert verdicts["offset of torque"] == "offset of torque cannot be distinguished from what is free"
     assert "unused" in str(found)
     assert np.isnan(next(row for row in found.rows if row.name == "unused").errors["unused"])
 

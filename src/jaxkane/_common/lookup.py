@@ -1,4 +1,4 @@
-"""Names that are looked up, and what to say where one is not there. Knows words, and nothing of mechanics."""
+"""Looking up names, and the errors for names that are missing. Knows nothing of mechanics."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-_LISTED = 12  # more names than this are not read by anybody
+_LISTED = 12  # names in a message, at most
 
 
 def hint(wrong: str | Iterable[str], known: Iterable[str], have: str = "there are") -> str:
@@ -34,7 +34,7 @@ def refuse_unknown(given: Iterable[str], known: Iterable[str], message: str, hav
 
 
 def not_there(name: Any, known: Iterable[str], where: str) -> KeyError:
-    """The error for a name that is looked up in vain; `where` as in "this trajectory"."""
+    """The error for a name that is not found; `where` as in "this trajectory"."""
     return KeyError(f"There is no {name!r} in {where}; {hint(str(name), known)}")
 
 

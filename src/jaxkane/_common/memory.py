@@ -1,4 +1,4 @@
-"""A memory that does not grow without end. Knows Python."""
+"""A memory of limited size. Knows Python."""
 
 from __future__ import annotations
 

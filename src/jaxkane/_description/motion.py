@@ -39,7 +39,7 @@ _moments = itertools.count()
 
 
 def now() -> int:
-    """A number that is larger each time, by which a motion is told from one that was made before."""
+    """A number that is larger each time, which distinguishes a motion from one that was made before."""
     return next(_moments)
 
 

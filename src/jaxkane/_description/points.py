@@ -1,6 +1,6 @@
 """Points, and the inertial frame with its origin. Knows vectors and frames; knows no body and no equation of motion.
 
-A point knows its velocity, and its position as a chain of vectors that is summed only when somebody asks.
+A point knows its velocity, and its position as a chain of vectors that is summed only when it is needed.
 """
 
 from __future__ import annotations

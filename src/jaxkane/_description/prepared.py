@@ -55,10 +55,10 @@ def checked_names(system: str, kind: str, given: Any) -> tuple[str, ...]:
 
 
 class Kind(type(eqx.Module)):
-    """The class of all classes of systems.
+    """The metaclass of systems.
 
-    What is set on a class that stands already, as `Pendulum.loads = f` in a notebook, is prepared as what stands in its
-    body.
+    What is set on an existing class, as `Pendulum.loads = f` in a notebook, is prepared as what its body
+    defines.
     """
 
     def __new__(mcs, name: str, bases: tuple[type, ...], namespace: dict[str, Any], **kwargs: Any) -> Any:
@@ -80,12 +80,13 @@ _ASKED_FOR_A_VALUE = (
 def _named(method: Callable[..., Any], name: str) -> Callable[..., Any]:
     """A method of a description, of that name, whose `q`, `u` and `x` may be any sequence, and are read by place and
     by name."""
-    if getattr(method, "reads_by_name", None) is method:  # what decorates such a method has a copy of this, and is none
+    # A decorator of such a method copies this attribute, and is another function.
+    if getattr(method, "reads_by_name", None) is method:
         return method
 
     @functools.wraps(method)
     def call(self: System, t: Component, q: Any, *rest: Any, **more: Any) -> Any:
-        method = vars(call)["__wrapped__"]  # IPython's autoreload changes what stands there, and no closure
+        method = vars(call)["__wrapped__"]  # IPython's autoreload replaces this attribute, and no closure
         q = _values(q, self.coordinates, f"{type(self).__name__}: q")
         if rest:
             names = (*self.speeds, *self.dependent_speeds, *self.auxiliary_speeds)

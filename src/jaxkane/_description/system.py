@@ -165,7 +165,7 @@ def _check_names(system: System) -> None:
     names = {kind: checked_names(name, kind, getattr(system, kind)) for kind in NAMES}
     units = checked_units(name, system.units)
     has_outputs = type(system).outputs is not System.outputs  # whose names are known when they are read
-    if "units" in vars(type(system)) and not has_outputs:  # those that are inherited may name what this class has not
+    if "units" in vars(type(system)) and not has_outputs:  # inherited units may name what this class lacks
         refuse_unknown(
             units,
             [each for named in names.values() for each in named],

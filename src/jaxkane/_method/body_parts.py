@@ -1,4 +1,4 @@
-"""Which bodies of a system have parameters that are told apart, about which points, and which values they may take.
+"""Which bodies of a system have parameters in a regressor, about which points, and which values they may take.
 
 Knows bodies and the points that they are built from; knows no equations.
 """
@@ -31,11 +31,12 @@ UNITS = ("kg", *["kg m"] * 3, *["kg m^2"] * 6)
 
 
 Bodies = str | Sequence[str] | Mapping[str, str | Sequence[str]] | None
-"""Names of bodies, or with each those of its parameters that are told apart; None for all."""
+"""Names of bodies, or with each the names of its parameters that are columns; None for all."""
 
 
 class Part(NamedTuple):
-    """A body whose parameters are told apart: its place among the motion's bodies, and which parameters it can have."""
+    """A body with parameters of its own in a regressor: its place among the motion's bodies, and which parameters it
+    can have."""
 
     place: int
     name: str
@@ -62,7 +63,7 @@ class Part(NamedTuple):
 
 
 class Described(eqx.Module):
-    """A system, and which of its bodies are told apart. `leaves`: of those that the bodies' masses read."""
+    """A system, and its bodies that have parameters in a regressor. `leaves`: of those that the bodies' masses read."""
 
     system: System
     parts: tuple[Part, ...] = eqx.field(static=True)
@@ -82,7 +83,7 @@ def _is_fixed_in(point: Point, body: Body) -> bool:
     claim = point._claim
     still = claim is not None and claim.frame is body.frame and all(is_zero(x) for x in claim.velocity.components)
     turns = not body.is_particle and body.angular_velocity is body.frame.angular_velocity
-    return still and turns  # what spins in its frame has no other points there than those of its axis
+    return still and turns  # where a body spins in its frame, only points of the axis are fixed in both
 
 
 _PARTS = Memory()  # by structure
@@ -119,7 +120,7 @@ def described(system: System, bodies: Bodies) -> Described:
 
 
 def _chosen_of(part: Part, names: Sequence[str] | None) -> Part:
-    """A part of which only some parameters are told apart."""
+    """A part with only some of its parameters."""
     if names is None:
         return part
     names = (names,) if isinstance(names, str) else tuple(names)

@@ -48,7 +48,7 @@ def check_system(system: System, t: Any, q: Any, *, bodies: bool = True) -> None
     if in_batches(system):
         return
     system, t, q = jax.tree.map(_value, (system, t, q))
-    # Of one type, whoever asks: a number of Python and an array would be two programs.
+    # Always of one type: a Python number and an array would be two programs.
     t = t if isinstance(t, Tracer) else np.asarray(t, jnp.result_type(float) if q is None else q.dtype)
     with concretely(), np.errstate(invalid="ignore", over="ignore"):
         check_description(system, t, q)
@@ -91,7 +91,7 @@ def check_bodies(system: System, t: Any, q: Any) -> None:
 
 
 def _fault(mass: float, I: np.ndarray) -> str:
-    """What is wrong with a body beyond arguing."""
+    """What is wrong with a body, whatever the accuracy of its numbers."""
     slack = 1e-6 * max(np.abs(I).max(), 1e-300)
     if not mass >= 0:
         return f"the mass is {mass:.6g} kg; it must not be negative."

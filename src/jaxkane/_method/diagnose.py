@@ -1,4 +1,4 @@
-"""Why Kane's equations have no solution at a state, in words. Asked only once a result is not finite."""
+"""Why Kane's equations have no solution at a state, in words. Called only after a result is not finite."""
 
 from __future__ import annotations
 

@@ -158,7 +158,7 @@ def relative_condition(C: np.ndarray, dependent: Sequence[int]) -> Any:
 
         largest singular value of C / smallest of C_dep,   each row of C divided by its largest entry
 
-    At least the condition number of C_dep. C_dep alone would not tell that all of its entries are small beside those of
+    At least the condition number of C_dep. C_dep alone would not show that all of its entries are small beside those of
     the other speeds, so that these are multiplied by a large number: one residual has always the condition number 1.
     Infinite where the residuals cannot be solved, NaN where C is not finite.
     """

@@ -1,10 +1,10 @@
-"""What a description is told of one instant beyond its speeds: accelerations and the forces of constraints.
+"""What a description can read of one instant beside its speeds: accelerations and the forces of constraints.
 
 `System.state_rates` and `System.outputs` are read here. Knows the method; knows no mechanism and no time.
 
-An acceleration is asked for while a description is read, and is a derivative of what is being read. So the description
-is read twice: first it says of which points and frames it wants to know; their velocities are differentiated along the
-motion; then it is read with the answers. What asks for none is read once.
+A description may need accelerations, which are derivatives of what is being read. So it is read twice: the first
+reading records the points and frames whose accelerations it needs; their velocities are differentiated along the
+motion; the second reading receives the accelerations. A description that needs none is read once.
 """
 
 from __future__ import annotations
@@ -102,13 +102,13 @@ def read_at(now: Instant, u_dot: Row, read: Read) -> Any:
 
     def reading(t: Component, q: Row, u: Row, answers: Iterator[Row] | None = None) -> tuple[Any, Now]:
         motion = now.motion(t, q, u)
-        told = Now(now, motion.N, Values(u_dot_all, names), answers)
-        return read(now.system, t, q, u, motion, told), told
+        given = Now(now, motion.N, Values(u_dot_all, names), answers)
+        return read(now.system, t, q, u, motion, given), given
 
     # Points that are made while it is read divide by speeds, perhaps: by no exact zero.
     q, u = (tuple(jnp.asarray(x, now.dtype) if is_exact(x) else x for x in row) for row in (now.q, now.u_all))
-    found, told = reading(now.t, q, u)
-    if not told._asked:
+    found, given = reading(now.t, q, u)
+    if not given._asked:
         return found
     n_q = len(q)
 
@@ -116,7 +116,7 @@ def read_at(now: Instant, u_dot: Row, read: Read) -> Any:
         return [vector.components for vector in reading(t, z[:n_q], z[n_q:])[1]._asked]
 
     values, rates = jvp(asked, (now.t, *q, *u), (1.0, *now.q_dot, *u_dot_all))
-    turning = [vector.frame.angular_velocity.components for vector in told._asked]
+    turning = [vector.frame.angular_velocity.components for vector in given._asked]
     # dv/dt in N = derivative of the components + omega x v
     answers = [add3(rate, cross(w, v)) for rate, w, v in zip(rates, turning, values, strict=True)]
     return reading(now.t, q, u, iter(answers))[0]

@@ -1,4 +1,4 @@
-"""Constraint forces, by auxiliary speeds that nobody has to write down. Knows the method; knows no mechanism.
+"""Constraint forces, by auxiliary speeds that the library adds itself. Knows the method; knows no mechanism.
 
 An auxiliary speed is zero in the motion and gives a point or a frame a velocity that it does not have. Its Kane
 equation holds one unknown more, the force there (Kamman, Unit 5, Example 7, note on constraint forces; Kane and
@@ -63,7 +63,7 @@ class _Forces(NamedTuple):
     """Along N.x, N.y, N.z."""
 
     transmitted: Row  # on what is built from a point or a frame
-    of_residuals: Row  # of the constraint residuals that see it move
+    of_residuals: Row  # of the constraint residuals that depend on its motion
 
 
 class Reactions(Instant):

@@ -1,4 +1,4 @@
-"""What a bicycle asks of its parts, and what it refuses of their answers. Knows parts; knows no particular one."""
+"""The methods of a bicycle's parts, called and checked. Knows parts; knows no particular one."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def as_tuple(parts: Any) -> tuple[Any, ...]:
 
 
 def refuse_misfits(bicycle: Bicycle) -> None:
-    """Refuse what stands in the wrong field, parts that do not fit, and tyres thicker than their wheels."""
+    """Refuse objects in the wrong field, parts that do not fit, and tyres thicker than their wheels."""
     name = type(bicycle).__name__
     for field, kind in (("rear_tyre", Tyre), ("front_tyre", Tyre), ("head", HeadTwist), ("road", Ground)):
         held = getattr(bicycle, field)
@@ -42,7 +42,7 @@ def refuse_misfits(bicycle: Bicycle) -> None:
     known = (*bicycle.coordinates, *bicycle.speeds, *bicycle.dependent_speeds, *bicycle.states)
     for part in bicycle.parts:
         part.check(bicycle)
-        refuse_unknown(part.lateral(), known, f"{told(part, 'lateral')}: {name} has no")
+        refuse_unknown(part.lateral(), known, f"{label_of(part, 'lateral')}: {name} has no")
     for end, tyre, radius in (("rear", bicycle.rear_tyre, bicycle.rR), ("front", bicycle.front_tyre, bicycle.rF)):
         crown = tyre.crown
         if crown is None or not is_concrete(crown, radius) or crown.ndim or radius.ndim:
@@ -54,7 +54,7 @@ def refuse_misfits(bicycle: Bicycle) -> None:
             )
 
 
-def told(part: Part, method: str) -> str:
+def label_of(part: Part, method: str) -> str:
     return f"{type(part).__name__}.{method}"
 
 
@@ -71,7 +71,7 @@ def moved(part: Part, bicycle: Bicycle, motion: BicycleMotion, t: Component, q: 
     found = part.motion(bicycle, motion, t, q, u)
     if not isinstance(found, type(motion)):
         hint = " Does it end without a `return`?" if found is None else ""
-        raise TypeError(f"{told(part, 'motion')} returns `motion.extended(...)`, got {found!r}.{hint}")
+        raise TypeError(f"{label_of(part, 'motion')} returns `motion.extended(...)`, got {found!r}.{hint}")
     return found
 
 
@@ -104,7 +104,7 @@ def commanded(bicycle: Bicycle, t: Any, q: Any, u: Any, motion: Any, values: Map
     late: set[str] = set()
     for part in bicycle.parts:
         found.read.clear()
-        given = by_name(part.commands(bicycle, t, q, u, motion, found), told(part, "commands"))
+        given = by_name(part.commands(bicycle, t, q, u, motion, found), label_of(part, "commands"))
         for to, command in given.items():
             if to not in bicycle.inputs:
                 raise not_there(
@@ -112,8 +112,8 @@ def commanded(bicycle: Bicycle, t: Any, q: Any, u: Any, motion: Any, values: Map
                 )
             if to in late:
                 raise ValueError(
-                    f"{name}: {type(part).__name__} adds to {to!r} behind the part that reads it, which would not "
-                    f"notice. Put it before that part; parts are asked in the order {_ORDER}."
+                    f"{name}: {type(part).__name__} adds to {to!r} after the part that reads it, which would "
+                    f"miss it. Put it before that part; parts are called in the order {_ORDER}."
                 )
             found[to] = add(found.get(to), component(command))
             found.commanded[to] = None

@@ -26,7 +26,7 @@ from .._scalars.components import add
 from .._scalars.types import Component
 from ..catalog._bicycle_file import refuse_other_units
 from ..catalog.bicycle import WhippleBicycle
-from ._asked import as_tuple, by_name, commanded, refuse_misfits, told
+from ._asked import as_tuple, by_name, commanded, label_of, refuse_misfits
 from ._files import as_meijaard, read_yaml
 from ._ground import Ground
 from ._head import HeadTwist
@@ -74,8 +74,8 @@ class Bicycle(WhippleBicycle):
         contact and the height of the rear one are coordinates too, "front_x", "front_y" and "rear_height" [m]; yaw,
         roll and pitch begin at its tangent plane.
 
-    Parts are asked in this order: `rider`, `control`, `steering`, `drive`, `extra`. A class that inherits from this one
-    may have fields of its own that hold parts.
+    Methods of parts are called in this order: `rider`, `control`, `steering`, `drive`, `extra`. A class that inherits
+    from this one may have fields of its own that hold parts.
 
     The motion names what that of `WhippleBicycle` names, and the frame "H" of the fork at zero steer. Inputs that parts
     command are outputs too, with what came from outside: "applied_steer_torque".
@@ -121,7 +121,7 @@ class Bicycle(WhippleBicycle):
 
     @property
     def parts(self) -> tuple[Part, ...]:
-        """All parts, in the order in which they are asked; tyres are none of them."""
+        """All parts, in the order in which their methods are called; tyres are not among them."""
         held = (getattr(self, field.name) for field in dataclasses.fields(self))
         return tuple(part for each in held for part in as_tuple(each) if isinstance(part, Part))
 
@@ -191,7 +191,7 @@ class Bicycle(WhippleBicycle):
             climbing = self.road.climbing(q["x"], q["y"], place_rates(self, q, u))
             moving += [*(u[name] for name in front_speeds(self)), climbing]
         for part in self.parts:
-            moving += as_row(part.q_dot(self, t, q, u), part.coordinates, told(part, "q_dot"))
+            moving += as_row(part.q_dot(self, t, q, u), part.coordinates, label_of(part, "q_dot"))
         return (*turning, *moving)
 
     @property
@@ -237,7 +237,9 @@ class Bicycle(WhippleBicycle):
         now = now.with_values(commanded(self, t, q, u, motion, now))
         rates = [*deflection_rates(self, motion, x), *transfer_rates(self, motion, now)]
         for part in self.parts:
-            rates += named_row(part.state_rates(self, t, q, u, x, motion, now), part.states, told(part, "state_rates"))
+            rates += named_row(
+                part.state_rates(self, t, q, u, x, motion, now), part.states, label_of(part, "state_rates")
+            )
         return rates
 
     def outputs(self, t, q, u, motion: Any, now):
@@ -246,10 +248,10 @@ class Bicycle(WhippleBicycle):
         found: dict[str, Any] = dict(self.tyre_forces(motion, now))
         found |= {f"applied_{name}": now[name] for name in given.commanded}
         for part in self.parts:
-            more = by_name(part.outputs(self, t, q, u, motion, now), told(part, "outputs"))
+            more = by_name(part.outputs(self, t, q, u, motion, now), label_of(part, "outputs"))
             twice = [name for name in more if name in found]
             if twice:
-                raise ValueError(f"{told(part, 'outputs')}: there is an output {twice[0]!r} already.")
+                raise ValueError(f"{label_of(part, 'outputs')}: there is an output {twice[0]!r} already.")
             found |= more
         return found
 

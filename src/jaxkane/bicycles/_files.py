@@ -89,7 +89,8 @@ def as_meijaard(kind: str, values: Mapping[str, float]) -> tuple[Values, Values 
 
 
 class _Read(dict[str, float]):
-    """Parameters by name that are taken out one by one, so that what is missing or left over is told together."""
+    """Parameters by name that are taken out one by one, so that all that is missing or left over is reported
+    together."""
 
     def __init__(self, kind: str, values: Mapping[str, float]):
         super().__init__(values)

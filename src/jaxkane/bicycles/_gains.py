@@ -1,7 +1,7 @@
 """Balance by feedback of the state: constant gains, and gains scheduled over speed. Knows names of states.
 
-Every part here follows a roll angle, the input "desired_roll" [rad], which is zero where nobody gives it: a path
-follower does, or the inputs of a simulation.
+Every part here follows a roll angle, the input "desired_roll" [rad], which is zero by default: a path follower
+sets it, or the inputs of a simulation.
 """
 
 from __future__ import annotations

@@ -20,7 +20,7 @@ from .._scalars.types import Component, Scalar
 from ._part import check_parameters
 
 CREEPING = 0.01
-"""[m/s]: a speed below which a tyre without relaxation length is not what it says, but stays finite."""
+"""[m/s]: below this speed the law of a tyre without relaxation length is smoothed, so that it stays finite."""
 
 
 class Slip(eqx.Module):

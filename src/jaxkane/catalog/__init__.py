@@ -1,7 +1,7 @@
 """The systems of Kamman, Volume II, Unit 5: Examples 1 to 7 and Exercises 5.1 to 5.8, one file a mechanism.
 
 `CATALOG` lists them all, each with an example instance and a consistent state. A new mechanism is a file here, with
-`@entry(...)` above its class, and its line below; the laws in `tests/catalog/test_laws.py` then hold it to account, and
+`@entry(...)` above its class, and its line below; the laws in `tests/catalog/test_laws.py` then test it, and
 the site's catalogue shows it.
 """
 

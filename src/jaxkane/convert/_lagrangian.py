@@ -36,8 +36,8 @@ def inertia_of(sympy: Any, lagrange: Any, speeds: dict[Any, Any], name: str) -> 
     **Arguments:** `speeds`: the coordinates with their speeds, in the order of the speeds.
 
     **Raises:** `ValueError` where L is no quadratic function of the rates; for a load without a frame to measure its
-    velocity in, and for one whose velocity is not told by the rates of the coordinates. `TypeError` for a load that
-    acts neither at a point nor on a frame.
+    velocity in, and for one whose velocity does not follow from the rates of the coordinates. `TypeError` for a load
+    that acts neither at a point nor on a frame.
     """
     t = sympy.physics.mechanics.dynamicsymbols._t
     to_speeds = {c.diff(t): u for c, u in speeds.items()}

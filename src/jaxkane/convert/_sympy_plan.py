@@ -35,7 +35,7 @@ class LoadPlan(NamedTuple):
 
 
 class Plan(NamedTuple):
-    """All of a model: hashable, so that one model has one class. Expressions are told by their place."""
+    """All of a model: hashable, so that one model has one class. Expressions are referred to by their place."""
 
     name: str
     q: tuple[Any, ...]

@@ -12,7 +12,7 @@ from ..joints import Coupling, Loop
 
 def robot_of(text: str) -> ElementTree.Element:
     try:
-        robot = ElementTree.fromstring(re.sub(r"<(/?)\w+:", r"<\1", text))  # extensions with a prefix nobody declared
+        robot = ElementTree.fromstring(re.sub(r"<(/?)\w+:", r"<\1", text))  # extensions with an undeclared prefix
     except ElementTree.ParseError as error:
         raise ValueError(f"This is no URDF: {error}.") from error
     if robot.tag != "robot":

@@ -112,7 +112,7 @@ def bicycle_rides(rides: Sequence[Trial] | Trial, bicycle: WhippleBicycle) -> tu
 def bicycle_priors(path: str | os.PathLike[str]) -> dict[str, Prior]:
     """What a text file of BicycleParameters says was measured: (value, standard deviation) by name.
 
-    Entries without a deviation are not among them: nobody says how well they are known.
+    Entries without a deviation are not among them: how well they are known is not given.
     """
     values, deviations = read_bicycle_file(path)
     return {name: (values[name], deviation) for name, deviation in deviations.items() if deviation > 0}

@@ -33,8 +33,8 @@ def trajectories(
     - `trajectory`: a `Trajectory`. Of a batch all members are drawn, faintly.
     - `names`: of what is drawn; names in a tuple share a panel. By default the coordinates.
     - `degrees`: angles in degrees instead of radians.
-    - `units`: by name. By default those that the system declares (`System.units`); where it declares none, what a usual
-        name tells, as "roll", "x", "yaw_rate" and "steer_torque" do.
+    - `units`: by name. By default those that the system declares (`System.units`); where it declares none, those of
+        usual names, as "roll", "x", "yaw_rate" and "steer_torque" do.
     - `label`: what this motion is called in the legend, when several are drawn into the same `axes`.
     - `axes`: as many as there are panels. `style`: passed on to matplotlib's `plot`.
 

@@ -23,7 +23,7 @@ on_forget(_FOUND.clear)
 
 
 def cyclic_coordinates(system: System) -> tuple[str, ...]:
-    """Names of the cyclic (ignorable) coordinates: those that may be shifted without any other rate noticing.
+    """Names of the cyclic (ignorable) coordinates: those that may be shifted without a change of any other rate.
 
     Neither the accelerations, nor the configuration constraints, nor the rates of the other coordinates depend on
     them: a bicycle's wheel angles, yaw and place. They may grow in a steady motion, in which the others stand still.
@@ -81,10 +81,10 @@ def _search(system: System, leaves: list, treedef) -> tuple[str, ...]:
             break
     if not compared:
         raise ValueError(
-            f"{type(system).__name__}: which coordinates are cyclic cannot be told: at none of {_MOST_TRIALS} trial "
+            f"{type(system).__name__}: which coordinates are cyclic cannot be found: at none of {_MOST_TRIALS} trial "
             "states, with parameters of about one and with its own, are its accelerations finite."
         )
-    kept = notices[-1].copy()  # not cyclic: the accelerations notice them,
+    kept = notices[-1].copy()  # not cyclic: the accelerations depend on them,
     while (more := kept | notices[:-1][kept].any(axis=0)).sum() > kept.sum():
         kept = more  # or the rate of one that is not cyclic does
     return tuple(name for name, k in zip(names, kept, strict=True) if not k)

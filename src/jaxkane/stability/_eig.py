@@ -57,7 +57,7 @@ def _condition(values, left, right):
 
 
 # LAPACK gets one matrix at a time. jaxlib cuts a batch into tasks for XLA's pool of threads and waits for them; where
-# the waiting threads are those of the pool, since several programs run at once, that is for ever (jaxlib 0.10).
+# the waiting threads are those of the pool, since several programs run at once, that is a deadlock (jaxlib 0.10).
 
 
 @jax.custom_batching.sequential_vmap
@@ -93,7 +93,7 @@ def _(primals, tangents):
     values, Y, X = _decomposed(A)
     lost = ~(jax.lax.stop_gradient(_condition(values, Y, X)) < MOST_CONDITION)
     A_c, dA_c = A.astype(X.dtype), dA.astype(X.dtype)
-    # Ones stand for what is lost, so that its NaN does not meet the zeros of who does not read it.
+    # Ones stand for what is lost, since NaN would spoil the gradients of callers who do not use it (0 * NaN).
     still, y, x = (jnp.where(lost, 1.0, z) for z in (values, Y, X))
     # Y^H dA X, of which the diagonal; per unit of y^H x
     d_values = jnp.einsum("ji,jk,ki->i", y.conj(), dA_c, x) / jnp.where(lost, 1.0, jnp.sum(y.conj() * x, axis=0))

@@ -93,8 +93,8 @@ def eigenvalues(
     - `states`: as for `linearize`; for the bicycle riding straight (roll, steer, roll_rate, steer_rate), and those of
         its parts.
     - `modes`: names of the modes, one for each column. By default those of a bicycle that rides straight: weave,
-        capsize, castering, wobble, and those of its parts and tyres, told by how much their states take part; "mode 5"
-        where less than half of a mode is theirs. All others are numbered.
+        capsize, castering, wobble, and those of its parts and tyres, recognized by how much their states take part;
+        "mode 5" where less than half of a mode is theirs. All others are numbered.
 
     **Returns:** `Eigenvalues`, differentiable in the system's parameters. A mode is followed by its eigenvalue, that
     is extrapolated, and its eigenvector: the assignment with the least sum of both changes. Under a trace, where names

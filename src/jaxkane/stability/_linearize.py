@@ -137,7 +137,7 @@ def linearize(
         wrong = jnp.array(False)
     else:
         wrong = is_wrong(*origin, steady)
-    # Numbers in the place of what is none, so that its NaN does not meet the zeros of who does not read it.
+    # Numbers in the place of NaN, which would spoil the gradients of callers who do not use it (0 * NaN).
     at = tuple(jnp.where(jnp.all(jnp.isfinite(y)), y, 0.1) for y in (t, q, u, x, w))
     model = _derivatives((system, *at), _Choice(dependent, kept, rows), _Functions(functions))
     A, B, C, D = nan_where(wrong, model, origin)

@@ -43,7 +43,7 @@ def named_order(
 
     `shares` (m, states, modes): participations. Modes are dealt out to groups where they belong to them most clearly:
     at the value at which the smallest share of a group in a mode of its own is largest. Two groups that vibrate with
-    the steer, "wobble" and "front end", are told apart by the slower one.
+    the steer, "wobble" and "front end", are distinguished by their frequencies: the slower one is the wobble.
     """
     members = [[states.index(k) for k in group] for group in (LATERAL, *groups.values())]
     owner = np.repeat(np.arange(len(members)), [len(group) for group in members])  # of each slot

@@ -1,7 +1,8 @@
 """Chunks on the workers of a Dask cluster. Knows Dask's client; schedules nothing itself.
 
 A class or function of a module that can be imported travels by its name, and a worker that has imported it before has
-the numbers and the code of that time. So each worker is told the digest of the program, and refuses to compute another.
+the numbers and the code of that time. So each worker receives the digest of the program, and refuses to compute
+another.
 """
 
 from __future__ import annotations

@@ -109,7 +109,7 @@ def _read(path: Path) -> Mapping[str, Any]:
         found = json.loads(path.read_bytes())
     except ValueError as error:  # of JSON, or of its encoding
         raise ValueError(
-            f"{path} cannot be read ({error}): it is damaged, or no manifest of a sweep, so nobody knows whose chunks "
+            f"{path} cannot be read ({error}): it is damaged, or no manifest of a sweep, so it is unknown whose chunks "
             "stand beside it. Choose another folder, or delete this one."
         ) from None
     if not isinstance(found, dict) or not {"system", "times", "layout"} <= found.keys():
@@ -121,7 +121,7 @@ def _compare(path: Path, there: Mapping[str, Any], here: Mapping[str, Any]) -> N
     if "program" not in there:
         raise ValueError(
             f"{path} holds a sweep of an earlier version of jaxkane, which kept no account of all that was computed: "
-            "it cannot be told whether it is this one. Choose another folder, or delete this one."
+            "so it is unknown whether it is this one. Choose another folder, or delete this one."
         )
     found = differences(there, here)
     if found:

@@ -15,7 +15,7 @@ from ._solve import Job, Part
 
 def traced(job: Job, own: Any) -> tuple[str, Part]:
     """The digest of the program for one member, `own` (shapes and types), and the shapes of what it gives."""
-    numbers, rest = eqx.partition(job, eqx.is_array)  # numbers that are arguments are told by name elsewhere
+    numbers, rest = eqx.partition(job, eqx.is_array)  # numbers that are arguments are recorded by name elsewhere
     whole = lambda own, numbers: eqx.combine(numbers, rest).whole(own)  # noqa: E731
     program, like = jax.make_jaxpr(whole, return_shape=True)(own, numbers)
     return digest(program), like

@@ -1,4 +1,4 @@
-"""What a folder's sweep is, in words that tell two of them apart. Knows systems and their parameters."""
+"""What a folder's sweep is, in words, so that two sweeps can be compared. Knows systems and their parameters."""
 
 from __future__ import annotations
 

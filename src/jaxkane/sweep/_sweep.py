@@ -123,7 +123,7 @@ def _in_chunks(
             for start, part in _finished(kept, left, like, n, size):
                 left.remove(start)
                 bar.update(result.put(start, part))
-            bar.initial = bar.n  # what was there tells nothing about how fast it goes
+            bar.initial = bar.n  # chunks that were read from files say nothing about the speed
             if client is None:
                 run = ((start, job.solve(members_at(start), size)) for start in left)
             else:

@@ -80,7 +80,7 @@ class Equations:
         return (self.t, *self.q, *self.u, *self.inputs, *self.parameters)
 
     def cse(self, expressions: Any) -> tuple[list[tuple[Any, Any]], Any]:
-        """`replacements` and the expressions, as `sympy.lambdify` wants to be told of common subexpressions:
+        """`replacements` and the expressions, as the argument `cse` of `sympy.lambdify` takes them:
 
         lambdify(equations.arguments, [equations.M, equations.f], cse=equations.cse)
         """

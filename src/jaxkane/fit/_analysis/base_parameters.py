@@ -1,4 +1,4 @@
-"""Which sums of the bodies' parameters motions can tell, in words, and with which values. Knows regressors."""
+"""Which sums of the bodies' parameters motions determine, in words, and with which values. Knows regressors."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def base_parameters(
     spacing: float | None = None,
     flat: float = 0.5,
 ) -> BaseParameters:
-    """Which sums of mass, first moment, inertia and other parameters can be told, and with data their values.
+    """Which sums of mass, first moment, inertia and other parameters are determined, and with data their values.
 
         print(base_parameters(arm, parameters=("friction",)))     # by any motion
         print(base_parameters(arm, trials))                       # by these, with values and deviations
@@ -38,7 +38,7 @@ def base_parameters(
     **Arguments:**
 
     - `system`; `bodies`, `parameters`: as of `regressor`. Or a `Regressor` of many instants (by `jax.vmap`) alone.
-    - `motions`: none, for what any motion can tell; or measured or simulated ones, as of `instants_of`.
+    - `motions`: none, for what any motion determines; or measured or simulated ones, as of `instants_of`.
     - `sigma`: by speed, the standard deviation of what remains in its equation [N m, N]; by default estimated.
     - `spacing` [s]: of knots, as of `instants_of`.
     - `flat`: a combination whose standard deviation exceeds this part of its size is called undetermined.
@@ -85,5 +85,5 @@ def structure_of_states(chosen: Chosen) -> BaseParameters:
 
 
 def states_for(chosen: Chosen) -> Instants:
-    """Random states, some three times as many as the numbers that they could tell."""
+    """Random states, some three times as many as the numbers that they could determine."""
     return random_states(chosen.system, 10 + 3 * -(-len(chosen.names) // len(chosen.system.speeds)))

@@ -1,9 +1,9 @@
 """Base parameters from the regressor at random states: which columns are sums of others, whatever moves.
 
 Columns of the regressor that are always zero have no influence; columns that are always the same sum of others can only
-be told with those. What remains are base parameters: as many numbers as the equations of motion have, and no fewer
-(Gautier and Khalil, Direct calculation of minimum set of inertial parameters of serial robots, IEEE Transactions on
-Robotics and Automation, 1990; Gautier, Numerical calculation of the base inertial parameters of robots, Journal of
+be determined with those. What remains are base parameters: as many numbers as the equations of motion have, and no
+fewer (Gautier and Khalil, Direct calculation of minimum set of inertial parameters of serial robots, IEEE Transactions
+on Robotics and Automation, 1990; Gautier, Numerical calculation of the base inertial parameters of robots, Journal of
 Robotic Systems, 1991).
 """
 
@@ -69,7 +69,7 @@ def random_states(system: System, n: int) -> Instants:
         if len(fine) < n:
             raise ValueError(
                 f"{type(system).__name__}: {len(fine)} of {len(q)} random coordinates could be assembled, and {n} are "
-                "needed to say what motions can tell: give a Regressor of states of your own, by jax.vmap."
+                "needed to find what motions determine: give a Regressor of states of your own, by jax.vmap."
             )
         fine = fine[np.linspace(0, len(fine) - 1, n).astype(int)]
         t, q = t[fine], q[fine]

@@ -16,7 +16,7 @@ from .._result.base_parameters import BaseParameters
 from .._result.identifiability import combination
 
 _BLOCKS = 40  # of data, whose residuals are taken as independent of each other
-_EXACT = 1e-6  # of an equation's size: no smaller deviation is believed in
+_EXACT = 1e-6  # of an equation's size: no smaller deviation is assumed
 _ROUNDING = 1e-10  # of the largest singular value
 
 
@@ -70,8 +70,8 @@ class _Equations:
         freedom = self.rest.size - int(np.sum(s > _ROUNDING * s.max(initial=0.0)))
         if not sigma and freedom <= 0:
             raise ValueError(
-                f"{self.rest.size} equations of motion, at {len(self.rest)} instants, tell {self.rest.size - freedom} "
-                "numbers, and nothing of how large their errors are: give more instants, or `sigma`."
+                f"{self.rest.size} equations of motion, at {len(self.rest)} instants, determine "
+                f"{self.rest.size - freedom} numbers, and nothing of how large their errors are: give more instants, or `sigma`."
             )
         for _ in range(0 if sigma else 4):  # each equation weighed by what remains in it
             left = self.rest - A @ z
@@ -79,8 +79,8 @@ class _Equations:
             s, V, z = self._solve(A / deviation[:, None], self.rest / deviation)
         left = self.rest - A @ z
         along = self._covariance(A / deviation[:, None], left / deviation, s, V, bool(sigma))
-        told = np.diag(along) <= flat**2
-        z = V[told].T @ (V[told] @ z)  # what is not told stays
+        known = np.diag(along) <= flat**2
+        z = V[known].T @ (V[known] @ z)  # what is not determined stays
         left = self.rest - A @ z
         seen = np.isfinite(np.diag(along))
         spread: Any = V[seen].T @ along[np.ix_(seen, seen)] @ V[seen]
@@ -98,7 +98,7 @@ class _Equations:
             deviations=np.sqrt(np.diag(covariance)),
             covariance=covariance,
             information=np.einsum("inb,inc,n->bc", self.W, self.W, deviation**-2.0, optimize=True),
-            undetermined=tuple(combination(base, row) for row in V[~told]),
+            undetermined=tuple(combination(base, row) for row in V[~known]),
             held=self.held,
             noise=dict(zip(self.speeds, np.sqrt(np.mean(left**2, axis=0)).tolist(), strict=True)),
             unexplained=float(
@@ -111,7 +111,7 @@ class _Equations:
         return self.W * (self.now + moved)
 
     def _solve(self, A: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Singular values (m,), a row (m, m) for each, and the solution (m,) that is zero where nothing is told."""
+        """Singular values (m,), a row (m, m) for each, and the solution (m,), zero where nothing is determined."""
         m = A.shape[2]
         rows = np.column_stack([A.reshape(-1, m), rest.ravel()])
         R: Any = np.linalg.qr(rows, mode="r") if len(rows) > m else rows

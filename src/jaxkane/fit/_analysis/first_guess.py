@@ -31,7 +31,7 @@ _TRIED = 7  # spacings of knots
 
 @dataclasses.dataclass(frozen=True)
 class FirstGuess:
-    """What the equations of motion say of the free parameters, without simulating anything.
+    """What the equations of motion determine of the free parameters, without any simulation.
 
     - `system`: with what was found in it; a fit may begin from it.
     - `values` (p) by name, `starts` (p) from which they came.
@@ -91,7 +91,7 @@ def first_guess(
     covariance: a positive parameter stays positive, an `Inertia(...)` stays what a body can have, since its pseudo-
     inertia stays positive definite (Wensing, Kim and Slotine, Linear matrix inequalities for physically consistent
     inertial parameter identification, IEEE Robotics and Automation Letters, 2018; Rucker and Wensing 2022). Where the
-    data are silent, they stay nearest to the system's values in the free numbers of a fit.
+    data determine nothing, they stay nearest to the system's values in the free numbers of a fit.
 
     **Arguments:**
 

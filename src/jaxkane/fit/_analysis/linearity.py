@@ -48,8 +48,8 @@ class _Linearity:
         # Of the bodies that are named every parameter: what is known of them moves with the others.
         every = described(system, [part.name for part in chosen.described.parts])
         self.chosen = eqx.tree_at(lambda c: c.described, chosen, every)
-        self.told = np.array([name in chosen.names for name in self.chosen.names], bool)
-        self.of_bodies = np.arange(len(self.told)) < len(self.told) - len(chosen.places)
+        self.chosen_columns = np.array([name in chosen.names for name in self.chosen.names], bool)
+        self.of_bodies = np.arange(len(self.chosen_columns)) < len(self.chosen_columns) - len(chosen.places)
         dtype = q.dtype
         q = (np.nan_to_num(q) + rng.uniform(-0.1, 0.1, q.shape)).astype(dtype)  # beside what is often zero
         n = len(system.speeds)
@@ -61,12 +61,12 @@ class _Linearity:
     def read(self, system: System) -> tuple[dict[str, np.ndarray], np.ndarray]:
         found, now = jax.device_get(regressor_at(self.chosen.of(system), *self.state))
         Y, values = found.matrix, found.values
-        known = ~self.told
+        known = ~self.chosen_columns
         pieces = {
             "Y": Y,
             "tau": found.forces,
             "pi": values[self.of_bodies],
-            "told": values[self.told & self.of_bodies],
+            "own": values[self.chosen_columns & self.of_bodies],
             "right": found.forces - Y[:, known] @ values[known],
             "of bodies": Y[:, self.of_bodies],
             "moving": np.concatenate([x.ravel() for x in (now.V, now.W, now.a, now.alpha, now.omega)]),
@@ -111,7 +111,7 @@ class _Linearity:
         return not bool(np.all(np.abs(x - y) <= self.tolerance * size))
 
     def _judge_own(self, parameter: str, changes: set[str]) -> None:
-        if "told" in changes:
+        if "own" in changes:
             raise ValueError(
                 f"{self.name}: {parameter} belongs to a body that has columns of its own: leave it out of "
                 "`parameters`, or the body out of `bodies`."
@@ -141,7 +141,7 @@ class _Linearity:
         )
 
     def _check_weights(self, g: np.ndarray) -> None:
-        """A weight that is written as a number, of a mass that is one too, cannot be told from other loads."""
+        """A weight that is written as a number, of a mass that is one too, cannot be distinguished from other loads."""
         weightless = ~np.any(g != 0, axis=1)
         lone = [part.name for part, none in zip(self.chosen.described.parts, weightless, strict=True)
                 if none and part.has_number]  # fmt: skip

@@ -15,7 +15,7 @@ from .._problem.parameters import Parameters
 from .._result.base_parameters import BaseParameters
 from .columns import Chosen
 
-_PULL = 1e-2  # of a free number towards its start, in standard deviations: decides where the data are silent
+_PULL = 1e-2  # of a free number towards its start, in standard deviations: decides what the data do not determine
 
 
 def _values_at(chosen: Chosen, parameters: Parameters, x: Any) -> Any:
@@ -38,19 +38,19 @@ def nearest(chosen: Chosen, parameters: Parameters, base: BaseParameters) -> tup
     eigenvalues, V = np.linalg.eigh(base.information)
     root = np.sqrt(np.maximum(eigenvalues, 0.0))[:, None] * V.T
     if base.held is not None:
-        # As firmly held as the best that is told.
+        # Held as firmly as the best determined number.
         hold = np.zeros(len(base.places))
         hold[base.held] = 10.0 * np.sqrt(max(eigenvalues.max(initial=0.0), 1e-300))
         root = np.vstack([root, hold])
     known = np.isfinite(np.asarray(parameters.prior_deviation))
 
     def residuals(x: Any) -> np.ndarray:
-        told, priors = look(x)[0]
-        return np.concatenate([root @ (base.of(told) - base.estimates), _PULL * x, priors[known]])
+        columns, priors = look(x)[0]
+        return np.concatenate([root @ (base.of(columns) - base.estimates), _PULL * x, priors[known]])
 
     def slopes(x: Any) -> np.ndarray:
-        told, priors = look(x)[1]
-        return np.vstack([root @ base.matrix @ told, _PULL * np.eye(len(x)), priors[known]])
+        columns, priors = look(x)[1]
+        return np.vstack([root @ base.matrix @ columns, _PULL * np.eye(len(x)), priors[known]])
 
     seen: dict[bytes, Any] = {}
 
@@ -69,6 +69,6 @@ def nearest(chosen: Chosen, parameters: Parameters, base: BaseParameters) -> tup
 
 @compiled
 def values_with_slopes(chosen, parameters, x):
-    """The told values and the residuals of the priors, and how both change with the free numbers."""
+    """The values of the columns and the residuals of the priors, and how both change with the free numbers."""
     both = lambda x: (_values_at(chosen, parameters, x), parameters.prior_residuals(x))  # noqa: E731
     return both(x), jax.jacfwd(both)(x)

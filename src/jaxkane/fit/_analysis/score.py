@@ -65,8 +65,8 @@ class Score:
 
     - `step` (q,) of them, and its `covariance` (q, q). `drop`: by how much the sum of squares falls, `least`: to what.
     - `p`: the probability that chance promises as much.
-    - `seen`, `apart` (q,): whether the data see a parameter at all, and whether they can tell it from those that are
-        free already.
+    - `seen`, `apart` (q,): whether the data depend on a parameter at all, and whether it can be distinguished from
+        those that are free already.
     """
 
     step: np.ndarray

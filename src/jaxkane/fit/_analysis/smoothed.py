@@ -73,8 +73,8 @@ class Smoothed:
 
 
 def smoothed(fit: Fit) -> dict[str, Smoothed]:
-    """By trial, the motion that its measurements tell, with its uncertainty: what is left of process noise and sensors'
-    noise when both are known.
+    """By trial, the motion as estimated from all its measurements, with its uncertainty: what is left of process noise
+    and sensors' noise when both are known.
 
     The extended smoother of Bryson and Frazier (as that of Rauch, Tung and Striebel, without an inverse). A start, or a
     bias, that was given no standard deviation may be anywhere: its uncertainty is that which the data leave.

@@ -47,9 +47,9 @@ class Suspect:
     @property
     def cells(self) -> tuple[str, ...]:
         number = lambda x, form=".5g": "" if math.isnan(x) else f"{x:{form}}"  # noqa: E731
-        told = [name for name in self.parameters if not math.isnan(self.errors[name])]
-        estimates = ", ".join(f"{self.values[name]:.4g}" for name in told)
-        errors = ", ".join(f"{self.errors[name]:.2g}" for name in told)
+        known = [name for name in self.parameters if not math.isnan(self.errors[name])]
+        estimates = ", ".join(f"{self.values[name]:.4g}" for name in known)
+        errors = ", ".join(f"{self.errors[name]:.2g}" for name in known)
         numbers = (number(self.promised), number(self.cost), number(self.p, ".2g"), number(self.predicted))
         return (self.name, estimates, errors, *numbers, self.verdict)
 

@@ -46,7 +46,7 @@ def suspects(
     A candidate stands where (1) chance promises so much with a probability below `level`, over all candidates
     together (Bonferroni); (2) fitted, it keeps that; (3) no parameter becomes implausible, its own or one that was
     free; (4) trials that are left out in turn are predicted better with it. Of those that stand, the one that predicts
-    best is taken; with `depth` above one the others are asked again beside it, and so on, until none stands.
+    best is taken; with `depth` above one the others are tried again beside it, and so on, until none stands.
 
     **Arguments:**
 
@@ -54,7 +54,7 @@ def suspects(
         `Inertia`, and `Candidate`, which may be several of these together, what every trial has its own of, or another
         system. Each starts where it is neutral.
     - `depth`: how many may be taken, one after the other. `refits`: how many are fitted in each round; None for all
-        that the data can tell. `level`: of the test.
+        that the data can distinguish. `level`: of the test.
     - `plausible`: by name, (lower, upper), or a share of the start such as 0.2. Else what `Candidate.plausible` says,
         three deviations of a prior, and a factor of 2.5 from a start that is not zero. A `Free` with bounds that starts
         on one of them, as friction at zero, is searched for on both sides and believed on one.

@@ -43,22 +43,22 @@ class Trying:
     ) -> tuple[tuple[Suspect, ...], dict[str, Standing]]:
         """What every candidate promises, and of the promising ones what they keep; with where the search stands then.
         Those that stand come first, the best at the top."""
-        hopes = [hope for group in groups_of(self.fit, left) for hope in self._linearized(group, bar)]
-        rows, found = {hope.row.name: hope.row for hope in hopes}, {}
-        able = [h for h in hopes if h.extended is not None and not h.row.verdict]
+        promises = [promise for group in groups_of(self.fit, left) for promise in self._linearized(group, bar)]
+        rows, found = {promise.row.name: promise.row for promise in promises}, {}
+        able = [h for h in promises if h.extended is not None and not h.row.verdict]
         if refits is not None:
             able = [h for h in able if not h.nested or h.row.p < self.share]
             able = sorted(able, key=lambda h: (bool(h.objections), h.row.promised))[:refits]
-        for hope in able:
-            bar.set_postfix_str(hope.row.name)
-            rows[hope.row.name], after = self._fitted(hope)
-            found |= {} if after is None else {hope.row.name: after}
+        for promise in able:
+            bar.set_postfix_str(promise.row.name)
+            rows[promise.row.name], after = self._fitted(promise)
+            found |= {} if after is None else {promise.row.name: after}
             bar.update()
         done = [self._judged(row) for row in rows.values()]
         best = lambda row: (not row.stands, row.predicted if row.stands and self.folds else row.least)  # noqa: E731
         return tuple(sorted(done, key=best)), found
 
-    def _linearized(self, group: Sequence[Candidate], bar: Any) -> list[Hope]:
+    def _linearized(self, group: Sequence[Candidate], bar: Any) -> list[Promise]:
         """The candidates of one system, by one linearization."""
         bar.set_postfix_str(f"{len(group)} linearized")
         try:
@@ -68,7 +68,7 @@ class Trying:
             more, at, why = None, None, str(error)
         bar.update()
         if more is None or at is None or not usable(at):
-            return [Hope(c, Suspect(c.name, verdict=why)) for c in group]
+            return [Promise(c, Suspect(c.name, verdict=why)) for c in group]
         said = {name: value for c in group for name, value in c.plausible.items()}
         said |= {name: value for name, value in self.said.items() if name in more.names}
         # What was free has started where the fit did, whatever another system begins with.
@@ -80,7 +80,7 @@ class Trying:
         common = Common(more, at, _held(at), Plausible(ranges))
         return [self._promised(candidate, common) for candidate in group]
 
-    def _promised(self, candidate: Candidate, common: Common) -> Hope:
+    def _promised(self, candidate: Candidate, common: Common) -> Promise:
         more, (x, b) = common.extended, common.extended.owned([candidate])
         new = [i for i in x if i not in more.base_x]
         rows, was = rows_of(more.problem, common.at, more.point, b), self.standing
@@ -111,17 +111,17 @@ class Trying:
             promised=was.cost - found.drop if nested else float("nan"),
             p=found.p if nested else float("nan"),
             predicted=left_out,
-            verdict=_untold(more, new, found) if nested else "",
+            verdict=_undetermined(more, new, found) if nested else "",
         )
         objections = common.plausible.objections(row.values)
-        return Hope(candidate, row, more, common, nested, tuple(objections))
+        return Promise(candidate, row, more, common, nested, tuple(objections))
 
-    def _fitted(self, hope: Hope) -> tuple[Suspect, Standing | None]:
+    def _fitted(self, promise: Promise) -> tuple[Suspect, Standing | None]:
         """After a fit of all that is free and this."""
-        more, was, row, common = hope.extended, self.standing, hope.row, hope.common
+        more, was, row, common = promise.extended, self.standing, promise.row, promise.common
         assert more is not None
         assert common is not None
-        problem, start = more.with_only([hope.candidate], common.held)
+        problem, start = more.with_only([promise.candidate], common.held)
         try:
             found = uninterrupted(minimize(problem, LeastSquares(), start=start))
             at = linearize(without_priors(problem), found.point)
@@ -129,9 +129,9 @@ class Trying:
             return dataclasses.replace(row, verdict=str(error)), None
         if at is None or not usable(at) or found.status != "converged":
             return dataclasses.replace(row, verdict=f"its fit has not converged ({found.status})"), None
-        n, count = len(more.base_x), self._unknowns(hope.candidate, more)
+        n, count = len(more.base_x), self._unknowns(promise.candidate, more)
         k = len(found.names) - n + count
-        rows = rows_of(problem, at, found.point, more.owned([hope.candidate])[1])
+        rows = rows_of(problem, at, found.point, more.owned([promise.candidate])[1])
         after = Standing(problem, found.point, found.names, found.cost, was.freedom - k, found.autocorrelation, rows)
         now = score(
             rows, range(n), range(n, len(found.names)), freedom=was.freedom, more=count, correlation=after.correlation
@@ -183,7 +183,7 @@ class Common:
 
 
 @dataclasses.dataclass(frozen=True)
-class Hope:
+class Promise:
     """A candidate and what it promises; `nested`: whether it changes nothing where it starts."""
 
     candidate: Candidate
@@ -212,10 +212,10 @@ def _errors(names: Sequence[str], slopes: np.ndarray, covariance: np.ndarray) ->
     return {name: float(deviation) for name, deviation in zip(names, deviations, strict=True)}
 
 
-def _untold(more: Extended, new: Sequence[int], found: Any) -> str:
-    """What the data cannot say, in words."""
+def _undetermined(more: Extended, new: Sequence[int], found: Any) -> str:
+    """What the data do not determine, in words."""
     unseen = [more.names[i] for i, seen in zip(new, found.seen, strict=True) if not seen]
     if unseen:
         return f"{', '.join(unseen)} is not seen by these data"
     lost = [more.names[i] for i, apart in zip(new, found.apart, strict=True) if not apart]
-    return f"{', '.join(lost)} cannot be told from what is free" if lost else ""
+    return f"{', '.join(lost)} cannot be distinguished from what is free" if lost else ""

@@ -33,7 +33,8 @@ def read_trials(
     **Arguments:**
 
     - `measured`, `inputs`, `initial`: the column of every channel, input and known start (see `Trial`).
-    - `t`: the column of the times [s]. `by`: the column that tells the trials apart; without it the file is one trial.
+    - `t`: the column of the times [s]. `by`: the column that names the trial of each row; without it the file is one
+        trial.
     - `sigma`: as `Trial` takes it.
 
     An empty cell, or one that says NaN, is a gap. The file is UTF-8, with or without a byte-order mark; compressed by

@@ -78,7 +78,7 @@ class BFGS(Optimizer):
         return Memory(point, unit, y, state, jnp.asarray(False), jnp.asarray(True))
 
     def step(self, problem: Problem, now: Iterate, taken: int) -> Iterate | str:
-        # One step at a time, so that Ctrl-C finds the best so far: a program that runs cannot be asked for it.
+        # One step at a time, so that after Ctrl-C the best so far is known: a running program cannot be interrupted.
         if now.memory.done:
             return "converged" if now.memory.success else "stuck"
         memory = _step(problem.model, problem.windows, problem.by_trial, self._solver, now.memory)

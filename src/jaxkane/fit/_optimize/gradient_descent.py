@@ -23,7 +23,8 @@ from .steps import moved, solve_nuisance, usable
 
 
 class Memory(eqx.Module):
-    """Between two steps: the way gone in the round coordinates, those coordinates, their unit, and optax's state."""
+    """Between two steps: the displacement in the whitened coordinates, those coordinates, their unit, and optax's
+    state."""
 
     y: Float[Array, " p"]
     directions: Float[Array, "p p"]
@@ -38,8 +39,9 @@ class GradientDescent(Optimizer):
         minimize over x  1/2 min over z, b of |residual(x, z, b)|^2
 
     The unknown starts z and biases b are re-solved to first order in every step (variable projection), so the
-    gradient is that of the best fit with given parameters. The descent runs in coordinates y in which the sensitivity A
-    is round, x = x0 + (A^T A)^(-1/2) y: a step means the same for every parameter, however well it is known.
+    gradient is that of the best fit with given parameters. The descent runs in whitened coordinates y, in which A^T A
+    = 1 for the sensitivity A, x = x0 + (A^T A)^(-1/2) y: a step means the same for every parameter, however well it is
+    known.
 
     A step whose simulation fails, or which multiplies the cost, is halved until it does not.
 
@@ -48,7 +50,7 @@ class GradientDescent(Optimizer):
     - `transform`: any optax optimizer, with its schedule; by default Nesterov's descent at a rate of 0.3 that falls
         along a cosine over all steps. The unit of y is the way that there seems to be to go, so rates about 0.1 suit
         Adam.
-    - `refresh`: how many steps until the coordinates are made round anew; None for the plainly scaled parameters
+    - `refresh`: how many steps until the coordinates are whitened anew; None for the plainly scaled parameters
         (`Free.scale`) throughout.
     - `rtol`: stop when the linearized problem promises less than this part of the cost.
     """
@@ -107,7 +109,7 @@ class GradientDescent(Optimizer):
 
 @functools.lru_cache(maxsize=16)
 def _descend(transform: optax.GradientTransformation) -> Callable[..., tuple[Array, Array, Any]]:
-    """optax's step: of the parameters, of the round coordinates, and its next state."""
+    """optax's step: of the parameters, of the whitened coordinates, and its next state."""
 
     @jax.jit
     def descend(directions, unit, gradient, of_optax, y):

@@ -16,7 +16,7 @@ from .._problem.model import Unknowns
 from .._problem.problem import Problem
 from .minimize import minimize
 from .optimizer import Iterate, Optimizer
-from .steps import moved, settled, usable
+from .steps import moved, refined, usable
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,19 +76,19 @@ class LeastSquares(Optimizer):
         there = linearize(problem, tried)
         if there is not None and usable(there) and there.cost >= at.cost:
             # Often only the nuisance values, which went along a straight line, are not yet where they belong.
-            tried, there = settled(problem, tried, there, 3, self.rtol, enough=at.cost - 0.5 * gain)
+            tried, there = refined(problem, tried, there, 3, self.rtol, enough=at.cost - 0.5 * gain)
         if there is not None and usable(there) and there.cost < at.cost:
             ratio = (at.cost - there.cost) / gain
             # Nielsen's rule: trust more where the promise was kept.
             damping *= max(0.1, 1 - (2 * ratio - 1) ** 3)
             return Iterate(tried, there.cost, there, jnp.asarray(damping, x.dtype))
-        if _is_settled(problem, at):
+        if _is_refined(problem, at):
             return "converged"
         damping = max(5 * damping, 1e-3)
         return dataclasses.replace(now, memory=jnp.asarray(damping, x.dtype)) if damping <= 1e8 else "stuck"
 
 
-def _is_settled(problem: Problem, at: Linearization) -> bool:
+def _is_refined(problem: Problem, at: Linearization) -> bool:
     """Whether an undamped step promises no more than a tenth of a standard error is worth. Where such a step is
     refused, errors of integration, which are no smooth function of the unknowns, hide what is left to gain."""
     n_r, n_unknown = problem.size

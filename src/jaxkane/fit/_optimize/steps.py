@@ -67,7 +67,7 @@ def _solved(problem: Problem, point: Unknowns, steps: int, rtol: float) -> tuple
         at = linearize(problem.shortened(samples), point)
     stuck = 0
     while True:
-        point, at = settled(problem.shortened(samples), point, at, steps if np.all(samples == whole) else 2, rtol)
+        point, at = refined(problem.shortened(samples), point, at, steps if np.all(samples == whole) else 2, rtol)
         if np.all(samples == whole):
             return point, at
         longer = (
@@ -84,7 +84,7 @@ def _solved(problem: Problem, point: Unknowns, steps: int, rtol: float) -> tuple
         assert at is not None
 
 
-def settled(
+def refined(
     problem: Problem, point: Unknowns, at: Linearization, steps: int, rtol: float, enough: float = -np.inf
 ) -> tuple[Unknowns, Linearization]:
     """The nuisance values after a few Gauss-Newton steps with the parameters held, until these gain less than a part

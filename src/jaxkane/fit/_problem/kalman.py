@@ -27,7 +27,7 @@ def root(A: Float[Array, "n k"]) -> tuple[Float[Array, "n n"], Float[Array, "k n
 
 
 class Update(NamedTuple):
-    """What measurements of one instant tell of a state m + S x, with x (n,) standard normal before.
+    """The update of a state m + S x, with x (n,) standard normal before, by the measurements of one instant.
 
     - `innovation`, `deviation` (n_c,): measured less predicted, each after those before it, and its standard deviation;
         zero and one where nothing was measured.

@@ -87,7 +87,7 @@ class Model(eqx.Module):
 
         residual = (gain * simulated + bias - measured) / sigma
 
-    With process noise (`noise`), a window is a trial, and `filtered` says what its measurements tell.
+    With process noise (`noise`), a window is a trial, and `filtered` follows its measurements.
     """
 
     system: System

@@ -112,7 +112,7 @@ class Problem:
 
     @property
     def chooses_steps(self) -> bool:
-        """Whether fixed steps of integration are halved until they are fine enough: nobody has given any."""
+        """Whether fixed steps of integration are halved until they are fine enough: where no step was given."""
         return self.has_steps and self.posed["simulation"].step is None
 
     @property

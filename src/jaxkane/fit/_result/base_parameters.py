@@ -1,4 +1,4 @@
-"""What motions can tell of bodies' parameters, and its table. Knows numbers and names."""
+"""Base parameters: the sums of parameters that motions determine, as a table. Knows numbers and names."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 @dataclasses.dataclass(frozen=True)
 class BaseParameters:
-    """What motions can tell of p parameters: b sums of them. `print` shows it in words.
+    """What motions determine of p parameters: b sums of them. `print` shows it in words.
 
     - `names`, `units`, `values` (p): the parameters as the system has them.
     - `matrix` (b, p): base parameters = matrix @ parameters. `places` (b): the parameter that each begins with, which
@@ -23,10 +23,10 @@ class BaseParameters:
     From data, else NaN:
 
     - `estimates` (b) and their `deviations` (b), `covariance` (b, b): by weighted least squares. The deviations allow
-        for residuals that hang together within a fortieth of the data. Where only ratios can be told the base parameter
+        for residuals that are correlated within a fortieth of the data. Where only ratios are determined, the parameter
         `held` has the system's value.
     - `information` (b, b): W^T W of the weighed equations W b = tau, before anything is held.
-    - `undetermined`: combinations that these data do not tell, in words; they stay at the system's values.
+    - `undetermined`: combinations that these data do not determine, in words; they stay at the system's values.
     - `noise`: by speed, the root mean square of what remains in its equation. `unexplained`: the part of the equations'
         size that it is.
     """
@@ -50,7 +50,7 @@ class BaseParameters:
 
     @property
     def count(self) -> int:
-        """How many numbers can be told."""
+        """How many numbers are determined."""
         return len(self.places) - self.ratios_only - len(self.undetermined)
 
     @property
@@ -64,9 +64,9 @@ class BaseParameters:
     def __str__(self) -> str:
         b, p = len(self.places), len(self.names)
         only = ", and only their ratios: nothing acts that is known" if self.ratios_only else ""
-        told = f"of {p} parameters {b} sums can be told{only}"
+        determined = f"of {p} parameters {b} sums can be determined{only}"
         given = bool(np.isfinite(self.estimates).any())
-        lines = [f"{told}; {self.count} numbers{' by these data' * given}"]
+        lines = [f"{determined}; {self.count} numbers{' by these data' * given}"]
         width = max((len(text) for text in self.texts), default=0)
         now = self.of(self.values)
         for i, (text, unit) in enumerate(zip(self.texts, self.base_units, strict=True)):
@@ -78,7 +78,7 @@ class BaseParameters:
             lines.append(f"{text:<{width}}  {number} {unit}".rstrip())
         if self.without_influence:
             lines.append(f"without influence: {', '.join(self.without_influence)}")
-        lines += [f"not told by these data: {text}" for text in self.undetermined]
+        lines += [f"not determined by these data: {text}" for text in self.undetermined]
         if given:
             lines.append(f"unexplained: {100 * self.unexplained:.3g} % of the equations' size")
         return "\n".join(lines)

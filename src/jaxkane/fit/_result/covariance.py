@@ -105,7 +105,7 @@ def _by_window(problem: Problem, point: Unknowns, at: Linearization) -> np.ndarr
     scale = np.sqrt(np.maximum(N.diagonal(), np.finfo(float).tiny))
 
     def inverse(M: np.ndarray) -> np.ndarray:
-        # A trial's unknowns may be known by one window alone: without it they are nobody's, and stay.
+        # One window alone may determine a trial's unknowns: without it nothing does, and they stay.
         return np.linalg.pinv(M / np.outer(scale, scale), rcond=1e-13, hermitian=True) / np.outer(scale, scale)
 
     def moved_without(w: int) -> np.ndarray:

@@ -201,7 +201,7 @@ def _direction(seen: Identifiability, i: int, row: np.ndarray) -> Direction:
     elif len(parts) == 1 and first in seen.without_influence:
         text = f"{first} has no influence on these data; it stays at its start."
     elif len(parts) == 1 and s == 0:
-        text = f"{first} cannot be told apart from the unknown starts and biases."
+        text = f"{first} cannot be distinguished from the unknown starts and biases."
     elif len(parts) == 1:
         unit = f" {seen.units[order[0]]}" * bool(seen.units[order[0]])
         error = deviation * seen.scales[order[0]]

@@ -108,9 +108,9 @@ def odd_trials(fit: Fit) -> list[str]:
     odd = {name: size for name, size in sizes.items() if size > max(3 * usual, 2.0)}
     if not odd or len(odd) > len(sizes) / 4:
         return []
-    told = ", ".join(f"{name} ({size / usual:.1f} times)" for name, size in odd.items())
+    named = ", ".join(f"{name} ({size / usual:.1f} times)" for name, size in odd.items())
     return [
-        f"The residuals of {told} are several times as large as those of the other trials: something happened there "
+        f"The residuals of {named} are several times as large as those of the other trials: something happened there "
         "that the model does not have, and all parameters pay for it. Look at it, and fit the others without it."
     ]
 
@@ -226,7 +226,7 @@ def only_priors(fit: Fit) -> list[str]:
 def far_from_start(fit: Fit) -> list[str]:
     """Estimates that left what the user thought plausible by far, and are still called precise."""
     notes = []
-    means_nothing = {  # of noise nobody knows the size beforehand
+    means_nothing = {  # the size of noise is not known beforehand
         e.name for e in fit.parameters.entries if e.part or (e.role and e.role[0] in ("intensity", "sigma"))
     }
     for name, value in fit.estimates.items():
