@@ -119,7 +119,7 @@ class _Description:
         now = self.read(q, u)
         judged = all(np.all(np.isfinite(x)) for x in now.values())
         if not judged or any(_rotation_error(x) > self.tolerance for x in _of_kind(now, "frame").values()):
-            return False  # coordinates that are bound together without a constraint: nothing can be said beside them
+            return False  # coordinates with a relation that no constraint states: nearby states cannot be checked
         rates = self.read_along(q, u, now)
         check = {
             "frame": self._check_frame,

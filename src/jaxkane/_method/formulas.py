@@ -115,7 +115,9 @@ class Formulas:
             raise ValueError(f"{self.name}: dtype is 'float64' or 'float32', got {dtype!r}.")
         batched = in_batches(system)
         if batched:
-            raise ValueError(f"{self.name} is a batch: {', '.join(batched)} has leading axes more. Give one of it.")
+            raise ValueError(
+                f"{self.name} is a batch: {', '.join(batched)} has additional leading axes. Give one member of it."
+            )
         if not is_concrete(system):
             raise TypeError(f"{self.name} is being traced: write its equations outside of jax.jit, vmap and grad.")
         if FUSES is not None:

@@ -65,7 +65,7 @@ class Folder:
 
     def read(self, start: int, like: Any, size: int) -> Any:
         """The chunk of `size` members that begins with a member, each in the structure of `like`; None where there is
-        none that is whole, of which `damaged` keeps account."""
+        none that is whole, which `damaged` lists."""
         path = self.file(start)
         if not path.exists():
             return None

@@ -24,7 +24,7 @@ Tree = Any
 
 
 class Row(dict):
-    """One member's numbers by name, for the functions that a user gives; it keeps account of what was read."""
+    """One member's numbers by name, for the functions that a user gives; it records which names were read."""
 
     def __init__(self, values: dict[str, Any]):
         super().__init__(values)

@@ -1,8 +1,9 @@
 """One chunk as one compiled program. Knows groups of lanes and devices; knows no mechanism and no files.
 
 On the CPU the members of a chunk are solved in small groups, one group after the other: as many as the vector units
-can use, and few enough that one that needs many steps keeps few others waiting. One that falls or is nonsense stops
-where it is. On other devices a chunk goes in step (`vmap`). Several devices share a chunk, each by a loop of its own.
+can use, and few enough that one that needs many steps keeps few others waiting. A member that ends early or is invalid
+stops there. On other devices all members of a chunk take their steps together (`vmap`). Several devices share a chunk,
+each by a loop of its own.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ class Job(eqx.Module):
     def solve(self, members: Any, size: int) -> Part:
         """The motions of a chunk (n, ...), n at most `size`: one program serves every chunk of a size."""
         n = jax.tree.leaves(members)[0].shape[0]
-        # What is missing to whole groups on every device is filled up with copies of the last member.
+        # Padded to whole groups on every device with copies of the last member.
         unit = GROUP * (1 if self.mesh is None else self.mesh.size)
         lanes = size if size <= GROUP and self.mesh is None else unit * -(-size // unit)
         places = np.minimum(np.arange(lanes), n - 1)

@@ -32,7 +32,7 @@ _ORDER = ("Ixx", "Ixy", "Ixz", "Iyz", "Izz", "mx", "my", "mz", "Iacross", "Iyy",
 def equations_at(chosen: Chosen, at: Instants) -> tuple[tuple[str, ...], np.ndarray, np.ndarray, np.ndarray]:
     """The names of the speeds, and Y (N, n, p), tau (N, n) and the trials (N,) of all instants at which they exist."""
     dtype = jnp.result_type(float)
-    # Filled up to a power of two with the last instant, so that few numbers of instants are programs of their own.
+    # Padded to a power of two with the last instant, so that few different sizes are compiled.
     n = len(at)
     places = np.minimum(np.arange(1 << (n - 1).bit_length()), n - 1)
     row = [jnp.asarray(x[places], dtype) for x in (at.t, at.q, at.u, at.u_dot)]

@@ -71,7 +71,8 @@ class _Equations:
         if not sigma and freedom <= 0:
             raise ValueError(
                 f"{self.rest.size} equations of motion, at {len(self.rest)} instants, determine "
-                f"{self.rest.size - freedom} numbers, and nothing of how large their errors are: give more instants, or `sigma`."
+                f"{self.rest.size - freedom} numbers, and not how large "
+                "their errors are: give more instants, or `sigma`."
             )
         for _ in range(0 if sigma else 4):  # each equation weighed by what remains in it
             left = self.rest - A @ z
@@ -82,11 +83,7 @@ class _Equations:
         known = np.diag(along) <= flat**2
         z = V[known].T @ (V[known] @ z)  # what is not determined stays
         left = self.rest - A @ z
-        seen = np.isfinite(np.diag(along))
-        spread: Any = V[seen].T @ along[np.ix_(seen, seen)] @ V[seen]
-        loose = np.any(np.abs(V[~seen]) > 1e-6, axis=0)
-        spread[loose] = spread[:, loose] = np.nan
-        spread[loose, loose] = np.inf
+        spread = _from_directions(V, along)
         full, covariance = np.zeros(b), np.zeros((b, b))
         full[moving] = z * self.scale[moving]
         covariance[np.ix_(moving, moving)] = spread * np.outer(self.scale[moving], self.scale[moving])
@@ -146,3 +143,14 @@ class _Equations:
             found[places] = first + np.arange(len(places)) // length
             first = found[places].max() + 1
         return found
+
+
+def _from_directions(V: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """A covariance (m, m) of directions, the rows of V, as that of what they are directions of: infinite variances, and
+    covariances NaN, of all that has a part in a direction without information."""
+    seen = np.isfinite(np.diag(along))
+    spread: Any = V[seen].T @ along[np.ix_(seen, seen)] @ V[seen]
+    loose = np.any(np.abs(V[~seen]) > 1e-6, axis=0)
+    spread[loose] = spread[:, loose] = np.nan
+    spread[loose, loose] = np.inf
+    return spread

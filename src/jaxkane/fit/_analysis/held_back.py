@@ -21,7 +21,7 @@ from .._result.result import Fit
 
 
 def applied_to(fit: Fit, trials: Sequence[Trial] | Trial) -> Fit:
-    """The parameters of a fit on other trials, of which only starts and biases are found: a look at data held back.
+    """The parameters of a fit on other trials, of which only starts and biases are found (held-out data).
 
         jk.fit.applied_to(result, others).variance_accounted_for
 
@@ -68,7 +68,7 @@ class CrossValidation:
 
     @property
     def verdict(self) -> str:
-        """What a fit takes away from trials it has not seen, in words."""
+        """By how much a fit lowers the sum of squares of trials that it was not fitted to, in words."""
         if self.cost_name != "sum of squares":
             less = self.at_start.sum() - self.held_out.sum()
             return f"held out, the {self.cost_name} of all is {less:.4g} below that of the start."
@@ -85,7 +85,7 @@ class CrossValidation:
 
 
 def cross_validate(fit: Fit, folds: int | Sequence[Sequence[int]] | None = None) -> CrossValidation:
-    """Fit some trials and look at the others: does what was found hold where it was not looked for?
+    """Cross-validation: fit some of the trials, and predict the others with the parameters that were found.
 
     **Arguments:** `folds`: how many, or the numbers of the trials that are left out together; by default each trial
     alone, and five folds from eleven trials on.

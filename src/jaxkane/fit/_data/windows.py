@@ -46,7 +46,7 @@ class Windows(eqx.Module):
 
     @property
     def by_trial(self) -> Array:
-        """The windows of every trial (T, m), filled up with W."""
+        """The windows of every trial (T, m), padded with W."""
         owner = np.asarray(self.trial)
         own = [np.flatnonzero(owner == k) for k in range(owner.max() + 1)]
         most = max(map(len, own))

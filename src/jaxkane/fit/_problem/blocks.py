@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, Int
 
 class Blocks(eqx.Module):
     """Linearized residuals: `R` (W, k, k) with k = n_z + n_next + n_b + n_x + 1, where n_next is n_z or, without
-    chains, 0; and the windows of every trial in their order (T, m), filled up with W."""
+    chains, 0; and the windows of every trial in their order (T, m), padded with W."""
 
     R: Float[Array, "W k k"]
     windows: Int[Array, "T m"]

@@ -77,8 +77,8 @@ def cost(problem: Problem, point: Unknowns) -> float:
 
 
 def simulated(problem: Problem, point: Unknowns) -> np.ndarray:
-    """What the sensors would have said (W, n_c, n_t), with process noise followed by its deviations (W, 2 n_c, n_t);
-    NaN where that cannot be simulated."""
+    """What the sensors would have measured (W, n_c, n_t), with process noise followed by its deviations (W, 2 n_c,
+    n_t); NaN where that cannot be simulated."""
     found = _starts(problem, point)
     if found is None:
         several = 1 if problem.model.noise is None else 2
@@ -87,7 +87,7 @@ def simulated(problem: Problem, point: Unknowns) -> np.ndarray:
 
 
 def all_of(seen: Seen) -> np.ndarray:
-    """What `simulated` gives, of what was seen."""
+    """Simulated measurements and their deviations, as `simulated` gives them."""
     parts = [x for x in (seen.simulated, seen.deviation) if x is not None]
     return np.concatenate(parts, axis=1)
 

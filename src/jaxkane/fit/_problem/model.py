@@ -162,7 +162,7 @@ class Model(eqx.Module):
         return window.t_input + delay
 
     def simulated(self, ride: Trajectory, b: Array, roles: Roles) -> Array:
-        """What the sensors would have said (n_c, n_t)."""
+        """What the sensors would have measured (n_c, n_t)."""
         rows = []
         for c in self.channels:
             y = ride[c]

@@ -36,7 +36,7 @@ def finer(problem: Problem, point: Unknowns) -> Problem:
         after = simulated(halved, point)
         apart = _apart(problem, before, after)
         going &= ~(apart <= step_tolerance(problem))
-        # What halving does not bring nearer has no step: it is chaotic, or ends too early with each.
+        # Where halving does not reduce the difference, no step is fine enough: the motion is chaotic, or ends early.
         going &= (halvings < 2) | (np.isfinite(apart) & (apart <= last / 2))
         if not going.any():
             break

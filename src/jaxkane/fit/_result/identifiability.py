@@ -147,14 +147,27 @@ def identifiability_at(problem: Problem, point: Unknowns, at: Linearization, fla
         covariance=covariance,
         covariance_of_x=to_x @ scaled @ to_x.T,
     )
-    # That the numbers of a learned function are not determined one by one is as it should be.
-    physical = np.array([not part for part in parameters.learned])
-    weak = [i for i in reversed(range(p)) if not deviations[i] <= flat and np.any(np.abs(V[i, physical]) > 0.1)]
+    return dataclasses.replace(found, undetermined=_undetermined(found, np.array(parameters.learned) == "", flat))
+
+
+def _undetermined(found: Identifiability, physical: np.ndarray, flat: float) -> tuple[Direction, ...]:
+    """Directions whose deviation exceeds `flat`, weakest first. `physical` (p,): which parameters are no numbers of a
+    learned function, which need not be determined one by one."""
+    V, names = found.vectors, found.names
+    weak = [
+        i
+        for i in reversed(range(len(names)))
+        if not found.deviations[i] <= flat and np.any(np.abs(V[i, physical]) > 0.1)
+    ]
     rows = V.copy()
-    nothing = [i for i in weak if s[i] == 0 and names[int(np.abs(V[i]).argmax())] not in found.without_influence]
+    nothing = [
+        i
+        for i in weak
+        if found.singular_values[i] == 0 and names[int(np.abs(V[i]).argmax())] not in found.without_influence
+    ]
     if len(nothing) > 1 and physical.all():
         rows[nothing] = _with_fewest_parts(V[nothing])
-    return dataclasses.replace(found, undetermined=tuple(_direction(found, i, rows[i]) for i in weak))
+    return tuple(_direction(found, i, rows[i]) for i in weak)
 
 
 def _with_fewest_parts(V: np.ndarray, most: int = 20_000) -> np.ndarray:

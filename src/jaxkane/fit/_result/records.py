@@ -1,4 +1,4 @@
-"""What records look like before any model is asked: stale, limited, in degrees, differences of each other, with gaps.
+"""Checks of records that need no model: stale samples, limits, degrees, differences of each other, gaps.
 
 Knows samples and names; knows no system's equations.
 """
