@@ -151,7 +151,7 @@ def test_what_a_part_answers_wrongly_is_refused(part, error, words):
 def test_a_command_that_comes_too_late_is_refused(parts):
     """It would be lost: the part that has the input has read it already."""
     bicycle = BENCHMARK.with_parts(**parts)
-    with pytest.raises(ValueError, match="behind the part that reads it"):
+    with pytest.raises(ValueError, match="after the part that reads it"):
         jk.accelerations(bicycle, 0.0, jnp.zeros(8), jnp.zeros(3))
 
 

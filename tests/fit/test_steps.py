@@ -9,7 +9,6 @@ from scipy import stats
 from systems import Cart
 
 from jaxkane.fit import BFGS, Free, GradientDescent, LeastSquares, Problem, Simulation, Trial, fit, laplace, minimize
-from jaxkane.fit._problem.step_halving import step_errors, step_tolerance
 
 H, SIGMA = 0.25, 0.001
 t = np.arange(0.0, 10.0, H)
@@ -57,9 +56,9 @@ def test_few_samples_a_period_have_no_bias(trial, by_exact_motion):
     best, errors = by_exact_motion
     found = fit(GUESS, trial, NAMES, optimizer=LeastSquares())
     assert found.ok, found.message
-    assert found.step_error < step_tolerance(found.problem)
+    assert found.step_error < found.problem.step_tolerance
     # The tolerance bounds what the steps do to the estimates.
-    assert np.all(np.abs((np.array(list(found.estimates.values())) - best) / errors) < step_tolerance(found.problem))
+    assert np.all(np.abs((np.array(list(found.estimates.values())) - best) / errors) < found.problem.step_tolerance)
 
 
 def test_steps_too_coarse_are_told_or_halved(trial):
@@ -83,9 +82,9 @@ def test_steps_too_coarse_are_told_or_halved(trial):
 
 def test_a_step_longer_than_a_window_is_one_that_halving_shortens(trial):
     posed = [Problem.of(GUESS, trial, NAMES, simulation=Simulation(step=x)) for x in (t[-1], 100.0 * t[-1])]
-    errors = [step_errors(problem, problem.start) for problem in posed]
+    errors = [problem.step_errors(problem.start) for problem in posed]
     np.testing.assert_array_equal(errors[0], errors[1])
-    assert not errors[1] < step_tolerance(posed[1])  # NaN where such a step goes nowhere
+    assert not errors[1] < posed[1].step_tolerance  # NaN where such a step goes nowhere
 
 
 def test_what_says_how_to_integrate(trial):

@@ -16,7 +16,6 @@ from .._optimize.steps import solve_nuisance, uninterrupted
 from .._problem.arguments import refuse_other
 from .._problem.model import Unknowns
 from .._problem.problem import Problem
-from .._problem.step_halving import finer
 from .._result.result import Fit
 
 
@@ -34,7 +33,7 @@ def applied_to(fit: Fit, trials: Sequence[Trial] | Trial) -> Fit:
     problem = fit.problem.with_trials(trials)
     first = dataclasses.replace(problem.start, x=fit.point.x)
     if problem.chooses_steps:
-        problem = finer(problem, first)
+        problem = problem.finer(first)
     before = solve_nuisance(problem, problem.start)[1].cost
     point, at = solve_nuisance(problem, first, steps=20, rtol=1e-6)
     return Fit.of(problem, point, at, (before, at.cost), "applied", fit.method)

@@ -11,7 +11,6 @@ import numpy as np
 
 from .._problem.model import Unknowns
 from .._problem.problem import Problem
-from .._problem.step_halving import finer
 from .._result.result import Fit
 from .gradient_descent import GradientDescent
 from .minimize import minimize
@@ -35,7 +34,7 @@ def solve(
     for _ in range(3):
         if not result.problem.chooses_steps or result.status != "converged" or not result.too_coarse:
             break
-        problem = finer(result.problem, result.point)
+        problem = result.problem.finer(result.point)
         if np.array_equal(problem.windows.step, result.problem.windows.step):
             break
         again = minimize(problem, optimizer.without_preparation(), start=result.point, **run)

@@ -17,6 +17,7 @@ from ..._method.checks import check_system
 from ..._simulation.trajectory import Trajectory
 from .._data.trial import Trial
 from .._data.windows import Place, Windows, cut
+from . import step_halving
 from .arguments import check_windows, refuse_other
 from .entries import parameters_of
 from .free import Prior
@@ -27,7 +28,6 @@ from .parallel import check_same
 from .parameters import Parameters
 from .programs import rides_of, starts_of
 from .simulation import Simulation
-from .step_halving import finer
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,7 +103,7 @@ class Problem:
         if processes:
             check_same(model, windows)
         problem = cls(model, windows, windows.by_trial, trials, places, posed, processes)
-        return finer(problem, problem.start) if problem.chooses_steps else problem
+        return problem.finer(problem.start) if problem.chooses_steps else problem
 
     @property
     def cost_name(self) -> str:
@@ -119,6 +119,24 @@ class Problem:
     def has_steps(self) -> bool:
         """Whether something follows from fixed steps: the motion, or what noise adds to it."""
         return self.model.settings.step is not None or self.model.noise is not None
+
+    def finer(self, point: Unknowns) -> Problem:
+        """The problem with steps halved where that changes what is simulated at a point by more than a share of the
+        noise."""
+        return step_halving.finer(self, point)
+
+    @property
+    def step_tolerance(self) -> float:
+        """By how much halving the step may move all residuals of one window together, in standard deviations."""
+        return step_halving.step_tolerance(self)
+
+    def step_errors(self, point: Unknowns, now: np.ndarray | None = None) -> np.ndarray:
+        """By how much halving the step moves all residuals of every window (W,) together, in standard deviations; NaN
+        where a window is not simulated to its end, or where the step follows from tolerances.
+
+        `now`: what is simulated at the point, where that is known.
+        """
+        return step_halving.step_errors(self, point, now)
 
     def with_steps(self, step: Array) -> Problem:
         """The same problem with other steps of integration (W,) [s]; nothing is compiled anew."""

@@ -18,7 +18,7 @@ from .._problem.model import Unknowns
 from .._problem.parameters import Parameters
 from .._problem.problem import Problem
 from .._problem.state_file import described, write_state
-from .._problem.step_halving import STEP_TOLERANCE, step_errors
+from .._problem.step_halving import STEP_TOLERANCE
 from . import covariance, notes, residuals
 from .identifiability import Identifiability, identifiability_at, residual_variance
 from .nuisance import nuisance_by_trial
@@ -55,7 +55,7 @@ class Fit:
     problem: Problem
     point: Unknowns
     linearization: Linearization
-    step_errors: np.ndarray  # (W,), see `step_halving.step_errors`
+    step_errors: np.ndarray  # (W,), see `Problem.step_errors`
     history: tuple[float, ...]
     status: str
     method: str
@@ -71,7 +71,7 @@ class Fit:
         errors = np.full(len(problem.places), np.nan)
         if status != "interrupted":
             try:
-                errors = step_errors(problem, point, all_of(at.seen))
+                errors = problem.step_errors(point, all_of(at.seen))
             except KeyboardInterrupt:
                 status = "interrupted"
         return cls(problem, point, at, errors, tuple(history), status, method)
