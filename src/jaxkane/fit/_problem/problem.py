@@ -113,12 +113,7 @@ class Problem:
     @property
     def chooses_steps(self) -> bool:
         """Whether fixed steps of integration are halved until they are fine enough: where no step was given."""
-        return self.has_steps and self.posed["simulation"].step is None
-
-    @property
-    def has_steps(self) -> bool:
-        """Whether something follows from fixed steps: the motion, or what noise adds to it."""
-        return self.model.settings.step is not None or self.model.noise is not None
+        return step_halving.has_steps(self) and self.posed["simulation"].step is None
 
     def finer(self, point: Unknowns) -> Problem:
         """The problem with steps halved where that changes what is simulated at a point by more than a share of the

@@ -21,6 +21,11 @@ HALVINGS = 8
 """Of a step between two samples, at most: what needs more is stiff or chaotic."""
 
 
+def has_steps(problem: Problem) -> bool:
+    """Whether something follows from fixed steps: the motion, or what noise adds to it."""
+    return problem.model.settings.step is not None or problem.model.noise is not None
+
+
 def finer(problem: Problem, point: Unknowns) -> Problem:
     """The problem with steps halved where that changes what is simulated at a point by more than a share of the noise.
 
@@ -58,7 +63,7 @@ def step_errors(problem: Problem, point: Unknowns, now: np.ndarray | None = None
 
     `now`: what is simulated at the point, where that is known.
     """
-    if not problem.has_steps:
+    if not has_steps(problem):
         return np.full(len(problem.places), np.nan)
     now = simulated(problem, point) if now is None else now
     return _apart(problem, now, simulated(problem.with_steps(problem.windows.step / 2), point))
