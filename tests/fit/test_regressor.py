@@ -424,7 +424,7 @@ def test_what_data_do_not_tell_is_named_and_stays():
 def test_bad_data_are_refused_by_name():
     truth, at = swings()
     first = lambda n: Instants(at.t[:n], at.q[:n], at.u[:n], at.u_dot[:n])  # noqa: E731
-    with pytest.raises(ValueError, match="nothing of how large their errors are"):
+    with pytest.raises(ValueError, match="not how large their errors are"):
         base_parameters(truth, first(1), bodies=ARMS, parameters=FRICTION)
     gaps = np.array(at.u_dot)
     gaps[5:] = np.nan

@@ -15,6 +15,7 @@ from .._description.system import System
 from .._scalars.fuse import fused
 from .._scalars.linear import stack
 from .._scalars.versions import version_of
+from .._simulation.one_motion import reached_times
 from .._simulation.trajectory import Trajectory
 from ._sketch import Element, Figure, Sketch, rotation
 
@@ -51,23 +52,7 @@ def record(system: System, trajectory: Trajectory, figure: Figure | None) -> Rec
     its times.
     """
     name = type(system).__name__
-    if not isinstance(trajectory, Trajectory):
-        raise TypeError(f"animate({name}): the second argument is a Trajectory, as from simulate, got {trajectory!r}.")
-    if trajectory.t.ndim != 1:
-        raise ValueError(
-            f"animate({name}): takes one motion; of a batch of shape {trajectory.t.shape[:-1]} give one member: "
-            "jax.tree.map(lambda x: x[0], rides)."
-        )
-    if trajectory.names[0] != tuple(system.coordinates):
-        raise ValueError(
-            f"animate({name}): the trajectory has the coordinates {', '.join(trajectory.names[0])}, the system has "
-            f"{', '.join(system.coordinates)}: it is the motion of another system."
-        )
-    reached = np.all(np.isfinite(np.asarray(trajectory.q)), axis=1)
-    if reached.sum() < 2:
-        raise ValueError(
-            f"animate({name}): the simulation reached only {reached.sum()} of its times: {trajectory.reason}."
-        )
+    reached = reached_times("animate", system, trajectory)
     numbers, rest = eqx.partition(system, eqx.is_array)
     t, q, u, u_dep = (np.asarray(x)[reached] for x in (trajectory.t, trajectory.q, trajectory.u, trajectory.u_dep))
     u = np.concatenate([u, u_dep], axis=1)

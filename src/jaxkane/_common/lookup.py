@@ -25,6 +25,11 @@ def hint(wrong: str | Iterable[str], known: Iterable[str], have: str = "there ar
     return f"{have} {', '.join(known[:_LISTED]) or 'none'}{more}."
 
 
+def as_names(given: str | Iterable[str]) -> tuple[str, ...]:
+    """Names; one alone may be given as a string."""
+    return (given,) if isinstance(given, str) else tuple(given)
+
+
 def refuse_unknown(given: Iterable[str], known: Iterable[str], message: str, have: str = "there are") -> None:
     """`ValueError` for names that are not known; `message` stands before them: "Bicycle: q has no"."""
     known = tuple(known)

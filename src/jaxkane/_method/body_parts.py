@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._common.lookup import refuse_unknown
+from .._common.lookup import as_names, refuse_unknown
 from .._common.memory import Memory
 from .._description.bodies import UNNAMED, Body
 from .._description.motion import Motion
@@ -23,7 +23,7 @@ from .._description.vectors import Vector
 from .._scalars.components import is_zero
 from .._scalars.jax_internals import Literal, concretely
 from .reading import Reading
-from .trial_numbers import structure_of, with_trial_numbers
+from .trial_numbers import dtype_of, structure_of, with_trial_numbers
 
 TEN = ("m", "mx", "my", "mz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
 """Mass [kg], first moment [kg m], and inertia [kg m^2] as matrix entries, about the body's own point."""
@@ -101,7 +101,7 @@ def described(system: System, bodies: Bodies) -> Described:
     parts, leaves = _PARTS[structure]
     given = bodies
     if bodies is not None:
-        bodies = (bodies,) if isinstance(bodies, str) else tuple(bodies)
+        bodies = as_names(bodies)
         named = [part.name for part in parts]
         refuse_unknown(bodies, named, f"{type(system).__name__} has no body with a mass named", "it has")
         twice = sorted({name for name in bodies if bodies.count(name) > 1})
@@ -123,7 +123,7 @@ def _chosen_of(part: Part, names: Sequence[str] | None) -> Part:
     """A part with only some of its parameters."""
     if names is None:
         return part
-    names = (names,) if isinstance(names, str) else tuple(names)
+    names = as_names(names)
     known = [name.rpartition(".")[2] for name in part.names]
     refuse_unknown(names, known, f"`bodies`: {part.name} has no parameter", "it has")
     if part.axis is None:
@@ -144,7 +144,7 @@ def _read_parts(system: System) -> tuple[tuple[Part, ...], tuple[int, ...]]:
         rows = [spin.components_in(body.frame) for spin, body in zip(spins, bodies, strict=True)]
         return [jnp.asarray(body.mass, float) for body in bodies], [jnp.stack([*map(jnp.asarray, row)]) for row in rows]
 
-    number = jax.ShapeDtypeStruct((), jnp.result_type(float))
+    number = jax.ShapeDtypeStruct((), dtype_of(system))
     n_u = len(system.speeds) + len(system.dependent_speeds)
     rows = [[number] * n for n in (len(system.coordinates), n_u)]
     program = jax.make_jaxpr(lambda *args: read(*args)[0])(leaves, number, *rows).jaxpr

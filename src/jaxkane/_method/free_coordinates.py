@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from .._common.lookup import refuse_unknown
+from .._common.lookup import as_names, refuse_unknown
 from .._common.memory import Memory
 from .._description.system import System
 from .._scalars.jax_internals import concretely
@@ -35,7 +35,7 @@ def plan_of(system: System, q: Any, free: Sequence[str] | None) -> Plan:
     quaternions = _euler_parameters(system) if isinstance(q, Mapping) else []
     guess = {names[four[3]]: 1.0 for four in quaternions if names[four[3]] not in named}
     if free is not None:
-        free = (free,) if isinstance(free, str) else tuple(free)
+        free = as_names(free)
         refuse_unknown(free, names, f"{type(system).__name__} has no coordinate", "it has")
         return Plan(tuple(c for c in names if c in free), named, guess, lenient=True)
     if system.dependent_coordinates:

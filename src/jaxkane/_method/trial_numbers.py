@@ -18,6 +18,13 @@ def structure_of(system: System) -> tuple[Any, ...]:
     return (version_of(system), jax.tree.structure(system), *(np.shape(x) for x in jax.tree.leaves(system)))
 
 
+def dtype_of(system: System) -> Any:
+    """The type of a system's parameters; that of Python's floats where it has none."""
+    leaves = [x for x in jax.tree.leaves(system) if hasattr(x, "dtype")]
+    dtypes = [x.dtype for x in leaves if jnp.issubdtype(x.dtype, jnp.floating)]
+    return np.result_type(*dtypes) if dtypes else jnp.result_type(float)
+
+
 def with_trial_numbers(tree: tuple[System, Any, Any], rng: np.random.Generator) -> tuple[System, Any, Any]:
     """Numbers for what is traced: positive parameters, small coordinates; arrays of length 1, as axes and quaternions
     are, and unit matrices."""
@@ -33,7 +40,7 @@ def with_trial_numbers(tree: tuple[System, Any, Any], rng: np.random.Generator) 
 
     system = jax.tree.map(parameter, system)
     if q is None or isinstance(q, Tracer):
-        n, dtype = len(system.coordinates), jnp.result_type(float) if q is None else q.dtype
+        n, dtype = len(system.coordinates), dtype_of(system) if q is None else q.dtype
         q = rng.uniform(0.1, 0.5, n) * rng.choice((-1.0, 1.0), n)
         q = q.astype(dtype)
     return system, 0.3 if isinstance(t, Tracer) else t, np.asarray(q)

@@ -11,6 +11,7 @@ import numpy as np
 from .._description.system import System
 from .._method.drift import relative_condition
 from .balance import condition_of_masses, measured_along, work_of
+from .one_motion import reached_times
 from .trajectory import Trajectory
 
 LOOK, BAD = "look", "bad"
@@ -141,20 +142,11 @@ def audit(system: System, trajectory: Trajectory) -> Audit:
 
     **Returns:** an `Audit`. What comes after the end of a simulation that stopped early is left out.
 
-    **Raises:** `ValueError` for a batch, and for a trajectory that reached fewer than two of its times.
+    **Raises:** `ValueError` for a batch, for the motion of another system, and for one that reached fewer than two
+    of its times.
     """
     name = type(system).__name__
-    if not isinstance(trajectory, Trajectory):
-        raise TypeError(f"audit({name}): the second argument is a Trajectory, as from simulate, got {trajectory!r}.")
-    if trajectory.t.ndim != 1:
-        raise ValueError(
-            f"audit({name}): takes one motion; of a batch of shape {trajectory.t.shape[:-1]} give one member."
-        )
-    reached = np.all(np.isfinite(np.asarray(trajectory.q)), axis=1)
-    if reached.sum() < 2:
-        raise ValueError(
-            f"audit({name}): the simulation reached only {reached.sum()} of its times: {trajectory.reason}."
-        )
+    reached = reached_times("audit", system, trajectory)
     t, q, u = (x[reached] for x in (trajectory.t, trajectory.q, trajectory.u))
     inputs = {key: x[reached] for key, x in trajectory.values.items()}
     now = jax.tree.map(lambda x: np.asarray(x, dtype=float), measured_along(system, t, q, u, inputs))

@@ -14,7 +14,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._common.lookup import refuse_unknown
+from .._common.lookup import as_names, refuse_unknown
 from .._description.parameters import parameter, to_float
 from .._method.checks import is_concrete
 from .._scalars.components import mul, sub
@@ -74,7 +74,7 @@ class ScheduledGains(Part):
     """
 
     at: tuple[float, ...] = eqx.field(static=True, converter=lambda at: tuple(np.asarray(at, dtype=float).tolist()))
-    measured: tuple[str, ...] = eqx.field(static=True, converter=lambda m: (m,) if isinstance(m, str) else tuple(m))
+    measured: tuple[str, ...] = eqx.field(static=True, converter=as_names)
     gains: Float[Array, "n m"] = eqx.field(converter=to_float)
     follow: Float[Array, " n"] = eqx.field(converter=to_float)
     command: str = eqx.field(static=True, default=STEER)

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from .._common.lookup import refuse_unknown
 from .._description.system import System
-from .._method.formulas import OFFERED, Formulas
+from .._method.formulas import Formulas
 from .._scalars.graph import OPERATORS, NotScalarError, needed
 from .._scalars.written import as_objects
+from ._functions import one_function
 from ._names import in_ascii
 
 
@@ -38,9 +38,7 @@ def casadi(system: System, function: str = "rates", *, name: str | None = None) 
     """
     ca = _imported()
     formulas = Formulas(system)
-    if not isinstance(function, str):
-        raise TypeError(f"casadi exports one function at a time; `function` is its name, got {function!r}.")
-    refuse_unknown([function], OFFERED, f"{formulas.name}: there is no function", "there are")
+    one_function(formulas, function, "casadi")
     found = formulas.nodes(function)
     columns: dict[str, list[Any]] = {kind: [] for kind in ("t", "q", "u", "inputs", "parameters")}
     given = {}

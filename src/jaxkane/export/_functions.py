@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -26,6 +27,14 @@ def chosen(formulas: Formulas, functions: Sequence[str] | None, usual: Sequence[
         raise ValueError(f"{formulas.name}: `functions` names none; leave it out for the usual ones.")
     refuse_unknown(functions, OFFERED, f"{formulas.name}: there is no function", "there are")
     return functions
+
+
+def one_function(formulas: Formulas, function: Any, exporter: str) -> str:
+    """The name of the one function that an exporter was asked for, checked."""
+    if not isinstance(function, str):
+        raise TypeError(f"{exporter} exports one function at a time; `function` is its name, got {function!r}.")
+    refuse_unknown([function], OFFERED, f"{formulas.name}: there is no function", "there are")
+    return function
 
 
 def parameters(system: System) -> dict[str, np.ndarray]:

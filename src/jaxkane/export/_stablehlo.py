@@ -8,9 +8,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._common.lookup import refuse_unknown
 from .._description.system import System
-from .._method.formulas import OFFERED, Formulas
+from .._method.formulas import Formulas
+from ._functions import one_function
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 
@@ -56,9 +56,7 @@ def stablehlo(
     if path is not None:
         _refuse_without_flatbuffers()
     formulas = Formulas(system, dtype)
-    if not isinstance(function, str):
-        raise TypeError(f"stablehlo exports one function at a time; `function` is its name, got {function!r}.")
-    refuse_unknown([function], OFFERED, f"{formulas.name}: there is no function", "there are")
+    one_function(formulas, function, "stablehlo")
     if isinstance(platforms, str):
         raise TypeError(f"platforms is a sequence of names; one is ({platforms!r},).")
     strange = [platform for platform in platforms if platform not in PLATFORMS]

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from .._common.lookup import as_names
 from .._description.units import in_degrees, refuse_no_angle, unit_of
 from .._simulation.trajectory import Status, Trajectory
 from ._axes import SOFT, finish, panels
@@ -43,7 +44,7 @@ def trajectories(
     **Raises:** `KeyError` for a name that the trajectory does not have; `ValueError` for `degrees` where nothing is
     known to be an angle.
     """
-    groups = [(group,) if isinstance(group, str) else tuple(group) for group in names or trajectory.names[0]]
+    groups = [as_names(group) for group in names or trajectory.names[0]]
     drawn = [name for group in groups for name in group]
     known = {name: unit_of(name, dict(trajectory.units) | dict(units or {})) for name in drawn}
     values = {name: np.asarray(trajectory[name], dtype=float) for name in drawn}

@@ -13,7 +13,7 @@ from ..._common.lookup import refuse_unknown
 from ..._description.system import System
 from .._problem.entries import as_items, parameters_of
 from .._problem.free import Delay
-from .._problem.names import Names
+from .._problem.names import Names, deviations_by_name
 from .._result.result import Fit
 
 Bounds = tuple[float | None, float | None]
@@ -60,7 +60,7 @@ class Candidate:
     @property
     def of_trials(self) -> dict[str, dict[str, float | None]]:
         """What every trial has its own of, by the argument of `fit`."""
-        return {key: _by_name(getattr(self, key)) for key in OF_TRIALS}
+        return {key: deviations_by_name(getattr(self, key)) for key in OF_TRIALS}
 
 
 def candidates_of(fit: Fit, given: Any) -> tuple[Candidate, ...]:
@@ -126,20 +126,14 @@ def _refuse_nothing_new(fit: Fit, candidate: Candidate) -> None:
         raise ValueError(f"{candidate.name}: {', '.join(free)} is free in the fit already.")
     posed, more = fit.problem.posed, candidate.of_trials
     for key in OF_TRIALS:
-        there = [name for name in more[key] if name in _by_name(posed[key])]
+        there = [name for name in more[key] if name in deviations_by_name(posed[key])]
         if there:
             raise ValueError(f"{candidate.name}: every trial has its own {key} of {', '.join(there)} already.")
-    starts = [name for name in _by_name(candidate.unknown) if name in _by_name(posed["unknown"])]
+    starts = [name for name in deviations_by_name(candidate.unknown) if name in deviations_by_name(posed["unknown"])]
     if starts:
         raise ValueError(f"{candidate.name}: the start of {', '.join(starts)} is unknown already.")
     if not names and not any(more.values()) and not candidate.unknown and candidate.system is None:
         raise ValueError(f"{candidate.name}: nothing is freed, and nothing else is unknown.")
-
-
-def _by_name(given: Names) -> dict[str, float | None]:
-    if isinstance(given, Mapping):
-        return dict(given)
-    return dict.fromkeys((given,) if isinstance(given, str) else given)
 
 
 def groups_of(fit: Fit, candidates: Sequence[Candidate]) -> Iterator[list[Candidate]]:
@@ -161,13 +155,17 @@ def groups_of(fit: Fit, candidates: Sequence[Candidate]) -> Iterator[list[Candid
 
 def _same_frame(fit: Fit, a: Candidate, b: Candidate) -> bool:
     systems = [c.system or fit.problem.system for c in (a, b)]
-    same = _by_name(a.unknown) == _by_name(b.unknown) and _held_and_late(fit, a) == _held_and_late(fit, b)
+    same = deviations_by_name(a.unknown) == deviations_by_name(b.unknown) and _held_and_late(fit, a) == _held_and_late(
+        fit, b
+    )
     return same and bool(eqx.tree_equal(*systems))
 
 
 def _held_and_late(fit: Fit, candidate: Candidate) -> set[str]:
     """Inputs under a zero-order hold that a candidate delays."""
-    late = {item.what for item in candidate.items if isinstance(item, Delay)} | {*_by_name(candidate.input_delay)}
+    late = {item.what for item in candidate.items if isinstance(item, Delay)} | {
+        *deviations_by_name(candidate.input_delay)
+    }
     return late & {*fit.problem.model.held}
 
 
@@ -188,9 +186,9 @@ def posed_with(fit: Fit, candidates: Sequence[Candidate]) -> dict[str, Any]:
             items.append((item, names))
     posed["free"] = [*as_items(posed["free"]), *(item for item, _ in items)]
     for key in ("unknown", *OF_TRIALS):
-        posed[key] = _by_name(posed[key])
+        posed[key] = deviations_by_name(posed[key])
         for candidate in candidates:
-            posed[key] |= _by_name(getattr(candidate, key))
+            posed[key] |= deviations_by_name(getattr(candidate, key))
     return posed
 
 

@@ -12,7 +12,7 @@ import equinox as eqx
 import numpy as np
 import scipy.optimize
 
-from ..._common.lookup import refuse_unknown
+from ..._common.lookup import as_names, refuse_unknown
 from .._data.trial import Trial
 from .._optimize.least_squares import LeastSquares
 from .._optimize.minimize import minimize
@@ -67,7 +67,7 @@ def find_continuity(fit: Fit, sigma: Sequence[str] = ()) -> Fit:
     links = dict(problem.posed["continuity"] or {})
     if not links:
         raise ValueError("find_continuity: no windows are linked here: give `window`, and `continuity` to begin with.")
-    sigma = (sigma,) if isinstance(sigma, str) else tuple(sigma)
+    sigma = as_names(sigma)
     refuse_unknown(sigma, problem.channels, "find_continuity: `sigma` names")
     now, limit = fit, -np.log(SMALLEST)
 

@@ -21,6 +21,7 @@ from .._problem.arguments import refuse_other
 from .._problem.filtered import brought_back, filtered
 from .._problem.model import Model, Unknowns
 from .._problem.programs import each, starts_of
+from .._result.covariance import check_level
 from .._result.result import Fit
 
 DIFFUSE = 1e4
@@ -58,8 +59,7 @@ class Smoothed:
 
     def band(self, name: str, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper ends (n_t,), between which the value lies with this probability at each time."""
-        if not 0 < level < 1:
-            raise ValueError(f"`level` is a probability between 0 and 1, such as 0.95; got {level}.")
+        check_level(level)
         half = float(stats.norm.ppf(0.5 * (1 + level))) * self.deviation(name)
         return self[name] - half, self[name] + half
 

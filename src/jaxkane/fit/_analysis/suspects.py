@@ -12,6 +12,7 @@ from .._optimize.least_squares import LeastSquares
 from .._optimize.solve import solve
 from .._problem.arguments import refuse_other
 from .._problem.problem import Problem
+from .._result.covariance import check_level
 from .._result.result import Fit
 from .candidates import Candidate, candidates_of, posed_with
 from .held_back import folds_of
@@ -118,8 +119,7 @@ def _check(fit: Fit, depth: Any, refits: Any, level: float) -> None:
             continue
         if not isinstance(value, int) or value < least:
             raise ValueError(f"`{name}` is a whole number of {least} at least, got {value!r}.")
-    if not 0 < level < 1:
-        raise ValueError(f"`level` is a probability between 0 and 1, such as 0.05; got {level}.")
+    check_level(level)
 
 
 def _fitted(fit: Fit, taken: Sequence[Candidate], standing: Standing) -> Fit:

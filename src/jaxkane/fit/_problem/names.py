@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from ..._common.lookup import hint, refuse_unknown
+from ..._common.lookup import as_names, hint, refuse_unknown
 from ..._description.system import System
 from ..._method.drift import has_configuration_constraints
 from ..._method.free_coordinates import found_of
@@ -41,10 +41,14 @@ def checked_trials(system: System, trials: Sequence[Trial]) -> tuple[str, ...]:
     return tuple(dict.fromkeys(channel for trial in trials for channel in trial.measured))
 
 
+def deviations_by_name(given: Names) -> dict[str, float | None]:
+    """Each name with its standard deviation, or None."""
+    return dict(given) if isinstance(given, Mapping) else dict.fromkeys(as_names(given))
+
+
 def checked_names(system: System, what: str, given: Any, known: Sequence[str]) -> dict[str, float]:
     """Names with the deviations of their priors."""
-    given = (given,) if isinstance(given, str) else given
-    given = dict(given) if isinstance(given, Mapping) else dict.fromkeys(given)
+    given = deviations_by_name(given)
     wrong = [name for name in given if name not in known]
     if wrong:
         raise ValueError(

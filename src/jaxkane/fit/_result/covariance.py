@@ -130,10 +130,15 @@ def intervals(parameters: Parameters, x: Array, half: np.ndarray) -> list[tuple[
     return [(float(min(a, b)), float(max(a, b))) for a, b in zip(low, high, strict=True)]
 
 
+def check_level(level: float) -> None:
+    """**Raises:** `ValueError` for what is no probability between 0 and 1."""
+    if not 0 < level < 1:
+        raise ValueError(f"`level` is a probability between 0 and 1, such as 0.95 or 0.05; got {level}.")
+
+
 def t_quantile(level: float, freedom: int) -> float:
     """Two-sided, of Student's distribution; NaN without a degree of freedom."""
-    if not 0 < level < 1:
-        raise ValueError(f"`level` is a probability between 0 and 1, such as 0.95; got {level}.")
+    check_level(level)
     return float(stats.t.ppf(0.5 * (1 + level), freedom)) if freedom > 0 else float("nan")
 
 
