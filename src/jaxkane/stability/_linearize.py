@@ -28,7 +28,7 @@ from .._scalars.versions import compiled
 from ._cyclic import cyclic_coordinates
 from ._eig import Eig, eig, eigvals
 from ._solve import jacobian
-from ._steadiness import check_state, inputs_by_name, is_wrong
+from ._steadiness import check_dependent, check_state, inputs_by_name, is_wrong
 from ._steady import SteadyMotion
 
 Outputs = Sequence[str] | Mapping[str, Callable[..., Any]] | None
@@ -120,12 +120,7 @@ def linearize(
     origin = (system, t, q, u, x, w)
     n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q).shape[0]
     dependent = tuple(system.dependent_coordinates if dependent is None else dependent)
-    if len(dependent) != n_h:
-        raise ValueError(
-            f"{name}: {n_h} configuration constraints determine as many coordinates, but {len(dependent)} are named "
-            f"({', '.join(dependent) or 'none'}). Give linearize(..., dependent=(...)) {n_h} of "
-            f"{', '.join(system.coordinates)}."
-        )
+    check_dependent(system, dependent, n_h)
     kept = _states(system, states, dependent)
     rows = tuple(kept) if outputs is None else tuple(outputs)
     functions = dict(outputs) if isinstance(outputs, Mapping) else {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import jax
@@ -35,6 +36,16 @@ def _still(system: System) -> np.ndarray:
     """Places of the coordinates that stand still in a steady motion."""
     cyclic = cyclic_coordinates(system)
     return np.array([i for i, k in enumerate(system.coordinates) if k not in cyclic], int)
+
+
+def check_dependent(system: System, dependent: Sequence[str], n_h: int) -> None:
+    """**Raises:** `ValueError` where not as many coordinates are named as `n_h` configuration constraints determine."""
+    if len(dependent) != n_h:
+        raise ValueError(
+            f"{type(system).__name__}: {n_h} configuration constraints determine as many coordinates, but "
+            f"{len(dependent)} are named ({', '.join(dependent) or 'none'}). Give linearize(..., dependent=(...)) "
+            f"{n_h} of {', '.join(system.coordinates)}."
+        )
 
 
 def is_wrong(system: System, t, q, u, x, w, steady: bool):

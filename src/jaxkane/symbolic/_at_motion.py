@@ -11,6 +11,7 @@ from .._common.lookup import refuse_unknown
 from .._method.formulas import Formulas
 from .._scalars.graph import NotScalarError, needed
 from .._scalars.written import as_objects
+from ..stability._steadiness import check_dependent
 from ._equations import by_name
 from ._sympy import exact, given_nodes, imported, symbols_of, table
 
@@ -108,11 +109,7 @@ class AtMotion:
         free = [x for x in names if x not in dependent]
         T = sp.Matrix(len(names), len(free), lambda i, j: int(names[i] == free[j]))
         (h,) = self.formulas.derivatives("configuration_residuals", ("q",)).values()
-        if len(h) != len(dependent):
-            raise ValueError(
-                f"{self.formulas.name}: {len(h)} configuration constraints determine as many coordinates, but "
-                f"{len(dependent)} are named ({', '.join(dependent) or 'none'}). Give linearize(..., dependent=(...))."
-            )
+        check_dependent(self.formulas.system, dependent, len(h))
         if dependent:
             G = self.expressions(h)  # dh/dq
             by = [names.index(x) for x in dependent]
