@@ -105,6 +105,7 @@ def test_the_derivatives_of_what_is_not_found_are_nan(given):
         assert np.isnan(jax.jit(derivative(found))(given["x"]))
 
 
+@pytest.mark.slow
 def test_one_that_is_not_found_leaves_the_others_as_they_are():
     x = jnp.array([0.6, 2.0, 1.0, 0.0, jnp.nan])
     found = jax.vmap(lambda x: jk.assemble(OnACircle(), {"x": x}).q[1])

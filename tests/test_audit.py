@@ -114,6 +114,7 @@ class Satellite(jk.System):
         return jk.Force(-500.0 * 3.986e14 / q["r"] ** 2 * motion["A"].x, motion["satellite"])
 
 
+@pytest.mark.slow
 def test_metres_beside_radians_are_no_bad_condition():
     rate = np.sqrt(3.986e14 / 7e6**3)
     ride = jk.simulate(Satellite(), jk.State([7e6, 0.0], [0.0, rate]), np.linspace(0.0, 0.1, 11) / rate)

@@ -108,6 +108,7 @@ def test_hinges():
     np.testing.assert_allclose(u_dot, [-on_disk - 0.7, on_disk / 2.0], rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_what_a_spring_takes_it_gives_back():
     law = lambda P, Q, i: jk.loads.spring(P, Q, 10.0, 4.5)  # noqa: E731
     system = type("Two", (Two,), {"law": staticmethod(law)})()

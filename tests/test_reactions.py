@@ -179,6 +179,7 @@ def test_the_multiplier_of_a_scalar_residual_is_a_force_along_it():
     np.testing.assert_allclose(force * across, momentum_rate(system, q, u), rtol=RTOL, atol=RTOL)
 
 
+@pytest.mark.slow
 def test_along_a_trajectory_under_jit_and_in_gradients():
     system, q, u = moving("DoublePendulum")
     inputs = {"elbow_torque": 0.4}

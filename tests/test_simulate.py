@@ -401,6 +401,7 @@ class Pendulum(jk.System):
         return [*jk.weight(motion, -9.81 * motion.N.y), jk.Torque(inputs["torque"] * motion.N.z, motion.bodies[0])]
 
 
+@pytest.mark.slow
 def test_a_step_that_ends_beside_a_sample():
     """Steps of 2.5 ms by chance end a rounding error before samples; what is left was once too short a step."""
     pendulum = Pendulum()

@@ -128,6 +128,7 @@ def test_a_batch_by_sweep(cart):
     assert rides.to_xarray()["motor.force"].shape == (2, 21)
 
 
+@pytest.mark.slow
 def test_linear_models_and_steady_motions(cart):
     still = equilibrium(cart, inputs={"command": 5.0})
     assert float(still["place"]) == pytest.approx(5.0 / 30.0)
