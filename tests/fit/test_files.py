@@ -8,7 +8,7 @@ import pytest
 from systems import POSED, PUSH, SEEN, TRIAL, Track
 from systems import T as t
 
-import jaxkane.fit._problem.problem as posing
+import jaxkane.fit._problem.linearization as linearization
 from jaxkane.fit import (
     BFGS,
     GradientDescent,
@@ -160,7 +160,7 @@ def test_lack_of_memory_is_not_taken_for_a_bad_start(problem, monkeypatch):
     def exhausted(*_):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 bytes.")
 
-    monkeypatch.setattr(posing, "starts_of", exhausted)
+    monkeypatch.setattr(linearization, "starts_of", exhausted)
     with pytest.raises(jax.errors.JaxRuntimeError, match="RESOURCE_EXHAUSTED"):
         linearize(problem, problem.start)
 

@@ -61,15 +61,16 @@ def test_a_fit_comes_back_as_it_was(result, path):
 
 
 def test_to_look_at_a_fit_simulates_nothing(path, monkeypatch):
-    import jaxkane.fit._problem.problem as problem
+    from jaxkane.fit._problem import linearization, problem
 
     again = load(path, pose())
 
     def refuse(*arguments):
         raise AssertionError("a fit that is looked at was simulated")
 
-    for name in ("starts_of", "blocks_of", "costs_of", "rides_of"):
-        monkeypatch.setattr(problem, name, refuse)
+    for module, names in ((linearization, "starts_of blocks_of costs_of"), (problem, "starts_of rides_of")):
+        for name in names.split():
+            monkeypatch.setattr(module, name, refuse)
     assert repr(again) == str(again)
     assert again.ok is again.identifiability.ok
     assert again.message
