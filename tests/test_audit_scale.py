@@ -10,7 +10,7 @@ import jaxkane as jk
 from jaxkane._method import rates
 from jaxkane._scalars import linear
 from jaxkane._scalars.fuse import _Program
-from jaxkane._simulation import audit
+from jaxkane._simulation import balance
 
 TILTS = ((0.3, 0.5, 0.81), (0.7, -0.2, 0.4), (-0.4, 0.6, 0.5))
 
@@ -68,7 +68,7 @@ def test_the_audit_costs_what_the_accelerations_cost(held):
     counts = {}
     for n in (4, 6, 8):
         system = TiltedChain(n=n, held=held)
-        counts[n], is_plain = operations(audit._measured, system, jnp.ones(n - held))
+        counts[n], is_plain = operations(balance._measured, system, jnp.ones(n - held))
         assert is_plain
     assert counts[6] < operations(rates._motion_rates, TiltedChain(n=6, held=held))[0]
     # Linear but for the weights and the columns of the constraint, which pass all frames: less than quadratic

@@ -159,13 +159,13 @@ def test_delays_gains_rates_and_gaps(result):
 
 @pytest.mark.slow
 def test_other_data_and_guesses_compile_nothing(result, runs, problem):
-    import jaxkane.fit._problem.model as model
+    import jaxkane.fit._problem.programs as programs
 
-    before = model.blocks_of.compiled._cached._cache_size()
+    before = programs.blocks_of.compiled._cached._cache_size()
     again = [Trial(r.t, r.measured, r.inputs, sigma=0.02, name="again") for r in runs]
     other = Problem.of(TRUTH, again, FREE, sensor_gain={"x": 0.2}, **UNKNOWN)
     near(minimize(other, LeastSquares()))
-    assert model.blocks_of.compiled._cached._cache_size() == before
+    assert programs.blocks_of.compiled._cached._cache_size() == before
 
 
 @pytest.mark.parametrize("method", [LeastSquares(damping=0.0), BFGS()], ids=lambda m: m.name)
@@ -276,10 +276,10 @@ class Pulled(jk.System):
 
 @pytest.mark.parametrize(("options", "kinks", "anew"), [({}, 11, False), ({"input_delay": ["left"]}, 2 * 23, True)])
 def test_inputs_that_share_their_times_share_their_kinks(options, kinks, anew, monkeypatch):
-    import jaxkane._simulation.ride as ride
+    import jaxkane._simulation.steps as steps
 
-    seen, original = [], ride.sample_times
-    monkeypatch.setattr(ride, "sample_times", lambda *a: seen.append(original(*a)) or seen[-1])
+    seen, original = [], steps.sample_times
+    monkeypatch.setattr(steps, "sample_times", lambda *a: seen.append(original(*a)) or seen[-1])
     t = np.linspace(0.0, 1.0, 11)
     trial = Trial(t, {"x": 0.1 * t**2}, {"left": np.sin(t), "right": np.cos(t)}, sigma=0.1)
     problem = Problem.of(Pulled(), trial, "mass", simulation=Simulation(rtol=1e-6), **options)
