@@ -1,4 +1,4 @@
-"""Linear models as formulas of the parameters, about a steady motion. Knows formulas and SymPy."""
+"""Linear models as matrices of formulas of the parameters. Knows SymPy; knows a motion by its formulas."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Extensions of a fit that are to be tried, and one problem that holds all of them. Knows names; solves nothing."""
+"""Extensions of a fit that are to be tried, checked and put into groups. Knows names; solves nothing."""
 
 from __future__ import annotations
 

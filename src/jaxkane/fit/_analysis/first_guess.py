@@ -1,4 +1,4 @@
-"""A linear first guess of bodies, and the nearest bodies that can be. Knows regressors and what a fit may move."""
+"""A first guess of bodies by linear least squares. Knows regressors and the free parameters of a fit."""
 
 from __future__ import annotations
 

@@ -1,12 +1,4 @@
-"""Coordinates, speeds and accelerations at instants of a motion: of a simulation, or of measurements by splines.
-
-An acceleration that is not measured is a second derivative, which noise spoils. Each channel is approximated by least
-squares by a spline of fifth degree (scipy's `make_lsq_spline`), whose knots are as far apart as the measurements'
-standard deviations allow: the smoothest curve that agrees with them (Reinsch, Smoothing by spline functions, Numerische
-Mathematik 1967, asks the same of another spline). Inputs are approximated between the same knots: what filters both
-sides of a linear equation alike does not bend it (Gautier, Dynamic identification of robots with power model, ICRA
-1997).
-"""
+"""Coordinates, speeds and accelerations at instants of a motion: of a simulation, or of measurements by splines."""
 
 from __future__ import annotations
 
