@@ -109,3 +109,33 @@ def test_what_a_program_does_not_read_is_not_computed_for_it(native):
     np.testing.assert_allclose(batch, np.sin(0.5) + 1.0, rtol=1e-15)
     slope = jax.jit(jax.grad(lambda x, y: _of_the_first(x, y), argnums=(0, 1)))(0.5, 2.0)
     np.testing.assert_allclose(slope, [np.cos(0.5), 0.0], rtol=1e-15)
+
+
+@fused
+def _doubled_if_positive(x):
+    positive = x > 0
+    return jnp.where(positive, 2.0 * x, x), positive
+
+
+def test_a_program_that_also_tells_what_is_true_has_derivatives(kernels):
+    value = lambda x: _doubled_if_positive(x)[0]  # noqa: E731
+    for x, slope in ((0.7, 2.0), (-0.7, 1.0)):
+        assert jax.jit(jax.grad(value))(x) == slope
+        (_, told), (x_dot, _) = jax.jit(lambda x: jax.jvp(_doubled_if_positive, (x,), (1.0,)))(x)
+        assert x_dot == slope
+        assert told == (x > 0)
+    np.testing.assert_array_equal(jax.jit(jax.vmap(jax.grad(value)))(jnp.array([-1.0, 1.0])), [1.0, 2.0])
+
+
+@pytest.mark.parametrize("jacobian", [jax.jacfwd, jax.jacrev])
+def test_the_last_time_and_the_first_have_derivatives(jacobian):
+    system, state = pendulum()
+
+    def end(times):
+        ride_of = jk.simulate(system, state, jnp.stack([times[0], times[1]]))
+        return ride_of.q[-1], (ride_of.u[-1], ride_of.q[0])
+
+    times = jnp.array([0.2, 0.9])
+    slopes, (u_end, _) = jacobian(end, has_aux=True)(times)
+    np.testing.assert_allclose(slopes[:, 1], u_end, rtol=1e-6)  # dq/dt at the end
+    np.testing.assert_allclose(slopes[:, 0], -u_end, rtol=1e-6)  # where nothing depends on the time itself

@@ -35,6 +35,7 @@ from .jax_internals import (
     is_undefined_primal,
     jaxpr_as_fun,
     new_primitive,
+    no_tangent,
     settings,
 )
 from .native import Scalars
@@ -162,7 +163,7 @@ class _Program:
         return _program_p.bind(*leaves, program=self, sizes=(), where=((),) * len(leaves))
 
     def _tangent(self, moving: tuple[bool, ...]) -> _Program:
-        """(primals, tangents of those that move) -> tangents of the outputs."""
+        """(primals, tangents of those that move) -> tangents of the outputs that have any."""
 
         def tangents(*args):
             n = len(moving)
@@ -171,7 +172,8 @@ class _Program:
             def of_moving(*ys):
                 return self.evaluate(*[*replaced(xs, places, ys)])
 
-            return jax.jvp(of_moving, [xs[i] for i in places], dxs)[1]
+            found = jax.jvp(of_moving, [xs[i] for i in places], dxs)[1]
+            return [dy for dy, aval in zip(found, self.out_avals, strict=True) if _moves(aval)]
 
         places = [i for i, m in enumerate(moving) if m]
         dx_avals = [self.in_avals[i] for i in places]
@@ -265,6 +267,11 @@ class _Program:
         _tell(self.label, f"{error}", "native kernels do not know: XLA does its work, three to ten times slower")
 
 
+def _moves(aval: Any) -> bool:
+    """Whether there can be a derivative of this kind of number, or by it."""
+    return jax.numpy.issubdtype(aval.dtype, jax.numpy.inexact)
+
+
 def _chosen(sizes: Sequence[int], has: Sequence[bool]) -> tuple[int, ...]:
     return tuple(n for n, h in zip(sizes, has, strict=True) if h)
 
@@ -281,16 +288,20 @@ def _abstract(*_, program, sizes, where):
 
 
 def _jvp(primals, tangents, *, program, sizes, where):
-    moving = tuple(not is_no_tangent(dx) for dx in tangents)
+    moving = tuple(not is_no_tangent(dx) and _moves(x) for x, dx in zip(program.in_avals, tangents, strict=True))
     moves = [(dx, w) for dx, m, w in zip(tangents, moving, where, strict=True) if m]
     outputs = _program_p.bind(*primals, program=program, sizes=sizes, where=where)
-    return outputs, _program_p.bind(
-        *primals,
-        *(dx for dx, _ in moves),
-        program=program.tangent(moving),
-        sizes=sizes,
-        where=(*where, *(w for _, w in moves)),
+    found = iter(
+        _program_p.bind(
+            *primals,
+            *(dx for dx, _ in moves),
+            program=program.tangent(moving),
+            sizes=sizes,
+            where=(*where, *(w for _, w in moves)),
+        )
     )
+    shapes = _abstract(program=program, sizes=sizes, where=where)
+    return outputs, [next(found) if _moves(aval) else no_tangent(aval) for aval in shapes]
 
 
 def _transpose(cotangents, *args, program, sizes, where):

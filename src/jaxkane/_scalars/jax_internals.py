@@ -109,6 +109,11 @@ def is_no_tangent(tangent: Any) -> bool:
     return type(tangent) is ad.Zero
 
 
+def no_tangent(x: Any) -> Any:
+    """JAX's sign for it, of an abstract value: what truth values and whole numbers have."""
+    return ad.Zero(x.to_tangent_aval())
+
+
 def one_function() -> contextlib.AbstractContextManager[Any]:
     """Under it, each call of a jitted function is compiled by XLA:CPU as one function of LLVM."""
     try:
