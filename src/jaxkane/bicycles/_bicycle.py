@@ -26,7 +26,6 @@ from .._scalars.components import add
 from .._scalars.types import Component
 from ..catalog._bicycle_file import refuse_other_units
 from ..catalog.bicycle import WhippleBicycle
-from ._asked import as_tuple, by_name, commanded, label_of, refuse_misfits
 from ._files import as_meijaard, read_yaml
 from ._ground import Ground
 from ._head import HeadTwist
@@ -43,6 +42,7 @@ from ._names import (
     slip_speeds,
 )
 from ._part import Part
+from ._part_methods import as_tuple, by_name, commanded, label_of, refuse_misfits
 from ._rider import rider_of
 from ._tyre import Tyre
 from ._tyre_forces import deflection_rates, loads_of_tyres, transfer_rates, tyre_forces, tyre_loads

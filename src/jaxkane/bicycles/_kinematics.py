@@ -14,8 +14,8 @@ from .._description.points import Point, inertial
 from .._description.vectors import Vector
 from .._scalars.components import add
 from .._scalars.types import Component
-from ._asked import moved
 from ._names import FRONT, REAR
+from ._part_methods import moved
 from ._tyre import Contact, Tyre, rolling_speed
 
 if TYPE_CHECKING:

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from ..catalog.bicycle import WhippleBicycle
-from ._asked import as_tuple
 from ._ground import Slope
 from ._part import Part
+from ._part_methods import as_tuple
 from ._tyre import Tyre
 
 if TYPE_CHECKING:

@@ -87,7 +87,7 @@ def described(problem: Problem) -> dict[str, Any]:
         "atol": settings.atol,
         "max_steps": settings.max_steps,
         "solver": type(settings.solver).__name__,
-        "fixed parameter": {name: _told(x) for name, x in fixed.items()},
+        "fixed parameter": {name: _described_value(x) for name, x in fixed.items()},
         "initial guesses, priors": digest(jax.tree.leaves(dataclasses.replace(numbers, system=guessed))),
         "data": digest(jax.tree.leaves(problem.windows)),
         "program": digest(jax.make_jaxpr(residuals)(numbers, window, point.z[0], point.b[0], point.x)),
@@ -102,6 +102,6 @@ def _fixed_and_guessed(problem: Problem) -> tuple[dict[str, Any], list[Any]]:
     return {name: x for i, name, x in arrays if i not in moved}, [x for i, _, x in arrays if i in moved]
 
 
-def _told(x: Any) -> Any:
+def _described_value(x: Any) -> Any:
     """A number as it is, an array by its digest."""
     return digest(x) if np.ndim(x) else float(x)
