@@ -49,11 +49,11 @@ Where = tuple[tuple[bool, ...], ...]
 
 
 def fused(f: Callable[..., Any]) -> Callable[..., Any]:
-    """`f`, a pure function at module level, as one operation; where it calls into libraries, `f` itself.
+    """A pure function at module level, such that a call of it is one operation of JAX.
 
     It is traced once for each structure of its arguments, however often it is called, and again where what the code of
-    its arguments reads has changed. What keeps it from being one operation is told, by the name of the first argument's
-    type.
+    its arguments reads has changed. A function that calls a library (LAPACK, a loop, a sort) cannot be one operation:
+    it is called as it is, and a warning names the call and the type of the first argument.
     """
 
     @functools.lru_cache(maxsize=256)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any, cast
+from collections.abc import Callable
+from typing import Any, NamedTuple, cast
 
 import diffrax
 import equinox as eqx
@@ -28,7 +29,7 @@ from .loops import keeping
 from .settings import Settings, refuse_held
 from .signals import evaluate, for_fixed_steps, with_own_times, without_nonsense
 from .stages import WrittenOut
-from .steps import controller_of, times_of
+from .steps import Times, controller_of, times_of
 from .trajectory import Status, Trajectory
 from .valid import is_rising, is_valid, safe, sound
 
@@ -53,6 +54,35 @@ class Now(eqx.Module):
         raise not_there(name, [each for names in names_of(system) for each in names], "the state")
 
 
+class _Asked(NamedTuple):
+    """A motion that is to be found. `system`, `signals`: those asked for, and harmless ones where none can begin;
+    `start`: the packed state. `rates`: (t, y, args) -> y_dot, and `args` that the steps pass to it."""
+
+    system: System
+    signals: Any
+    start: Array
+    ts: Array
+    times: Times
+    valid: Array
+    rates: Callable[..., Array]
+    args: Any
+    events: Events
+    settings: Settings
+
+
+class _Found(NamedTuple):
+    """What was found: packed states `motion` (n_t, n), and which of them were `reached` (n_t,); the end, and whether it
+    moves `smooth`ly with what it comes from; the status; steps counted."""
+
+    motion: Array
+    reached: Array
+    t_end: Array
+    end: Array
+    smooth: Array
+    status: Array
+    stats: dict[str, Array]
+
+
 @compiled
 def solve(
     system: System, state: State, ts: Array, signals: Any, settings: Settings, disturbance: Any = None
@@ -74,11 +104,30 @@ def solve(
     # what all members of a batch share remains shared, of which a kernel computes its part once.
     stepped = sound(system)
     system, state = safe(valid, (system, state))
-    start = packed(state)
     signals = without_nonsense(signals, valid)
     constrained = has_configuration_constraints(system, times.start, state.q)
+    asked = _Asked(
+        system=system,
+        signals=signals,
+        start=packed(state),
+        ts=ts,
+        times=times,
+        valid=valid,
+        rates=_rates(valid, settings.stabilize if constrained else 0.0),
+        args=(stepped, signals, disturbance),
+        events=events_of(system, times.start, state),
+        settings=settings,
+    )
+    found = _integrated(asked)
+    if asked.events.names:
+        found = _to_event(asked, found)
+    return _trajectory(asked, _everywhere(asked, found, constrained and settings.project), origin)
 
-    def vector_field(t, y, args):
+
+def _rates(valid: Array, stabilize: float) -> Callable[..., Array]:
+    """(t, y, args) -> y_dot, zero where no motion can begin. `stabilize` [1/s]: how fast constraints are led back."""
+
+    def rates(t: Array, y: Array, args: Any) -> Array:
         system, signals, disturbance = args
         state = unpacked(system, y)
         inputs, more = inputs_at(system, signals, t, state), None
@@ -87,70 +136,105 @@ def solve(
         y_dot = packed_rates(system, t, y, inputs)
         if more is not None:
             y_dot += packed(more)
-        if constrained and settings.stabilize:
-            back = settings.stabilize * correction(system, t, state.q)
+        if stabilize:
+            back = stabilize * correction(system, t, state.q)
             y_dot += jnp.concatenate([back, jnp.zeros_like(y_dot[back.size :])])
         return jnp.where(valid, y_dot, jnp.zeros_like(y_dot))
 
-    def trial_rates(t, y, args):
+    return rates
+
+
+def _integrated(asked: _Asked) -> _Found:
+    """The motion at the times that its steps reach."""
+    settings, times, (stepped, *_) = asked.settings, asked.times, asked.args
+
+    def trial_rates(t: Array, y: Array, args: Any) -> Array:
         # A step that is rejected since its rates are not finite must not spoil a derivative in reverse mode.
-        return derivative_free_where_not_finite(vector_field, t, y, args)
+        return derivative_free_where_not_finite(asked.rates, t, y, args)
 
     forward = isinstance(settings.adjoint, diffrax.ForwardMode)
-    events = events_of(system, times.start, state)
-    solver, inputs = settings.solver, inputs_at(system, signals, times.start, state)
-    is_native = rates_are_native(stepped, times.start, start, inputs)
+    solver: Any = settings.solver
+    inputs = inputs_at(asked.system, asked.signals, times.start, unpacked(asked.system, asked.start))
+    if isinstance(solver, diffrax.AbstractERK) and rates_are_native(stepped, times.start, asked.start, inputs):
+        solver = WrittenOut(solver)
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(vector_field if forward else trial_rates),
-        WrittenOut(solver) if is_native and isinstance(solver, diffrax.AbstractERK) else solver,
+        diffrax.ODETerm(asked.rates if forward else trial_rates),
+        solver,
         times.start,
         times.end,
         None,
-        start,
-        (stepped, signals, disturbance),
-        stepsize_controller=controller_of(times, vector_field, events, system, signals, settings),
-        **keeping(ts, settings.adjoint, anew=settings.progress),
+        asked.start,
+        asked.args,
+        stepsize_controller=controller_of(times, asked.rates, asked.events, stepped, asked.signals, settings),
+        **keeping(asked.ts, settings.adjoint, anew=settings.progress),
         max_steps=settings.max_steps,
         progress_meter=diffrax.TqdmProgressMeter() if settings.progress else diffrax.NoProgressMeter(),
         throw=False,
     )
     at, states = cast(Any, (solution.ts, solution.ys))
     (t_reached, t_last), (motion, last) = jax.lax.stop_gradient(at), states
-    reached, t_end, end = jnp.isfinite(t_reached) & valid, t_last[0], last[0]
+    status = jnp.where(asked.valid, _status(solution, asked.events), Status.INVALID).astype(jnp.int32)
+    completed = status == Status.COMPLETED
+    return _Found(
+        motion=motion,
+        reached=jnp.isfinite(t_reached) & asked.valid,
+        t_end=jnp.where(completed, times.end, jnp.where(asked.valid, t_last[0], times.start)),
+        end=last[0],
+        smooth=completed,
+        status=status,
+        stats={name: solution.stats[of] for name, of in _COUNTED.items()},
+    )
 
-    which = cast(Any, solution.controller_state).which.astype(int)
-    status = jnp.where(valid, _status(solution, which, events), Status.INVALID).astype(jnp.int32)
-    smooth = status == Status.COMPLETED
-    t_end = jnp.where(smooth, times.end, jnp.where(valid, t_end, times.start))
-    if events.names:
-        happened = status >= Status.EVENT
-        beside = jax.tree.map(lambda x, first: jnp.where(happened, x, first), (t_end, end), (times.start, start))
-        moving = lambda t, y: vector_field(t, y, (stepped, signals, disturbance))  # noqa: E731
-        found = at_zero(stepped, beside[0], beside[1], jnp.maximum(which, 0), happened, moving, times.beside, events)
-        t_end, end = jax.tree.map(lambda x, y: jnp.where(happened, x, y), (found.t, found.y), (t_end, end))
-        smooth |= happened & found.smooth
-        # The last step ends a little beside the event: samples from there to here are those of the event itself.
-        late = happened & ~reached & (ts <= t_end + times.here)
-        reached = jnp.where(happened, ts <= t_end + times.here, reached)
-        motion = jnp.where(late[:, None], end[None], motion)
 
-    # What follows from the motion is found where there is one, and from the first state elsewhere: a value that is
-    # not finite has derivatives that a mask behind it cannot take away.
-    motion = jnp.where(reached[:, None], motion, start[None])
-    end = jnp.where(valid, end, start)
-    if constrained and settings.project:
+_COUNTED = {"steps": "num_steps", "accepted": "num_accepted_steps", "rejected": "num_rejected_steps"}
+
+
+def _to_event(asked: _Asked, found: _Found) -> _Found:
+    """The same, whose end is the instant of the event, where one happened."""
+    times, happened = asked.times, found.status >= Status.EVENT
+    which = jnp.maximum(found.status - Status.EVENT, 0)
+    first, end = (times.start, asked.start), (found.t_end, found.end)
+    t, y = jax.tree.map(lambda x, x0: jnp.where(happened, x, x0), end, first)
+    rates = lambda t, y: asked.rates(t, y, asked.args)  # noqa: E731
+    zero = at_zero(asked.args[0], t, y, which, happened, rates, times.beside, asked.events)
+    t_end, end = jax.tree.map(lambda x, y: jnp.where(happened, x, y), (zero.t, zero.y), end)
+    # The last step ends a little beside the event: samples from there to here are those of the event itself.
+    before = asked.ts <= t_end + times.here
+    late = happened & ~found.reached & before
+    return found._replace(
+        motion=jnp.where(late[:, None], end[None], found.motion),
+        reached=jnp.where(happened, before, found.reached),
+        t_end=t_end,
+        end=end,
+        smooth=found.smooth | (happened & zero.smooth),
+    )
+
+
+def _everywhere(asked: _Asked, found: _Found, project: bool) -> _Found:
+    """The same with states in all places: the first where there is none, since a value that is not finite has
+    derivatives that a mask behind it cannot take away. `project`: onto the configuration constraints."""
+    motion = jnp.where(found.reached[:, None], found.motion, asked.start[None])
+    end = jnp.where(asked.valid, found.end, asked.start)
+    if project:
+        n_q = len(asked.system.coordinates)
 
         def onto(t: Array, y: Array) -> Array:
-            return jnp.concatenate([projected(system, t, y[: state.q.size]), y[state.q.size :]])
+            return jnp.concatenate([projected(asked.system, t, y[:n_q]), y[n_q:]])
 
-        motion, end = jax.vmap(onto)(ts, motion), onto(t_end, end)
+        motion, end = jax.vmap(onto)(asked.ts, motion), onto(found.t_end, end)
+    return found._replace(motion=motion, end=end)
+
+
+def _trajectory(asked: _Asked, found: _Found, origin: Array) -> Trajectory:
+    """What follows from the motion, and NaN where there is none. `origin`: what all of it comes from."""
+    system, ts, motion = asked.system, asked.ts, found.motion
     along = unpacked(system, motion)
     u_dep = jax.vmap(lambda t, y: _dependent_speeds_of(system, t, y))(ts, motion)
-    inputs = jax.vmap(lambda t, y: inputs_at(system, signals, t, y, all_of_them=True))(ts, along)
+    inputs = jax.vmap(lambda t, y: inputs_at(system, asked.signals, t, y, all_of_them=True))(ts, along)
     outputs = jax.vmap(lambda t, y, w: outputs_at(system, t, y.q, y.u, values_of(system, y.x, w)))(ts, along, inputs)
-    motion, u_dep, inputs, outputs = nan_where(~reached, (motion, u_dep, inputs, outputs), origin)
-    t_end, end = nan_derivative_where(~smooth, (t_end, end), origin)
-    motion, end = unpacked(system, motion), unpacked(system, nan_where(~valid, end, origin))
+    motion, u_dep, inputs, outputs = nan_where(~found.reached, (motion, u_dep, inputs, outputs), origin)
+    t_end, end = nan_derivative_where(~found.smooth, (found.t_end, found.end), origin)
+    motion, end = unpacked(system, motion), unpacked(system, nan_where(~asked.valid, end, origin))
     return Trajectory(
         t=ts,
         q=motion.q,
@@ -159,16 +243,12 @@ def solve(
         x=motion.u[:, :0] if motion.x is None else motion.x,
         inputs=inputs,
         outputs=outputs,
-        status=status,
+        status=found.status,
         t_end=t_end,
-        stats={
-            "steps": solution.stats["num_steps"],
-            "accepted": solution.stats["num_accepted_steps"],
-            "rejected": solution.stats["num_rejected_steps"],
-        },
+        stats=found.stats,
         names=names_of(system),
-        events=events.names,
-        adjoint=type(settings.adjoint).__name__,
+        events=asked.events.names,
+        adjoint=type(asked.settings.adjoint).__name__,
         units=tuple(units_of(system).items()),
         end=end,
     )
@@ -187,8 +267,8 @@ def _dependent_speeds_of(system: System, t: Array, y: Array) -> Array:
     return as_vector(Instant(system, t, state.q, state.u).u_dep, y)
 
 
-def _status(solution: diffrax.Solution, which: Array, events: Events) -> Array:
-    result = solution.result
+def _status(solution: diffrax.Solution, events: Events) -> Array:
+    result, which = solution.result, cast(Any, solution.controller_state).which.astype(int)
     status = jnp.where(result == diffrax.RESULTS.successful, Status.COMPLETED, Status.STEP_TOO_SMALL)
     status = jnp.where(result == diffrax.RESULTS.max_steps_reached, Status.MAX_STEPS, status)
     unmoved = (status == Status.STEP_TOO_SMALL) & (solution.stats["num_accepted_steps"] == 0)

@@ -90,14 +90,14 @@ def simulate(
     given = (system, state, ts, with_one_times(signals))
     if adjoint == "auto" and goes_forward(given):
         settings = dataclasses.replace(settings, adjoint=ADJOINTS["forward"]())
-    told = type(settings.adjoint).__name__
+    name_of_adjoint = type(settings.adjoint).__name__
     if isinstance(settings.adjoint, ADJOINTS["reverse"]):
         # A motion that nobody can differentiate is compiled without what its derivative would need: the same numbers.
         if nothing_is_traced():
             settings = dataclasses.replace(settings, adjoint=ADJOINTS["forward"]())
         else:
             given = for_reverse_mode(given)
-    ride = dataclasses.replace(solve(*given, of_any_accuracy(settings, ts.dtype)), adjoint=told)
+    ride = dataclasses.replace(solve(*given, of_any_accuracy(settings, ts.dtype)), adjoint=name_of_adjoint)
     if is_concrete(ride.status) and int(ride.status) == Status.NO_SOLUTION:
         inputs_now = values_of(system, state.x, inputs_at(system, signals, ts[0], state))
         raise ValueError(
