@@ -64,7 +64,7 @@ class _Asked(NamedTuple):
     ts: Array
     times: Times
     valid: Array
-    rates: Callable[..., Array]
+    rates: Callable[..., Any]
     args: Any
     events: Events
     settings: Settings
@@ -124,7 +124,7 @@ def solve(
     return _trajectory(asked, _everywhere(asked, found, constrained and settings.project), origin)
 
 
-def _rates(valid: Array, stabilize: float) -> Callable[..., Array]:
+def _rates(valid: Array, stabilize: float) -> Callable[..., Any]:
     """(t, y, args) -> y_dot, zero where no motion can begin. `stabilize` [1/s]: how fast constraints are led back."""
 
     def rates(t: Array, y: Array, args: Any) -> Array:
@@ -148,7 +148,7 @@ def _integrated(asked: _Asked) -> _Found:
     """The motion at the times that its steps reach."""
     settings, times, (stepped, *_) = asked.settings, asked.times, asked.args
 
-    def trial_rates(t: Array, y: Array, args: Any) -> Array:
+    def trial_rates(t: Any, y: Any, args: Any) -> Any:
         # A step that is rejected since its rates are not finite must not spoil a derivative in reverse mode.
         return derivative_free_where_not_finite(asked.rates, t, y, args)
 
