@@ -28,7 +28,7 @@ from jaxtyping import Array
 from .._description.loads import Load
 from .._description.motion import Motion
 from .._description.system import System
-from .._scalars.components import add, add3, component, cross, dot, is_exact, matvec, mul, scale3
+from .._scalars.components import add, add3, component, cross, dot, is_exact, matvec, mul, scale3, total
 from .._scalars.linear import Rows, solve, solve_positive
 from .._scalars.types import Component
 from .derivatives import jvp, transposed, unit
@@ -154,7 +154,7 @@ class Instant(Reading):
     def active_forces(self, partials: list) -> Row:
         # F_r = sum F . V_r + T . W_r
         vectors = self.force_components()
-        return tuple(_sum(dot(v, x) for v, x in zip(columns, vectors, strict=True)) for _, columns in partials)
+        return tuple(total(dot(v, x) for v, x in zip(columns, vectors, strict=True)) for _, columns in partials)
 
     def force_components(self) -> list[Row]:
         return self.read("forces", self.t, self.q, self.u_all)
@@ -163,7 +163,7 @@ class Instant(Reading):
         # F*_r = -sum_i V_ir . dp_i/dt + W_ir . dH_i/dt
         rates = self.momentum_rates()
         return tuple(
-            mul(-1.0, _sum(add(dot(V, p), dot(W, H)) for (V, W), (p, H) in zip(bodies, rates, strict=True)))
+            mul(-1.0, total(add(dot(V, p), dot(W, H)) for (V, W), (p, H) in zip(bodies, rates, strict=True)))
             for bodies, _ in partials
         )
 
@@ -191,13 +191,6 @@ class Instant(Reading):
 
     def accelerations(self) -> Row:
         return solve_positive(*self.equations())
-
-
-def _sum(terms) -> Component:
-    total: Component = 0.0
-    for term in terms:
-        total = add(total, term)
-    return total
 
 
 def _negative(row: Sequence[Component]) -> Row:

@@ -14,7 +14,6 @@ Knows Kane's method; knows no mechanism, and nothing of data.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -25,7 +24,7 @@ from jaxtyping import Array, Float
 from .._description.bodies import Body
 from .._description.loads import Force
 from .._description.system import System
-from .._scalars.components import ZERO3, add, add3, dot, mul, sub
+from .._scalars.components import ZERO3, add, add3, dot, mul, sub, total
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, stack
 from .._scalars.record import recorded
@@ -218,10 +217,6 @@ def unbalanced(system: System, t, q, u, inputs, u_dot) -> Float[Array, " n"]:
     partials = now.partials()
     rates = now.momentum_rates((*row, *now.dependent_accelerations(row)))
     needed = [
-        _sum(add(dot(V, p), dot(W, H)) for (V, W), (p, H) in zip(bodies, rates, strict=True)) for bodies, _ in partials
+        total(add(dot(V, p), dot(W, H)) for (V, W), (p, H) in zip(bodies, rates, strict=True)) for bodies, _ in partials
     ]
     return as_vector([sub(x, F) for x, F in zip(needed, now.active_forces(partials), strict=True)], q)
-
-
-def _sum(terms: Any) -> Component:
-    return functools.reduce(add, terms, 0.0)

@@ -7,7 +7,8 @@ since x might be infinite.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Iterable, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -72,11 +73,12 @@ def mul(a: Component, b: Component) -> Component:
     return a * b
 
 
+def total(terms: Iterable[Component]) -> Component:
+    return functools.reduce(add, terms, 0.0)
+
+
 def dot(a: Sequence[Component], b: Sequence[Component]) -> Component:
-    total: Component = 0.0
-    for x, y in zip(a, b, strict=True):
-        total = add(total, mul(x, y))
-    return total
+    return total(mul(x, y) for x, y in zip(a, b, strict=True))
 
 
 def cross(a: Triple, b: Triple) -> Triple:

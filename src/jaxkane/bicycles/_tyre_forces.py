@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from .._description.motion import Motion
+from .._scalars.components import component, total
 from .._scalars.types import Component
 from ._kinematics import wheels
 from ._names import FRONT, REAR, load_transfers, tyres_of
@@ -77,5 +78,4 @@ def tyre_forces(bicycle: Bicycle, motion: Any, values: Mapping[str, Component]) 
 
 
 def mass_of(motion: Motion) -> Component:
-    masses = [body.mass for body in motion.bodies]
-    return sum(masses[1:], masses[0])
+    return total(component(body.mass) for body in motion.bodies)

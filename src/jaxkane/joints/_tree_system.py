@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any, ClassVar
 
 from .._description.bodies import Body
@@ -11,7 +10,7 @@ from .._description.loads import Force
 from .._description.motion import Motion
 from .._description.points import Point, inertial
 from .._description.system import System
-from .._scalars.components import ZERO3, add, component, dot, is_zero, mul, sub
+from .._scalars.components import ZERO3, add, component, dot, is_zero, mul, sub, total
 from .._scalars.types import Component, Triple
 from ..rotations import Matrix
 from ._shapes import Placed, Shape
@@ -114,8 +113,8 @@ class Tree(System):
         gain, offset, stiff, damp = (
             self._read(f"{kind}.{actuator.name}") for kind in ("gain", "offset", "position_gain", "velocity_gain")
         )
-        terms = [mul(gain, control), offset, mul(-1.0, mul(damp, dot(actuator.gear, u)))]
-        return _total([*terms, mul(-1.0, mul(stiff, mul(actuator.gear[0], q[0])))])
+        resisted = add(mul(damp, dot(actuator.gear, u)), mul(stiff, mul(actuator.gear[0], q[0])))
+        return total(map(component, (mul(gain, control), offset, mul(-1.0, resisted))))
 
     def _inertia(self, link: str) -> Matrix:
         xx, yy, zz, xy, xz, yz = (self._read(f"inertia.{link}.{ij}") for ij in MOMENTS)
@@ -173,11 +172,3 @@ def _polynomial(coefficients: tuple[float, ...], x: Component) -> tuple[Componen
         slope = add(mul(slope, x), value)
         value = add(mul(value, x), a)
     return value, slope
-
-
-def _total(terms: Sequence[Component]) -> Component:
-    """The sum, exact zeros dropped."""
-    result: Component = 0.0
-    for term in terms:
-        result = add(result, component(term))
-    return result
