@@ -17,6 +17,7 @@ _SAFETY, _SHRINK, _GROW = 0.9, 0.2, 10.0
 
 
 def rms(y: Array) -> Array:
+    # That of optimistix has a rule of its own for derivatives, which a program of scalars cannot hold.
     return jnp.sqrt(jnp.mean(jnp.square(y)))
 
 

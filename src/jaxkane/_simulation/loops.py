@@ -68,13 +68,11 @@ def keeping(ts: Array, adjoint: diffrax.AbstractAdjoint, anew: bool = False) -> 
     """
     known = None if anew or not _AS_EXPECTED else _KNOWN.get(type(adjoint))
     end = diffrax.SubSaveAt(t1=True)
-    if known is None:
-        return {"adjoint": adjoint, "saveat": _saved(diffrax.SubSaveAt(ts=ts))}
-    return {"adjoint": known(**vars(adjoint), ts=ts), "saveat": _saved(end)}
-
-
-def _saved(samples: diffrax.SubSaveAt) -> diffrax.SaveAt:
-    return diffrax.SaveAt(subs=(samples, diffrax.SubSaveAt(t1=True)), controller_state=True)
+    samples = diffrax.SubSaveAt(ts=ts) if known is None else end
+    return {
+        "adjoint": adjoint if known is None else known(**vars(adjoint), ts=ts),
+        "saveat": diffrax.SaveAt(subs=(samples, end), controller_state=True),
+    }
 
 
 _AS_EXPECTED = _is_as_expected()

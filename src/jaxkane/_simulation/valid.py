@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -54,30 +55,35 @@ def _positive(system: System) -> list[Array]:
 
 def safe(valid: Array, values: Any) -> Any:
     """The values where they are valid, ones elsewhere."""
-    few, rest = eqx.partition(values, _is_few)
-    many, rest = eqx.partition(rest, eqx.is_inexact_array)
-    many = jax.tree.map(lambda x: jnp.where(valid, x, jnp.ones_like(x)), many)
-    leaves, treedef = jax.tree.flatten(few)
-    return eqx.combine(jax.tree.unflatten(treedef, _safe_scalars(valid, leaves)), many, rest)
+    return _replaced(values, lambda xs: _safe_scalars(valid, xs), lambda x: jnp.where(valid, x, jnp.ones_like(x)))
 
 
 def sound(system: System) -> System:
     """The system with ones for parameters that are not finite, or not positive as they must be: behind a mask these
     would still spoil the reverse gradient of what is shared."""
     must_be = {id(x) for x in _positive(system)}
-    few, rest = eqx.partition(system, _is_few)
+    scalars = lambda xs: _sound_scalars(_Positive(tuple(id(x) in must_be for x in xs)), xs)  # noqa: E731
+    return _replaced(system, scalars, lambda x: _sound_or_one(x, id(x) in must_be))
+
+
+def _replaced(values: Any, scalars: Callable[[list[Array]], list[Array]], array: Callable[[Array], Array]) -> Any:
+    """The values with others for numbers: small arrays all at once, as one program, and large ones each by itself."""
+    few, rest = eqx.partition(values, _is_few)
     many, rest = eqx.partition(rest, eqx.is_inexact_array)
-    many = jax.tree.map(lambda x: _sound_or_one(x, id(x) in must_be), many)
     leaves, treedef = jax.tree.flatten(few)
-    positive = [id(x) in must_be for x in leaves]
-    split = [[x for x, p in zip(leaves, positive, strict=True) if p == kind] for kind in (False, True)]
-    found = [iter(each) for each in _sound_scalars(*split)] if leaves else []
-    return eqx.combine(jax.tree.unflatten(treedef, [next(found[p]) for p in positive]), many, rest)
+    found = scalars(leaves) if leaves else leaves
+    return eqx.combine(jax.tree.unflatten(treedef, found), jax.tree.map(array, many), rest)
+
+
+class _Positive(eqx.Module):
+    """Which of some numbers must be positive."""
+
+    these: tuple[bool, ...] = eqx.field(static=True)
 
 
 @fused
-def _sound_scalars(values: list[Array], positive: list[Array]) -> tuple[list[Array], list[Array]]:
-    return [_sound_or_one(x, False) for x in values], [_sound_or_one(x, True) for x in positive]
+def _sound_scalars(positive: _Positive, values: list[Array]) -> list[Array]:
+    return [_sound_or_one(x, must_be) for x, must_be in zip(values, positive.these, strict=True)]
 
 
 def _sound_or_one(x: Array, positive: bool) -> Array:
@@ -86,5 +92,4 @@ def _sound_or_one(x: Array, positive: bool) -> Array:
 
 @fused
 def _safe_scalars(valid: Array, values: list[Array]) -> list[Array]:
-    # One program: as an operation each, the parameters would be as many kernels of XLA.
     return [jnp.where(valid, x, jnp.ones_like(x)) for x in values]
