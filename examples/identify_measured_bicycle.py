@@ -78,7 +78,7 @@ def main():
     likelihood = profile(first, "steer_damping")
     low, high = likelihood.interval
     print(f"\nThe damping, by its profile likelihood: {low:.3f} to {high:.3f} N m s/rad")
-    print(f"Trials left out in turn: {100 * left_out.score:.1f} % of the sum of squares is taken away all the same.")
+    print(f"Trials left out in turn: {100 * left_out.score:.1f} % of their variance is accounted for all the same.")
     page = save_report(
         first, arguments.out / "identify_measured_bicycle.html", cross_validation=left_out, profiles=[likelihood]
     )

@@ -188,5 +188,5 @@ def test_a_parameter_without_influence_is_named(swings):
 
 @pytest.mark.slow
 def test_a_start_that_cannot_be_simulated_is_named(swings):
-    with pytest.raises(ValueError, match=r"1\.5 s: from 0 to 0\.68 s the initial guess gives no finite residuals"):
+    with pytest.raises(ValueError, match=r"1\.5 s: with the initial guess from 0 to 0\.68 s there are no finite"):
         fit(GUESS, swings, "mass", simulation=Simulation(max_steps=1), **OPTIONS)

@@ -374,7 +374,7 @@ def test_windows_with_their_log_determinant_are_a_filter():
     by_logarithms = lambda p: linked(y, t, values, np.exp(p[:2]), np.exp(p[2]))  # noqa: E731
     least = scipy.optimize.minimize(by_logarithms, np.log([*begun.values(), 1.0]), method="Nelder-Mead")
     assert -2 * marginal_likelihood(found) == pytest.approx(least.fun, abs=1e-3)
-    assert found.problem.posed["continuity"]["x_dot"] == pytest.approx(np.exp(least.x[1]), rel=0.05)
+    assert found.problem.specification.continuity["x_dot"] == pytest.approx(np.exp(least.x[1]), rel=0.05)
     assert found.problem.trials[0].sigma["x"][0] == pytest.approx(SIGMA["x"] * np.exp(least.x[2]), rel=0.05)
     with pytest.raises(ValueError, match="no windows are linked"):
         find_continuity(quiet)

@@ -4,9 +4,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from systems import POSED, TRIAL, Track
 
 import jaxkane as jk
-from jaxkane.fit import Free, Gain
+from jaxkane.fit import Free, Gain, LeastSquares, Problem, fit
 from jaxkane.fit._problem.bijections import Interval, log_gaussian_mass
 from jaxkane.fit._problem.entries import parameters_of
 
@@ -56,7 +57,7 @@ def test_entries_of_a_vector_are_parameters_of_their_own():
         (Free("offset", tied={"missing": 1.0}), "has no parameter 'missing'"),
         (Free("stiffness", bounds=(5.0, 3.0)), r"stiffness: nothing lies between the bounds \(5.0, 3.0\)"),
         (Free("stiffness", bounds=(float("nan"), 3.0)), "stiffness: nothing lies between the bounds"),
-        (Free("stiffness", bounds=(4.0, 6.0)), r"stiffness starts at 4, which is not inside its bounds"),
+        (Free("stiffness", bounds=(4.5, 6.0)), r"stiffness starts at 4, which is not inside its bounds"),
         (Free("stiffness", start=-1.0), "stiffness starts at -1, which is not inside its bounds"),
         (Free("stiffness", scale=float("inf")), "the scale must be positive and finite"),
         (Free("stiffness", scale=0.0), "the scale must be positive and finite"),
@@ -98,3 +99,40 @@ def test_priors_integrate_to_one():
     # Far from the mean neither side cancels.
     assert log_gaussian_mass(30.0, 31.0) == pytest.approx(log_gaussian_mass(-31.0, -30.0), rel=1e-12)
     assert np.isfinite(log_gaussian_mass(30.0, np.inf))
+
+
+@pytest.mark.parametrize(("bounds", "begins"), [((0.0, None), 0.05), ((None, 0.0), -0.05), ((0.0, 0.2), 0.02)])
+def test_a_start_on_a_given_bound_is_searched_from_inside(bounds, begins):
+    parameters = parameters_of(SYSTEM, Free("offset", bounds=bounds, scale=0.5))
+    assert float(parameters.start[0]) == 0.0
+    assert float(parameters.values(jnp.zeros(1))[0]) == pytest.approx(begins)
+
+
+def test_friction_that_starts_at_its_bound_is_found():
+    rtol = 1e-4
+    free, bounded = (fit(Track(), TRIAL, ["gain", drift], optimizer=LeastSquares(rtol=1e-12), **POSED)
+                     for drift in ("drift", Free("drift", bounds=(0.0, None))))  # fmt: skip
+    assert bounded.status == "converged"
+    assert bounded.start["drift"] == 0.0
+    assert bounded.estimates["drift"] == pytest.approx(free.estimates["drift"], rel=rtol)
+    assert not any("initial guess" in note for note in bounded.notes)
+
+
+def test_what_is_posed_again_keeps_its_priors_and_the_trials_that_count():
+    problem = Problem.of(Track(), [TRIAL, TRIAL], ["gain", "drift"], priors={"drift": (0.0, 2.0)}, **POSED)
+    known = problem.with_priors({"gain": (1.0, 0.1)})
+    for again in (known.with_trials(TRIAL), known.asking(known.specification)):
+        assert again.parameters.prior_deviation.tolist() == [0.1, 2.0]
+    one = known.only([1])
+    assert one.asking(known.specification).size == one.size
+    assert Problem.of(Track(), TRIAL, iter(["gain"]), **POSED).with_trials(TRIAL).parameters.names == ("gain",)
+
+
+def test_a_specification_does_not_follow_what_its_caller_changes():
+    free, priors = ["gain"], {"gain": (1.0, 0.1)}
+    problem = Problem.of(Track(), TRIAL, free, priors=priors, **POSED)
+    free.append("drift")
+    priors["gain"] = (1.0, 9.0)
+    again = problem.with_trials(TRIAL).parameters
+    assert again.names == ("gain",)
+    assert float(again.prior_deviation[0]) == 0.1

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..._common.lookup import refuse_unknown
 from ..._description.system import System
+from .._problem.arguments import Specification
 from .._problem.entries import as_items, parameters_of
 from .._problem.free import Delay
 from .._problem.names import Names, deviations_by_name
@@ -124,12 +125,12 @@ def _refuse_nothing_new(fit: Fit, candidate: Candidate) -> None:
     free = [name for name in names if name in fit.names]
     if free:
         raise ValueError(f"{candidate.name}: {', '.join(free)} is free in the fit already.")
-    posed, more = fit.problem.posed, candidate.of_trials
+    asked, more = fit.problem.specification, candidate.of_trials
     for key in OF_TRIALS:
-        there = [name for name in more[key] if name in deviations_by_name(posed[key])]
+        there = [name for name in more[key] if name in deviations_by_name(getattr(asked, key))]
         if there:
             raise ValueError(f"{candidate.name}: every trial has its own {key} of {', '.join(there)} already.")
-    starts = [name for name in deviations_by_name(candidate.unknown) if name in deviations_by_name(posed["unknown"])]
+    starts = [name for name in deviations_by_name(candidate.unknown) if name in deviations_by_name(asked.unknown)]
     if starts:
         raise ValueError(f"{candidate.name}: the start of {', '.join(starts)} is unknown already.")
     if not names and not any(more.values()) and not candidate.unknown and candidate.system is None:
@@ -169,13 +170,12 @@ def _held_and_late(fit: Fit, candidate: Candidate) -> set[str]:
     return late & {*fit.problem.model.held}
 
 
-def posed_with(fit: Fit, candidates: Sequence[Candidate]) -> dict[str, Any]:
-    """The arguments of `fit` with these candidates in them.
+def posed_with(fit: Fit, candidates: Sequence[Candidate]) -> Specification:
+    """What the fit was asked, with these candidates in it.
 
     **Raises:** `ValueError` where two of them free the same differently, or are of systems that exclude each other.
     """
-    posed = dict(fit.problem.posed)
-    system = posed["system"] = _system_of(fit, candidates)
+    asked, system = fit.problem.specification, _system_of(fit, candidates)
     items: list[tuple[Any, tuple[str, ...]]] = []
     for item in (item for candidate in candidates for item in candidate.items):
         names = _named(system, item)
@@ -184,12 +184,12 @@ def posed_with(fit: Fit, candidates: Sequence[Candidate]) -> dict[str, Any]:
             raise ValueError(f"Two candidates free {', '.join(names)} in different ways.")
         if not same:
             items.append((item, names))
-    posed["free"] = [*as_items(posed["free"]), *(item for item, _ in items)]
+    more: dict[str, Any] = {"free": [*asked.free, *(item for item, _ in items)]}
     for key in ("unknown", *OF_TRIALS):
-        posed[key] = deviations_by_name(posed[key])
+        more[key] = deviations_by_name(getattr(asked, key))
         for candidate in candidates:
-            posed[key] |= deviations_by_name(getattr(candidate, key))
-    return posed
+            more[key] |= deviations_by_name(getattr(candidate, key))
+    return dataclasses.replace(asked, system=system, **more)
 
 
 def _system_of(fit: Fit, candidates: Sequence[Candidate]) -> System:

@@ -59,7 +59,7 @@ class Comparison:
         fits, columns = list(self.fits.values()), list(self.fits)
         rows = [["", *columns], ["sum of squares", *(f"{fit.cost:.6g}" for fit in fits)]]
         if self.held_out:
-            rows.append(["held back", *(f"{self.held_out[name].cost:.6g}" for name in columns)])
+            rows.append(["held back", *(_held_cost(self.held_out[name]) for name in columns)])
         rows.append(["residuals", *(str(fit.problem.size[0]) for fit in fits)])
         rows.append(["unknowns", *(str(fit.problem.size[1]) for fit in fits)])
         rows.append(["variance of a residual", *(f"{fit.variance:.3g}" for fit in fits)])
@@ -80,15 +80,12 @@ class Comparison:
         return rows
 
     def _trials(self, fits: Mapping[str, Fit]) -> list[list[str]]:
-        trials = list(dict.fromkeys(name for fit in fits.values() for name in fit.trial_names))
-        of = {
-            name: {t: sum(float(np.nansum(r**2)) for r in channels.values()) for t, channels in fit.residuals.items()}
-            for name, fit in fits.items()
-        }
-        return [
-            ["trial", *fits],
-            *([t, *(f"{of[name][t]:.5g}" if t in of[name] else "" for name in fits)] for t in trials),
-        ]
+        trials = list(dict.fromkeys(name for fit in fits.values() for name in (*fit.trial_names, *fit.failed)))
+        of = {name: dict.fromkeys(fit.failed, "not simulated") for name, fit in fits.items()}
+        for name, fit in fits.items():
+            for trial, channels in fit.residuals.items():
+                of[name][trial] = f"{sum(float(np.nansum(r**2)) for r in channels.values()):.5g}"
+        return [["trial", *fits], *([trial, *(of[name].get(trial, "") for name in fits)] for trial in trials)]
 
     def __str__(self) -> str:
         return "\n\n".join(f"{heading}\n{plain(rows)}" for heading, rows in self.tables)
@@ -97,6 +94,11 @@ class Comparison:
 
     def _repr_html_(self) -> str:
         return "".join(f"<p>{html.escape(heading)}</p>{table(rows)}" for heading, rows in self.tables)
+
+
+def _held_cost(fit: Fit) -> str:
+    n = len(fit.trial_names)
+    return f"{fit.cost:.6g}" + (f" ({n} of {n + len(fit.failed)} trials)" if fit.failed else "")
 
 
 def compare(

@@ -80,12 +80,13 @@ def extended(
     **Raises:** `ValueError` where a system lacks what is free in the fit, or two candidates free the same differently.
     """
     both = sorted((*taken, *candidates), key=lambda c: order.index(c.name))
-    posed, windows = posed_with(fit, both), fit.problem.windows
+    asked = posed_with(fit, both)
     if fit.problem.chooses_steps:  # the fit has chosen: nothing is tried again
-        chosen = posed["simulation"] or Simulation()
-        posed["simulation"] = dataclasses.replace(chosen, step=float(np.median(np.asarray(windows.step))))
-    problem = Problem.of(trials=fit.problem.trials, **posed).with_steps(windows.step)
-    names, trial, system = problem.parameters.names, problem.model.nuisance.trial, posed["system"]
+        step = float(np.median(np.asarray(fit.problem.windows.step)))
+        chosen = dataclasses.replace(asked.simulation or Simulation(), step=step)
+        asked = dataclasses.replace(asked, simulation=chosen)
+    problem = fit.problem.asking(asked)
+    names, trial, system = problem.parameters.names, problem.model.nuisance.trial, asked.system
     own_x = {c.name: tuple(names.index(n) for n in _parameter_names(system, c)) for c in both}
     own_b = {c.name: tuple(trial.index(pair) for pair in _pairs(c)) for c in both}
     base_x = [names.index(name) for name in fit.names]

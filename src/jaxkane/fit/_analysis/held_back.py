@@ -12,10 +12,11 @@ import numpy as np
 from .._data.trial import Trial
 from .._optimize.least_squares import LeastSquares
 from .._optimize.minimize import minimize
-from .._optimize.steps import solve_nuisance, uninterrupted
+from .._optimize.steps import Unsimulated, solve_nuisance, uninterrupted
 from .._problem.arguments import refuse_other
 from .._problem.model import Unknowns
 from .._problem.problem import Problem
+from .._result.residuals import trial_names
 from .._result.result import Fit
 
 
@@ -25,18 +26,35 @@ def applied_to(fit: Fit, trials: Sequence[Trial] | Trial) -> Fit:
         jk.fit.applied_to(result, others).variance_accounted_for
 
     **Returns:** a `Fit` of these trials, with the status "applied": its `cost`, `variance_accounted_for`, `tests` and
-    report are those of these trials.
+    report are those of these trials. Trials that cannot be simulated with these parameters are left out: `failed` says
+    by name why, and so do the `notes`.
 
-    **Raises:** `ValueError` as `fit` does, for trials that do not suit the system or cannot be simulated.
+    **Raises:** `ValueError` as `fit` does, for trials that do not suit the system, and where none can be simulated.
     """
     refuse_other(fit, Fit, "applied_to", "applied_to(fit(...), trials)")
-    problem = fit.problem.with_trials(trials)
-    first = dataclasses.replace(problem.start, x=fit.point.x)
-    if problem.chooses_steps:
-        problem = problem.finer(first)
-    before = solve_nuisance(problem, problem.start)[1].cost
-    point, at = solve_nuisance(problem, first, steps=20, rtol=1e-6)
-    return Fit.of(problem, point, at, (before, at.cost), "applied", fit.method)
+    problem, failed = fit.problem.with_trials(trials), {}
+    names = trial_names(problem)
+    while True:
+        first = dataclasses.replace(problem.start, x=fit.point.x)
+        if problem.chooses_steps:
+            problem = problem.finer(first)
+        try:
+            point, at = solve_nuisance(problem, first, steps=20, rtol=1e-6)
+            break
+        except Unsimulated as error:
+            failed |= {names[k]: words for k, words in error.reasons.items()}
+            kept = [k for k in range(len(names)) if k not in error.reasons]
+            if not kept:
+                words = next(iter(failed.items()))
+                raise ValueError(
+                    f"None of these trials can be simulated with these parameters: {words[0]}, {words[1]}."
+                ) from None
+            problem, names = fit.problem.with_trials([problem.trials[k] for k in kept]), [names[k] for k in kept]
+    try:
+        before = solve_nuisance(problem, problem.start)[1].cost
+    except Unsimulated:  # with the initial guesses, which is no fault of the fit
+        before = float("nan")
+    return dataclasses.replace(Fit.of(problem, point, at, (before, at.cost), "applied", fit.method), failed=failed)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +63,8 @@ class CrossValidation:
     fits with process noise, minus twice the log likelihoods.
 
     - `trials`: their names; `n`: numbers of residuals; `at_start`, `fitted`, `held_out` (T,): with the parameters of
-        the start, of the fit of all, and of the fit of the others.
+        the start, of the fit of all, and of the fit of the others; infinite where these cannot simulate a trial.
+    - `spread` (T,): sums of squares of the measurements about the mean of each channel, in their `sigma`.
     - `estimates`: by parameter, of each fold.
     """
 
@@ -54,31 +73,35 @@ class CrossValidation:
     at_start: np.ndarray
     fitted: np.ndarray
     held_out: np.ndarray
+    spread: np.ndarray
     estimates: dict[str, np.ndarray]
     cost_name: str = "sum of squares"
 
     @property
     def score(self) -> float:
-        """The share of the sum of squares at the start that the fit takes away from trials it has not seen; NaN of
-        likelihoods, which have no zero."""
+        """1 - held out / spread, over all trials: the share of the measurements' variance that parameters found from
+        other trials account for (the predictive R^2; one is perfect, below zero is worse than a constant). The initial
+        guess has no part in it. NaN of likelihoods, which have no zero."""
         if self.cost_name != "sum of squares":
             return float("nan")
-        return float(1 - self.held_out.sum() / self.at_start.sum())
+        return float(1 - self.held_out.sum() / self.spread.sum())
 
     @property
     def verdict(self) -> str:
-        """By how much a fit lowers the sum of squares of trials that it was not fitted to, in words."""
+        """How well trials are predicted that a fit has not seen, in words."""
+        lost = [name for name, cost in zip(self.trials, self.held_out, strict=True) if not np.isfinite(cost)]
+        if lost:
+            return f"{', '.join(lost)} cannot be simulated with the parameters of the others."
         if self.cost_name != "sum of squares":
             less = self.at_start.sum() - self.held_out.sum()
             return f"held out, the {self.cost_name} of all is {less:.4g} below that of the start."
-        return f"held-out score: {100 * self.score:.1f} % of the start's sum of squares is taken away."
+        return f"held-out score: {100 * self.score:.1f} % of the measurements' variance is accounted for."
 
     def __str__(self) -> str:
-        lines = [f"{'trial':<28}{'residuals':>10}{'start':>12}{'fitted':>12}{'held out':>12}"]
-        rows = zip(self.trials, self.n, self.at_start, self.fitted, self.held_out, strict=True)
-        lines += [f"{name:<28}{n:>10}{a:>12.5g}{b:>12.5g}{c:>12.5g}" for name, n, a, b, c in rows]
-        total = (self.n.sum(), self.at_start.sum(), self.fitted.sum(), self.held_out.sum())
-        lines.append("{:<28}{:>10}{:>12.5g}{:>12.5g}{:>12.5g}".format("all", *total))
+        lines = [f"{'trial':<28}{'residuals':>10}{'spread':>12}{'start':>12}{'fitted':>12}{'held out':>12}"]
+        columns = (self.n, self.spread, self.at_start, self.fitted, self.held_out)
+        rows = [*zip(self.trials, *columns, strict=True), ("all", *(column.sum() for column in columns))]
+        lines += [f"{name:<28}{n:>10}" + "".join(f"{x:>12.5g}" for x in costs) for name, n, *costs in rows]
         lines.append(self.verdict)
         return "\n".join(lines)
 
@@ -113,6 +136,7 @@ def cross_validate(fit: Fit, folds: int | Sequence[Sequence[int]] | None = None)
         at_start=costs_by_trial(fit.problem, fit.problem.start),
         fitted=costs_by_trial(fit.problem, fit.point),
         held_out=held,
+        spread=spread_by_trial(fit.problem),
         estimates={name: np.array(values) for name, values in estimates.items()},
         cost_name=fit.problem.cost_name,
     )
@@ -133,10 +157,32 @@ def costs_by_trial(problem: Problem, point: Unknowns) -> np.ndarray:
     """Sums of squares (T,) with these parameters, starts and biases found for them.
 
     With the priors of a trial's starts and biases, and without those of the parameters, which belong to no trial.
+    Infinite of trials that cannot be simulated.
     """
     windows = eqx.tree_at(lambda w: w.very_first, problem.windows, jnp.zeros_like(problem.windows.very_first))
     problem = dataclasses.replace(problem, windows=windows)
-    _, at = solve_nuisance(problem, point, rtol=1e-5)
+    try:
+        _, at = solve_nuisance(problem, point, rtol=1e-5)
+    except Unsimulated as error:
+        costs, kept = np.full(len(problem.trials), np.inf), np.delete(np.arange(len(problem.trials)), [*error.reasons])
+        if kept.size:
+            others = problem.with_trials([problem.trials[k] for k in kept])
+            costs[kept] = costs_by_trial(others, dataclasses.replace(others.start, x=point.x))
+        return costs
     value = at.seen.value
     costs = np.sum(np.asarray(at.blocks.R)[:, :, -1] ** 2, axis=1) if value is None else np.asarray(value)
     return np.bincount(np.asarray(problem.windows.trial), costs, minlength=len(problem.trials))
+
+
+def spread_by_trial(problem: Problem) -> np.ndarray:
+    """Sums of squares (T,) of the measurements about the mean of each channel, in their standard deviations: what a
+    constant leaves of them."""
+    windows, owner = problem.windows, np.asarray(problem.windows.trial)
+    y, weight = np.asarray(windows.measured), np.asarray(windows.weight) ** 2  # (W, n_c, n_t)
+    spread = []
+    for k in range(len(problem.trials)):
+        y_k, w_k = y[owner == k], weight[owner == k]
+        total = w_k.sum(axis=(0, 2), keepdims=True)
+        mean = np.sum(w_k * y_k, axis=(0, 2), keepdims=True) / np.where(total > 0, total, 1.0)
+        spread.append(np.sum(w_k * (y_k - mean) ** 2))
+    return np.array(spread)

@@ -52,7 +52,7 @@ def find_continuity(fit: Fit, sigma: Sequence[str] = ()) -> Fit:
     measurements are most likely: how much a motion is disturbed, and how well it was measured, found and not given.
 
         found = find_continuity(fit(..., window=0.1, continuity={"roll_rate": 0.1}), sigma=("roll",))
-        found.problem.posed["continuity"]
+        found.problem.specification.continuity
 
     The deviations are varied by the simplex of Nelder and Mead, each from what was given; for each the parameters are
     found anew. Those of `sigma` are multiplied by one factor in all trials. For noise in continuous time, whatever the
@@ -64,7 +64,7 @@ def find_continuity(fit: Fit, sigma: Sequence[str] = ()) -> Fit:
     """
     refuse_other(fit, Fit, "find_continuity", "find_continuity(fit(..., continuity={...}))")
     problem = fit.problem
-    links = dict(problem.posed["continuity"] or {})
+    links = dict(problem.specification.continuity or {})
     if not links:
         raise ValueError("find_continuity: no windows are linked here: give `window`, and `continuity` to begin with.")
     sigma = as_names(sigma)
@@ -82,10 +82,10 @@ def find_continuity(fit: Fit, sigma: Sequence[str] = ()) -> Fit:
     options = {"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-4}
     best = scipy.optimize.minimize(cost, start, method="Nelder-Mead", options=options)
     factors = np.exp(np.clip(best.x, -limit, limit))
-    posed = {name: float(x * factor) for (name, x), factor in zip(links.items(), factors, strict=False)}
+    continuity = {name: float(x * factor) for (name, x), factor in zip(links.items(), factors, strict=False)}
     of_channels = dict(zip(sigma, factors[len(links) :], strict=True))
     trials = [_with_sigma(trial, of_channels) for trial in problem.trials]
-    return _again(Problem.of(trials=trials, **{**problem.posed, "continuity": posed}), now)
+    return _again(Problem.posed(dataclasses.replace(problem.specification, continuity=continuity), trials), now)
 
 
 def _again(problem: Problem, near: Fit) -> Fit:

@@ -11,7 +11,6 @@ from ..._common.lookup import refuse_unknown
 from .._optimize.least_squares import LeastSquares
 from .._optimize.solve import solve
 from .._problem.arguments import refuse_other
-from .._problem.problem import Problem
 from .._result.covariance import check_level
 from .._result.result import Fit
 from .candidates import Candidate, candidates_of, posed_with
@@ -104,7 +103,7 @@ def suspects(
 
 
 def _check(fit: Fit, depth: Any, refits: Any, level: float) -> None:
-    if fit.problem.posed.get("noise") is not None:
+    if fit.problem.specification.noise is not None:
         raise ValueError(
             "suspects asks fits of least squares, whose sum of squares candidates lower; this one has process noise, "
             "which stands in for what is missing. Ask without `noise`, or compare `marginal_likelihood` of two fits."
@@ -124,7 +123,5 @@ def _check(fit: Fit, depth: Any, refits: Any, level: float) -> None:
 
 def _fitted(fit: Fit, taken: Sequence[Candidate], standing: Standing) -> Fit:
     """The fit with what was taken, as a user would pose it."""
-    problem = Problem.of(trials=fit.problem.trials, **posed_with(fit, taken))
-    if problem.chooses_steps:
-        problem = problem.with_steps(fit.problem.windows.step)
+    problem = fit.problem.asking(posed_with(fit, taken))
     return solve(problem, LeastSquares(), start=standing.carried_to(problem))

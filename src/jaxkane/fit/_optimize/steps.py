@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from ..._simulation.trajectory import Status, reason
 from .._problem.blocks import Eliminated, eliminate
-from .._problem.linearization import Linearization, linearize
+from .._problem.linearization import Linearization, linearize, without_start
 from .._problem.model import Unknowns
 from .._problem.problem import Problem
 
@@ -35,6 +35,28 @@ def uninterrupted(fit: Any) -> Any:
     return fit
 
 
+class Unsimulated(ValueError):
+    """Windows that cannot be simulated to their end. `reasons`: by the number of their trial, why."""
+
+    def __init__(self, problem: Problem, point: Unknowns, at: Linearization | None, bad: np.ndarray):
+        bad = without_start(problem, point) if at is None else bad
+        self.reasons: dict[int, str] = {}
+        for i in np.flatnonzero(bad):
+            (k, first, n), why = problem.places[i], "no consistent start"
+            if at is not None:
+                status = int(at.status[i])
+                why = "not finite" if status == Status.COMPLETED else reason(status, _event_names(problem))
+            t = problem.trials[k].t
+            self.reasons.setdefault(
+                k, f"from {t[first]:g} to {t[first + n - 1]:g} s there are no finite residuals ({why})"
+            )
+        k, words = next(iter(self.reasons.items()))
+        super().__init__(
+            f"{problem.trials[k].name}: with the initial guess {words}, as in {int(bad.sum())} of {len(bad)} windows. "
+            "Choose shorter windows or other starting values, or leave this stretch out."
+        )
+
+
 def solve_nuisance(
     problem: Problem, point: Unknowns, steps: int = 8, rtol: float = 1e-2
 ) -> tuple[Unknowns, Linearization]:
@@ -44,11 +66,11 @@ def solve_nuisance(
     shorter horizon, which is doubled as soon as it fits. Where that fails for windows that are chained, each is first
     solved for by itself.
 
-    **Raises:** `ValueError` that names a window which does not reach its end.
+    **Raises:** `Unsimulated` that names a window which does not reach its end.
     """
     try:
         return _solved(problem, point, steps, rtol)
-    except ValueError:
+    except Unsimulated:
         if not problem.model.nuisance.chained:
             raise
     point, _ = _solved(problem.unchained(), point, steps, rtol)
@@ -62,7 +84,7 @@ def _solved(problem: Problem, point: Unknowns, steps: int, rtol: float) -> tuple
     while at is None or not at.good.all():
         bad = ~at.good if at is not None else np.full(len(whole), True)
         if at is None or np.any(samples[bad] <= 2):
-            raise ValueError(_cannot_start(problem, at, bad))
+            raise Unsimulated(problem, point, at, bad & (samples <= 2))
         samples = np.where(bad, np.maximum(samples // 2, 2), samples)
         at = linearize(problem.shortened(samples), point)
     stuck = 0
@@ -78,7 +100,7 @@ def _solved(problem: Problem, point: Unknowns, steps: int, rtol: float) -> tuple
         if np.all(samples[~bad] == longer[~bad]) and bad.any():
             stuck += 1
             if stuck > 2:
-                raise ValueError(_cannot_start(problem, tried, bad))
+                raise Unsimulated(problem, point, tried, bad)
         samples = np.where(bad, samples, longer)
         at = tried if tried is not None and not bad.any() else linearize(problem.shortened(samples), point)
         assert at is not None
@@ -127,21 +149,6 @@ def _chosen(better: np.ndarray, owner: np.ndarray, new: Any, old: Any) -> tuple[
     R, seen = of_windows(there.blocks.R, at.blocks.R), jax.tree.map(of_windows, there.seen, at.seen)
     b, z = of(better)(tried.b, point.b), of_windows(tried.z, point.z)
     return Unknowns(point.x, b, z), Linearization(eqx.tree_at(lambda blocks: blocks.R, at.blocks, R), seen)
-
-
-def _cannot_start(problem: Problem, at: Linearization | None, bad: np.ndarray) -> str:
-    i = int(np.argmax(bad))
-    k, first, n = problem.places[i]
-    trial = problem.trials[k]
-    why = "no consistent start"
-    if at is not None:
-        status = int(at.status[i])
-        why = "not finite" if status == Status.COMPLETED else reason(status, _event_names(problem))
-    return (
-        f"{trial.name}: from {trial.t[first]:g} to {trial.t[first + n - 1]:g} s the initial guess gives no finite "
-        f"residuals ({why}; {int(bad.sum())} of {len(bad)} windows). Choose shorter windows or other starting values, "
-        "or leave this stretch out."
-    )
 
 
 def _event_names(problem: Problem) -> tuple[str, ...]:

@@ -21,6 +21,10 @@ from .free import Delay, Free, Gain, Inertia, Intensity, Offset, Prior, Shared, 
 from .leaves import find_leaves, one_leaf
 from .parameters import Entry, Parameters, checked_prior
 
+START_INSIDE = 0.1
+"""How far inside a bound that was given a search begins which would start on it, in scales (or of the bounds' width,
+where that is less)."""
+
 
 def as_items(free: Any) -> list[Any]:
     """What a fit takes as `free`, one by one."""
@@ -171,8 +175,6 @@ def _scalar(entry: Entry, item: Free | Shared | Intensity | Sigma, start: float,
     lower, upper = _checked_bounds(name, item.bounds, positive)
     if not math.isfinite(start):
         raise ValueError(f"{name} starts at {start}.")
-    if (lower is not None and not start > lower) or (upper is not None and not start < upper):
-        raise ValueError(f"{name} starts at {start:.6g}, which is not inside its bounds ({lower}, {upper}).")
     prior = checked_prior(name, item.prior) if item.prior is not None else None
     scale = abs(start) or (prior[1] if prior is not None and math.isfinite(prior[1]) else 1.0)
     if item.scale is not None:
@@ -180,7 +182,14 @@ def _scalar(entry: Entry, item: Free | Shared | Intensity | Sigma, start: float,
             raise ValueError(f"{name}: the scale must be positive and finite, got {item.scale}.")
         scale = float(item.scale)
     ends = (-math.inf if lower is None else lower, math.inf if upper is None else upper)
-    numbers = [jnp.asarray(float(x), jnp.result_type(float)) for x in (start, *ends, scale)]
+    begin = start
+    if item.bounds is not None and start in ends:  # where the bijection has no slope
+        begin += (1 if start == ends[0] else -1) * START_INSIDE * min(scale, ends[1] - ends[0])
+    if not ends[0] < begin < ends[1]:
+        raise ValueError(
+            f"{name} starts at {start:.6g}, which is not inside its bounds ({lower}, {upper}): give it another `start`."
+        )
+    numbers = [jnp.asarray(float(x), jnp.result_type(float)) for x in (begin, *ends, scale)]
     return [entry], Interval(*numbers, bounded=(lower is not None, upper is not None)), [start], [scale], [prior]
 
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
@@ -90,6 +92,16 @@ def all_of(seen: Seen) -> np.ndarray:
     """Simulated measurements and their deviations, as `simulated` gives them."""
     parts = [x for x in (seen.simulated, seen.deviation) if x is not None]
     return np.concatenate(parts, axis=1)
+
+
+def without_start(problem: Problem, point: Unknowns) -> np.ndarray:
+    """Whether the constraints can be met nowhere near the start of a window (W,)."""
+    missing = []
+    for i in range(len(problem.places)):
+        windows, z = jax.tree.map(lambda x, i=i: x[i : i + 1], (problem.windows, point.z))
+        alone = dataclasses.replace(problem, windows=windows)
+        missing.append(_starts(alone, Unknowns(point.x, point.b, z)) is None)
+    return np.array(missing)
 
 
 def _costs(problem: Problem, point: Unknowns, starts: Array) -> tuple[Array, Seen]:

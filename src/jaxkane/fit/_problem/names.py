@@ -15,6 +15,7 @@ from ..._method.free_coordinates import found_of
 from ..._method.outputs import output_names
 from .._data.trial import Trial
 from .._data.windows import state_names
+from .arguments import Specification
 from .entries import where_of
 from .free import Delay
 from .model import Nuisance
@@ -86,8 +87,9 @@ def starts_found(
     return (None if len(named) == len(system.coordinates) else moved), guess
 
 
-def nuisance_of(system: System, channels: Sequence[str], driven: Sequence[str], posed: Mapping[str, Any]) -> Nuisance:
-    """What is unknown beside the parameters, of the arguments of a fit by name; `driven` are inputs with samples."""
+def nuisance_of(asked: Specification, channels: Sequence[str], driven: Sequence[str]) -> Nuisance:
+    """What is unknown beside the parameters; `driven` are inputs with samples."""
+    system = asked.system
     known = {
         "sensor_bias": channels,
         "sensor_gain": channels,
@@ -98,16 +100,16 @@ def nuisance_of(system: System, channels: Sequence[str], driven: Sequence[str], 
     trial = {}
     for argument, names in known.items():
         where, kind = argument.split("_")
-        for name, deviation in checked_names(system, argument, posed[argument], names).items():
+        for name, deviation in checked_names(system, argument, getattr(asked, argument), names).items():
             trial[f"{kind} of {where}", name] = deviation
     independent = tuple(c for c in system.coordinates if c not in system.dependent_coordinates)
-    start = checked_names(system, "unknown", posed["unknown"], (*independent, *system.speeds, *system.states))
-    jump = checked_names(system, "continuity", posed["continuity"] or {}, tuple(start))
+    start = checked_names(system, "unknown", asked.unknown, (*independent, *system.speeds, *system.states))
+    jump = checked_names(system, "continuity", asked.continuity or {}, tuple(start))
     array = lambda numbers: jnp.asarray(np.array(list(numbers), float), jnp.result_type(float))  # noqa: E731
     return Nuisance(
         start=tuple(start),
         trial=tuple(trial),
-        chained=posed["continuity"] is not None,
+        chained=asked.continuity is not None,
         start_deviation=array(start.values()),
         trial_deviation=array(trial.values()),
         jump=array(jump.get(name, float("inf")) for name in start),
@@ -115,10 +117,9 @@ def nuisance_of(system: System, channels: Sequence[str], driven: Sequence[str], 
 
 
 def held_and_delayed(
-    system: System, hold: Any, free: Any, nuisance: Nuisance
+    system: System, hold: Any, free: Sequence[Any], nuisance: Nuisance
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
     """Inputs under a zero-order hold, and those that act with a delay which is to be found."""
-    items = [free] if isinstance(free, Delay) else free if isinstance(free, (list, tuple)) else ()
     delayed = [name for kind, name in nuisance.trial if kind == "delay of input"]
-    delayed += [item.what for item in items if isinstance(item, Delay) and where_of(system, item) == "input"]
+    delayed += [item.what for item in free if isinstance(item, Delay) and where_of(system, item) == "input"]
     return tuple(checked_names(system, "hold", hold, system.inputs)), tuple(delayed)

@@ -30,7 +30,8 @@ class Entry:
 
 
 class Parameters(eqx.Module):
-    """The free parameters of a fit: x (p,), zero at the start and about one where much has changed, to values (p,).
+    """The free parameters of a fit: x (p,), zero where the search begins and about one where much has changed, to
+    values (p,). `start` are the values that were given; of one on its bound the search begins inside (see `Free`).
 
     The maps are bijections, each from its own part of x to as many values: see `Interval` and `PossibleBody`.
     """

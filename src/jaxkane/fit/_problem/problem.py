@@ -18,11 +18,11 @@ from ..._simulation.trajectory import Trajectory
 from .._data.trial import Trial
 from .._data.windows import Place, Windows, cut
 from . import step_halving
-from .arguments import check_windows, refuse_other
+from .arguments import Specification
 from .entries import parameters_of
 from .free import Prior
 from .model import Model, Unknowns
-from .names import Names, checked_trials, held_and_delayed, nuisance_of, starts_found
+from .names import checked_trials, held_and_delayed, nuisance_of, starts_found
 from .noise import noise_of
 from .parallel import check_same
 from .parameters import Parameters
@@ -44,8 +44,7 @@ class Problem:
     by_trial: Array
     trials: tuple[Trial, ...]
     places: tuple[Place, ...]
-    posed: Mapping[str, Any]  # the arguments of `of`, but for the trials
-    processes: bool = False
+    specification: Specification
 
     @classmethod
     def of(
@@ -53,35 +52,24 @@ class Problem:
         system: System,
         trials: Sequence[Trial] | Trial,
         free: Any,
-        *,
-        unknown: Names = (),
-        sensor_bias: Names = (),
-        sensor_gain: Names = (),
-        input_bias: Names = (),
-        input_gain: Names = (),
-        input_delay: Names = (),
-        priors: Mapping[str, Prior] | None = None,
-        hold: Sequence[str] = (),
-        window: float | None = None,
-        continuity: Mapping[str, float] | None = None,
-        noise: Mapping[str, float] | None = None,
-        simulation: Simulation | None = None,
-        processes: bool = False,
+        **options: Any,
     ) -> Problem:
-        """Pose a fit. The arguments are those of `jaxkane.fit.fit`."""
-        simulation = Simulation() if simulation is None else simulation
-        refuse_other(simulation, Simulation, "`simulation=`", "Simulation(step=0.01)")
-        posed = {key: value for key, value in locals().items() if key not in ("cls", "trials")}
+        """Pose a fit. The arguments are those of `jaxkane.fit.fit`, from `unknown` to `simulation`."""
+        return cls.posed(Specification(system, free, **options), trials)
+
+    @classmethod
+    def posed(cls, asked: Specification, trials: Sequence[Trial] | Trial) -> Problem:
+        """What is asked, of these trials."""
+        system, window, simulation = asked.system, asked.window, asked.simulation or Simulation()
         trials = (trials,) if isinstance(trials, Trial) else tuple(trials)
         channels = checked_trials(system, trials)
-        check_windows(window, continuity)
         driven = tuple(name for name in system.inputs if any(name in trial.inputs for trial in trials))
-        nuisance = nuisance_of(system, channels, driven, posed)
+        nuisance = nuisance_of(asked, channels, driven)
         deviations = jnp.concatenate([nuisance.start_deviation, nuisance.trial_deviation])
-        of_noise = noise_of(system, noise, deviations, window, continuity)
-        held, delayed = held_and_delayed(system, hold, free, nuisance)
+        of_noise = noise_of(system, asked.noise, deviations, window, asked.continuity)
+        held, delayed = held_and_delayed(system, asked.hold, asked.free, nuisance)
         assembled, guess = starts_found(system, trials, nuisance.start)
-        parameters = parameters_of(system, free, noise, channels).with_priors(priors or {})
+        parameters = parameters_of(system, asked.free, asked.noise, channels).with_priors(asked.priors or {})
         options = {"chained": nuisance.chained, "delayed": bool(delayed), "guess": guess}
         windows, places = cut(system, trials, window, channels, **options)
         check_system(system, windows.t[0, 0], jnp.nan_to_num(windows.start[0, : len(system.coordinates)]))
@@ -100,9 +88,9 @@ class Problem:
         if simulation.step is not None:  # one step in all windows; none is longer than they, so that it can be halved
             step = jnp.minimum(simulation.step, windows.t[:, -1] - windows.t[:, 0])
             windows = eqx.tree_at(lambda w: w.step, windows, step)
-        if processes:
+        if asked.processes:
             check_same(model, windows)
-        problem = cls(model, windows, windows.by_trial, trials, places, posed, processes)
+        problem = cls(model, windows, windows.by_trial, trials, places, asked)
         return problem.finer(problem.start) if problem.chooses_steps else problem
 
     @property
@@ -113,7 +101,12 @@ class Problem:
     @property
     def chooses_steps(self) -> bool:
         """Whether fixed steps of integration are halved until they are fine enough: where no step was given."""
-        return step_halving.has_steps(self) and self.posed["simulation"].step is None
+        given = self.specification.simulation
+        return step_halving.has_steps(self) and (given is None or given.step is None)
+
+    @property
+    def processes(self) -> bool:
+        return self.specification.processes
 
     def finer(self, point: Unknowns) -> Problem:
         """The problem with steps halved where that changes what is simulated at a point by more than a share of the
@@ -231,7 +224,12 @@ class Problem:
 
     def with_trials(self, trials: Sequence[Trial] | Trial) -> Problem:
         """The same question, asked of other trials."""
-        return Problem.of(trials=trials, **self.posed)
+        return Problem.posed(self.specification, trials)
+
+    def asking(self, other: Specification) -> Problem:
+        """Another question, asked of the same trials, of which the same count, with the same steps of integration."""
+        counted = np.unique(np.asarray(self.windows.trial)[self.seen])
+        return Problem.posed(other, self.trials).with_steps(self.windows.step).only(counted.tolist())
 
     def unchained(self) -> Problem:
         """The same problem in which every window starts freely; nothing is compiled anew."""
@@ -240,6 +238,5 @@ class Problem:
 
     def with_priors(self, priors: Mapping[str, Prior]) -> Problem:
         """The same problem with priors (mean, standard deviation) of parameters by name; nothing is compiled anew."""
-        return dataclasses.replace(
-            self, model=eqx.tree_at(lambda m: m.parameters, self.model, self.parameters.with_priors(priors))
-        )
+        model = eqx.tree_at(lambda m: m.parameters, self.model, self.parameters.with_priors(priors))
+        return dataclasses.replace(self, model=model, specification=self.specification.with_priors(priors))

@@ -114,8 +114,8 @@ def _sections(
     if profiles:
         sections.append(("Profiles of the likelihood", picture(pictures.draw_profiles(fit, profiles))))
     if cross_validation:
-        rows = [line.rsplit(maxsplit=4) for line in str(cross_validation).splitlines()[1:-1]]
-        head = ("trial left out", "residuals", "start", "fitted", "held out")
+        rows = [line.rsplit(maxsplit=5) for line in str(cross_validation).splitlines()[1:-1]]
+        head = ("trial left out", "residuals", "spread", "start", "fitted", "held out")
         verdict = cross_validation.verdict[0].upper() + cross_validation.verdict[1:]
         sections.append(("Trials left out", paragraph(verdict) + details("Every trial", wide_table([head, *rows]))))
     if suspects:

@@ -9,9 +9,11 @@ import jax
 import numpy as np
 
 from ..._method.checks import check_system
+from .._data.windows import state_names
 from .._problem.bijections import PossibleBody
 from .._problem.problem import Problem
 from .records import DEGREE, suspicious_records
+from .text import STATUS
 
 if TYPE_CHECKING:
     from .result import Fit
@@ -21,12 +23,15 @@ def notes_of(fit: Fit) -> tuple[str, ...]:
     """All of them, for a fit."""
     problem = fit.problem
     return (
+        *not_converged(fit),
+        *(f"{name} is left out: {why}." for name, why in fit.failed.items()),
         *filter(None, [fit.identifiability.how_many]),
         *fit.identifiability.messages,
         *trade_offs(fit),
         *odd_trials(fit),
         *coloured_residuals(fit),
         *wrong_noise(fit),
+        *wrong_sigma(fit),
         *no_freedom(fit),
         *coarse_steps(fit),
         *impossible_bodies(fit),
@@ -39,6 +44,16 @@ def notes_of(fit: Fit) -> tuple[str, ...]:
         *other_units(fit),
         *bad_channels(fit),
     )
+
+
+def not_converged(fit: Fit) -> list[str]:
+    """Fits that ended before they had converged."""
+    if fit.status in ("converged", "applied"):
+        return []
+    return [
+        f"The fit has not converged ({STATUS[fit.status]}): its estimates and errors are not those of a minimum. Go on "
+        "with `minimize(fit.problem, LeastSquares(), start=fit.point)`, or begin with other initial guesses."
+    ]
 
 
 def empty_columns(problem: Problem) -> list[str]:
@@ -137,6 +152,30 @@ def wrong_noise(fit: Fit) -> list[str]:
         f"The innovations have the mean square {fit.innovation:.2f}, where the noise as it was given says one: the "
         "standard errors are wrong. Have intensities and `sigma` found: Intensity(...), Sigma(...) among `free`."
     ]
+
+
+def wrong_sigma(fit: Fit) -> list[str]:
+    """Residuals of another size than `sigma` says, by more than four deviations of chi^2."""
+    n_r, n_unknown = fit.problem.size
+    freedom = n_r - n_unknown
+    if fit.problem.model.noise is not None or freedom <= 0 or abs(fit.variance - 1) <= 4 * (2 / freedom) ** 0.5:
+        return []
+    size = f"chi^2 is {fit.cost:.4g} with {freedom} degrees of freedom: residuals are {fit.variance**0.5:.2g} times as "
+    if fit.variance < 1:
+        return [f"{size}large as `sigma` says, which is too large."]
+    noisy = noisy_starts(fit.problem)
+    if not noisy:
+        return [f"{size}large as `sigma` says: `sigma` is too small, or the model lacks something (`suspects`)."]
+    return [
+        f"{size}large as `sigma` says. The motions start at measured samples of {', '.join(noisy)}, with the errors of "
+        f"these: have the starts found, `unknown={noisy!r}`. Else `sigma` is too small, or the model lacks something."
+    ]
+
+
+def noisy_starts(problem: Problem) -> tuple[str, ...]:
+    """Coordinates, speeds and states that are held where a measurement of them begins."""
+    known = [name for name in state_names(problem.system) if name not in problem.model.nuisance.start]
+    return tuple(name for name in known if any(name in t.measured and name not in t.initial for t in problem.trials))
 
 
 def coarse_steps(fit: Fit) -> list[str]:

@@ -8,13 +8,14 @@ import numpy as np
 
 from .._problem.model import Seen, Unknowns
 from .._problem.problem import Problem
+from .._problem.programs import starts_of
 from .residuals import trial_names
 
 
 def nuisance_by_trial(problem: Problem, point: Unknowns, seen: Seen) -> dict[str, dict[str, Any]]:
     """By trial, values of the biases and gains, and of the starts of its windows (W,), by name."""
     n = problem.model.nuisance
-    starts = np.asarray(problem.windows.start)[:, problem.model.unknown_places] + np.asarray(point.z)
+    starts = np.asarray(starts_of(problem.model, problem.windows, point)[0])[:, problem.model.unknown_places]
     owner = np.array([k for k, _, _ in problem.places])
     found = {}
     b = point.b if seen.unknowns is None else seen.unknowns  # with process noise a window is a trial

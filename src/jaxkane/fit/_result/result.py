@@ -49,6 +49,7 @@ class Fit:
     - `nuisance`: by trial, values of the biases and of the windows' starts by name; with process noise, starts that
         were given a deviation are part of the filter (`jaxkane.fit.smoothed`).
     - `step_error`: by how much halving the step of integration moves the residuals.
+    - `failed`: by name, trials that could not be simulated and are not among these, with the reason (`applied_to`).
     - `notes`: what a reader should know, in words.
     """
 
@@ -59,6 +60,7 @@ class Fit:
     history: tuple[float, ...]
     status: str
     method: str
+    failed: Mapping[str, str] = dataclasses.field(default_factory=dict, hash=False)
 
     @classmethod
     def of(
@@ -259,7 +261,7 @@ class Fit:
         """
         path, versions = Path(path).expanduser(), ("jaxkane", "jax", "diffrax")
         key = {
-            "fit": {"status": self.status, "method": self.method},
+            "fit": {"status": self.status, "method": self.method, "failed": dict(self.failed)},
             "versions": ", ".join(f"{name} {importlib.metadata.version(name)}" for name in versions),
             **described(self.problem),
         }

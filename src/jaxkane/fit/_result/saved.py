@@ -61,7 +61,7 @@ def load(path: str | os.PathLike[str], problem: Problem) -> Fit:
     if there["program"] != here["program"]:
         _refuse_changed(path, problem, point, at, there["versions"])
     errors, history = np.asarray(found["step_errors"]), tuple(float(c) for c in found["history"])
-    return Fit(problem, point, at, errors, history, of_fit["status"], of_fit["method"])
+    return Fit(problem, point, at, errors, history, of_fit["status"], of_fit["method"], of_fit["failed"])
 
 
 def _refuse_changed(path: Path, problem: Problem, point: Unknowns, at: Linearization, versions: str) -> None:

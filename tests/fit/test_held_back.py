@@ -1,0 +1,118 @@
+"""Parameters on trials that they were not found from: scores, rides that cannot be simulated, starts and notes."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from systems import POSED, PUSH, TRIAL, T, Track
+
+import jaxkane as jk
+from jaxkane.fit import (
+    CrossValidation,
+    Gain,
+    LeastSquares,
+    Offset,
+    Problem,
+    Simulation,
+    Trial,
+    applied_to,
+    compare,
+    cross_validate,
+    fit,
+    load,
+    minimize,
+)
+from jaxkane.fit._analysis.held_back import costs_by_trial
+
+
+class Falling(Track):
+    """A track that is steeper the farther one is: beyond some place the motion is infinite before its end."""
+
+    def loads(self, t, q, u, motion, inputs):
+        return (*super().loads(t, q, u, motion, inputs), jk.Force(jnp.exp(q["x"]) * motion.N.x, motion["cart"]))
+
+
+RNG = np.random.default_rng(2)
+NEAR = [
+    Trial(T, {"x": 0.5 * T**2 + RNG.normal(0, 0.1, 11)}, {"push": PUSH}, sigma=0.1, name=f"near {i}") for i in "abc"
+]
+FAR = [Trial(T, {"x": np.full(11, x)}, {"push": PUSH}, sigma=0.1, initial={"x": x}, name="far") for x in (90.0, 95.0)]
+FREE, STEP = ("gain", "drift"), Simulation(step=0.1)
+
+
+@pytest.fixture(scope="module")
+def falling():
+    return fit(Falling(), NEAR, FREE, simulation=STEP, optimizer=LeastSquares())
+
+
+def test_trials_that_cannot_be_simulated_are_told_and_the_rest_is_kept(falling, tmp_path):
+    held = applied_to(falling, [FAR[0], *NEAR, FAR[1]])
+    alone = applied_to(falling, NEAR)
+    assert held.trial_names == ("near a", "near b", "near c")
+    assert held.cost == pytest.approx(alone.cost, rel=1e-6)
+    assert list(held.failed) == ["far (0)", "far (4)"]
+    assert all("not finite" in why for why in held.failed.values())
+    assert any(note.startswith("far (4) is left out: from 0 to 1 s") for note in held.notes)
+    assert alone.failed == {}
+    assert load(held.save(tmp_path / "held.npz"), held.problem).failed == held.failed
+    with pytest.raises(ValueError, match=r"None of these trials can be simulated .*: far \(0\), from"):
+        applied_to(falling, FAR)
+    text = str(compare({"one": falling}, held_out=[FAR[0], *NEAR]))
+    assert "3 of 4 trials" in text
+    assert "not simulated" in text
+
+
+def test_a_trial_that_the_others_cannot_simulate_costs_infinity(falling):
+    both = falling.problem.with_trials([*NEAR, FAR[0]])
+    costs = costs_by_trial(both, dataclasses.replace(both.start, x=falling.point.x))
+    assert np.isinf(costs[3])
+    np.testing.assert_allclose(costs[:3], costs_by_trial(falling.problem, falling.point), rtol=1e-6)
+    left_out = CrossValidation(("a", "b"), *(np.array([1.0, 1.0]) for _ in range(3)), np.array([1.0, np.inf]),
+                               np.array([2.0, 2.0]), {})  # fmt: skip
+    assert left_out.verdict == "b cannot be simulated with the parameters of the others."
+
+
+def test_the_score_is_relative_to_the_data_and_not_to_the_first_guess():
+    rtol = 1e-6
+    trials = [Trial(T, {"x": y}, {"push": PUSH}, sigma=0.1) for y in (TRIAL.measured["x"], 0.7 * T**2, 0.5 * T**2)]
+    fits = [fit(Track(gain=gain), trials, FREE, optimizer=LeastSquares(rtol=1e-12), **POSED) for gain in (1.0, 60.0)]
+    near, far = map(cross_validate, fits)
+    about_mean = [np.sum((10 * (y - y.mean())) ** 2) for y in (trial.measured["x"] for trial in trials)]
+    np.testing.assert_allclose(near.spread, about_mean, rtol=rtol)
+    assert near.score == pytest.approx(1 - near.held_out.sum() / near.spread.sum(), rel=rtol)
+    assert far.score == pytest.approx(near.score, rel=rtol)
+    assert 0.8 < near.score < 0.95
+    assert f"{100 * near.score:.1f} % of the measurements' variance" in str(near)
+
+
+def test_reported_starts_are_those_of_the_motion():
+    """With a gain and an offset of what is known of the starts."""
+    trial = TRIAL.begun({"x": 0.5, "x_dot": 0.2})
+    free = (Gain("x_dot", of="start"), Offset("x", of="start", prior=(0.3, 0.05)))
+    found = fit(Track(), trial, free, unknown={"x": 0.1}, simulation=STEP, optimizer=LeastSquares())
+    (start,) = (values["start of x"] for values in found.nuisance.values())
+    motion = found.problem.trajectories(found.point)[0]
+    assert float(start[0]) == pytest.approx(float(motion["x"][0]), rel=1e-9)
+    assert abs(float(start[0]) - 0.5) > 0.1
+
+
+def test_a_noisy_start_that_is_held_is_told():
+    """The first sample is off by three of its deviations, and the whole motion with it."""
+    y = 0.5 * T**2 + np.append(0.3, np.zeros(10))
+    told = fit(Track(), Trial(T, {"x": y}, {"push": PUSH}, sigma=0.02), FREE, simulation=STEP, optimizer=LeastSquares())
+    (note,) = [note for note in told.notes if "chi^2" in note]
+    assert f"chi^2 is {told.cost:.4g} with 9 degrees of freedom" in note
+    assert "start at measured samples of x" in note
+    assert "`unknown=('x',)`" in note
+    free = minimize(Problem.of(Track(), told.problem.trials, FREE, **POSED), LeastSquares())
+    assert "chi^2" in " ".join(free.notes)  # one sample is still off
+    loose = Trial(T, {"x": 0.5 * T**2}, {"push": PUSH}, sigma=1.0, initial={"x": 0.0})
+    fine = fit(Track(), loose, FREE, simulation=STEP, optimizer=LeastSquares())
+    assert not any("start" in note for note in fine.notes if "chi^2" in note)
+
+
+def test_a_fit_that_has_not_converged_says_so_in_its_notes():
+    ended = fit(Track(), TRIAL, FREE, steps=0, optimizer=LeastSquares(), **POSED)
+    assert ended.status == "steps"
+    assert ended.notes[0].startswith("The fit has not converged (stopped after the last step")
