@@ -12,6 +12,7 @@ import scipy.linalg
 
 import jaxkane as jk
 from jaxkane import Scalar, parameter, stability
+from jaxkane.joints import Link, ball, mechanism
 from jaxkane.stability import linearize, straight_ahead
 
 BIKE = jk.catalog.WhippleBicycle.benchmark()
@@ -146,6 +147,34 @@ def test_faults_are_named():
 @pytest.fixture(scope="module")
 def at_four(models):
     return jax.tree.map(lambda x: x[4], models)
+
+
+@pytest.mark.parametrize("y", [0.0, 1e-14])
+def test_where_constraints_do_not_determine_a_coordinate_there_is_no_linear_model(y):
+    """A ring at the height of its centre, and a wrong choice of `dependent` below it: an error, NaN under a trace."""
+    ring = RodOnPin(length=0.6)
+    model = lambda q, dependent: linearize(ring, jk.State(q, jnp.zeros(1)), dependent=dependent, steady=False)  # noqa: E731
+    for q, dependent in (([0.6, y], "x"), ([y, 0.6], "y")):
+        with pytest.raises(ValueError, match=f"RodOnPin: .* do not determine {dependent} to first order"):
+            model(jnp.array(q), (dependent,))
+        assert np.isnan(jax.jit(lambda q: model(q, (dependent,)).A)(jnp.array(q))).all()  # noqa: B023
+
+
+def test_singular_equations_and_derivatives_are_errors():
+    """A ball joint at half a turn, where its norm does not give the last Euler parameter; a speed that is not
+    determined; an output without a slope."""
+    link = Link("a", None, ball("s", stiffness=2.0), mass=1.0, inertia=(0.5, 0.5, 0.5))
+    body = mechanism([link], gravity=(0, 0, 0))
+    half_a_turn = jk.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3))
+    with pytest.raises(ValueError, match=r"do not determine s_e4 to first order at .*others of s_e1, s_e2, s_e3, s_e4"):
+        linearize(body, half_a_turn, steady=False)
+    assert np.isfinite(linearize(body, half_a_turn, steady=False, dependent=("s_e1",), states=body.speeds).A).all()
+    ring, aside = RodOnPin(length=0.6), jk.State(jnp.array([0.6, 0.0]), jnp.zeros(1))
+    with pytest.raises(ValueError, match="RodOnPin: the constraints cannot be solved for x_dot"):
+        linearize(ring, aside, dependent=("y",), steady=False)
+    below = jk.State(jnp.array([0.0, 0.6]), jnp.zeros(1))
+    with pytest.raises(ValueError, match="the derivatives of its equations or outputs are not finite"):
+        linearize(ring, below, outputs={"distance": lambda t, q, u: jnp.sqrt(q["y"])})
 
 
 def test_transfer_function_and_bode_agree(at_four):

@@ -19,9 +19,9 @@ _APART = 1e4  # rounding errors of the largest eigenvalue: nearer ones are one, 
 class Eig(NamedTuple):
     """Eigenvalues and what belongs to them.
 
-    `values` (n,) [1/s]; `vectors` (n, n), right eigenvectors of unit length in its columns, and `left`; `condition`
-    (n,): 1 / |y^H x| of the left and right eigenvectors of unit length, by how much an error of A is magnified in the
-    eigenvalue, infinite where two coalesce.
+    `values` (n,) [1/s]: the real ones, the largest first, and then the pairs by rising frequency; `vectors` (n, n),
+    right eigenvectors of unit length in its columns, and `left`; `condition` (n,): 1 / |y^H x| of the left and right
+    eigenvectors of unit length, by how much an error of A is magnified in the eigenvalue, infinite where two coalesce.
     """
 
     values: Complex[Array, "*batch n"]
@@ -62,19 +62,30 @@ def _condition(values, left, right):
 
 @jax.custom_batching.sequential_vmap
 def _by_lapack(A):
-    return tuple(jax.lax.linalg.eig(A, compute_left_eigenvectors=True, compute_right_eigenvectors=True))
+    values, Y, X = jax.lax.linalg.eig(A, compute_left_eigenvectors=True, compute_right_eigenvectors=True)
+    order = jnp.lexsort(_keys(values))
+    return values[order], Y[:, order], X[:, order]
 
 
 @jax.custom_batching.custom_vmap
 def _values_alone(A):
-    return jax.lax.linalg.eig(A, compute_left_eigenvectors=False, compute_right_eigenvectors=False)[0]
+    return _in_order(jax.lax.linalg.eig(A, compute_left_eigenvectors=False, compute_right_eigenvectors=False)[0])
 
 
 @_values_alone.def_vmap
 def _(axis_size, is_batched, A):
     if native.is_on() and axis_size >= CHUNK and A.shape[-1] in SIZES:  # which takes a second to compile
-        return jax.lax.map(qr_eigenvalues, A, batch_size=CHUNK), True
+        return jax.lax.map(lambda A: _in_order(qr_eigenvalues(A)), A, batch_size=CHUNK), True
     return jax.lax.map(_values_alone, A), True
+
+
+def _keys(values):
+    # The frequency first: what hardly decays has a real part of rounding errors, by which no two algorithms agree.
+    return -values.imag, -values.real, jnp.abs(values.imag)
+
+
+def _in_order(values):
+    return values[jnp.lexsort(_keys(values))]
 
 
 @jax.custom_jvp
@@ -106,7 +117,10 @@ def _(primals, tangents):
 
 @_values.defjvp
 def _(primals, tangents):
-    return jax.jvp(lambda A: _decomposed(A)[0], primals, tangents)
+    values = _values(*primals)
+    decomposed, slopes = jax.jvp(lambda A: _decomposed(A)[0], primals, tangents)
+    same = jnp.argmin(jnp.abs(values[:, None] - decomposed[None, :]), axis=1)
+    return values, slopes[same]
 
 
 def _turned(A, dA, values, X, lost):

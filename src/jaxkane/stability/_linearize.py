@@ -16,9 +16,10 @@ from .._description.system import State, System
 from .._description.values import Values
 from .._method.checks import check_system, is_concrete
 from .._method.description_facts import configuration_residual
+from .._method.diagnose import ROUNDING, diagnosis
 from .._method.equations import dependent_speeds
 from .._method.outputs import output_names, outputs_at
-from .._method.right_hand_side import rates
+from .._method.right_hand_side import rates, values_of
 from .._method.values import as_array, checked_inputs, refuse_incomplete
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, solve, stack
@@ -101,9 +102,9 @@ def linearize(
 
     **Returns:** a `LinearModel`; `A, B, C, D = linearize(...)` works too.
 
-    **Raises:** `ValueError` for unknown names, a motion that is not steady, coordinates off the constraints, or as many
-    dependent coordinates as there are not constraints. Under a trace the matrices are NaN, with their derivatives,
-    where the motion is not steady, not finite or off the constraints.
+    **Raises:** `ValueError` for unknown names, a motion that is not steady, coordinates off the constraints, dependent
+    coordinates that the constraints do not determine, or equations that are singular. Under a trace the matrices are
+    NaN there, with their derivatives.
     """
     name = type(system).__name__
     if isinstance(motion, SteadyMotion):
@@ -134,9 +135,26 @@ def linearize(
         wrong = is_wrong(*origin, steady)
     # Numbers in the place of NaN, which would spoil the gradients of callers who do not use it (0 * NaN).
     at = tuple(jnp.where(jnp.all(jnp.isfinite(y)), y, 0.1) for y in (t, q, u, x, w))
-    model = _derivatives((system, *at), _Choice(dependent, kept, rows), _Functions(functions))
-    A, B, C, D = nan_where(wrong, model, origin)
+    model, follows = _derivatives((system, *at), _Choice(dependent, kept, rows), _Functions(functions))
+    if is_concrete(*origin, model) and not (follows and all(np.isfinite(M).all() for M in model)):
+        raise ValueError(_why_not(origin, dependent, bool(follows)))
+    A, B, C, D = nan_where(wrong | ~follows, model, origin)
     return LinearModel(A, B, C, D, kept, tuple(system.inputs), rows)
+
+
+def _why_not(origin: Any, dependent: tuple[str, ...], follows: bool) -> str:
+    """Why there is no linear model, where its matrices are not finite or the dependent coordinates do not follow."""
+    system, t, q, u, x, w = origin
+    name = type(system).__name__
+    if not follows:
+        place = ", ".join(f"{k} = {float(x):.4g}" for k, x in zip(system.coordinates, q, strict=True))
+        return (
+            f"{name}: the configuration constraints do not determine {', '.join(dependent)} to first order at {place}. "
+            f"Give linearize(..., dependent=(...)) others of {', '.join(system.coordinates)}."
+        )
+    return diagnosis(system, t, q, u, values_of(system, x, inputs_by_name(system, w))) or (
+        f"{name}: there is no linear model: the derivatives of its equations or outputs are not finite there."
+    )
 
 
 def _states(system: System, states: Sequence[str] | None, dependent: tuple[str, ...]) -> tuple[str, ...]:
@@ -177,7 +195,9 @@ def _derivatives(at, choice: _Choice, functions: _Functions):
     # Two loops, so that who wants A alone does not pay for B.
     A, C = jacobian(lambda x: _at_deviation(x, w, at, T, choice, functions), x)
     B, D = jacobian(lambda w: _at_deviation(x, w, at, T, choice, functions), w)
-    return A, B, C, D
+    # Multiplied by more than that, a rounding error is as large as what it belongs to.
+    follows = jnp.max(jnp.abs(jax.lax.stop_gradient(T)), initial=0.0) < 1 / ROUNDING
+    return (A, B, C, D), follows
 
 
 def _at_deviation(x, w, at, T, choice: _Choice, functions: _Functions):
