@@ -11,24 +11,32 @@ import jaxkane as jk
 from jaxkane.bicycles import (
     Arms,
     Bicycle,
+    ConstantSpeed,
+    Drag,
     HeadTwist,
     LaneChange,
     LateralSlip,
     LeaningRider,
     LeanSteerGains,
     LongitudinalSlip,
+    MagicFormula,
     Part,
     PathFollower,
     RigidRider,
     Road,
     ScheduledGains,
+    Slope,
+    SteerByWire,
     SteeringMotor,
     Trailer,
     Tyre,
     lqr,
+    schwalbe_energizer,
     separate_rider,
 )
-from jaxkane.stability import canonical, straight_ahead
+from jaxkane.fit._problem.leaves import find_leaves, leaf_names
+from jaxkane.stability import canonical, linearize, straight_ahead
+from jaxkane.sweep import sweep
 
 BENCHMARK = Bicycle.benchmark()
 RIDER = RigidRider(mass=20.0, x=0.3, z=-1.0, Ixx=0.8, Iyy=0.8, Izz=0.4, Ixz=0.0, shoulder=[0.33, 0.2, -1.47])
@@ -82,6 +90,134 @@ class Aside(Part):
 def test_what_does_not_fit_is_refused_where_it_is_put_together(made, error, words):
     with pytest.raises(error, match=words):
         made()
+
+
+LEANING = {"mass": 40.0, "x": 0.25, "z": -1.0, "Ixx": 1.8, "Iyy": 1.8, "Izz": 0.9, "Ixz": 0.1, "hinge_x": 0.2}
+LEANING |= {"hinge_z": -0.8}
+BAR = {"mass": 1.0, "x": 0.7, "z": -1.0, "Ixx": 0.02, "Iyy": 0.01, "Izz": 0.02, "stiffness": 50.0}
+
+
+def changed(part, **more):
+    return dataclasses.replace(part, **more)
+
+
+@pytest.mark.parametrize(
+    ("made", "words"),
+    [
+        (lambda: Slope(10.0), r"Slope\.angle = 10 rad must lie between -1\.57 and 1\.57 rad\. In degrees\?"),
+        (lambda: Slope(np.pi / 2), r"Slope\.angle = 1\.5708 rad"),
+        (lambda: Slope(0.1, towards=90.0), r"Slope\.towards = 90 rad .* In degrees\?"),
+        (lambda: BENCHMARK.with_parts(zB=0.9), r"Bicycle\.zB = 0\.9 m must lie .* With the other sign\?"),
+        (lambda: BENCHMARK.with_parts(zH=0.7), r"Bicycle\.zH = 0\.7 m .* With the other sign\?"),
+        (lambda: BENCHMARK.with_parts(lam=18.0), r"Bicycle\.lam = 18 rad .* In degrees\?"),
+        (lambda: BENCHMARK.with_parts(c=80.0), r"Bicycle\.c = 80 m .* In millimetres\?"),
+        (lambda: BENCHMARK.with_parts(rF=350.0), r"Bicycle\.rF = 350 m .* In millimetres\?"),
+        (lambda: BENCHMARK.with_parts(w=-1.0), r"Bicycle\.w = -1\.0 must be positive"),
+        (lambda: BENCHMARK.with_parts(mB=-1.0), r"Bicycle\.mB = -1\.0 must be positive"),
+        (lambda: BENCHMARK.with_parts(g=-9.81), r"Bicycle\.g = -9\.81 m/s\^2 .* With the other sign\?"),
+        (lambda: jk.catalog.WhippleBicycle.from_parameters(PLAIN | {"zB": 0.9}), r"WhippleBicycle\.zB = 0\.9 m"),
+        (lambda: changed(RIDER, z=1.0), r"RigidRider\.z = 1 m .* With the other sign\?"),
+        (lambda: changed(RIDER, mass=800.0), r"RigidRider\.mass = 800 kg .* In newtons\?"),
+        (lambda: changed(RIDER, shoulder=[330.0, 200.0, -1470.0]), r"RigidRider\.shoulder = .* In millimetres\?"),
+        (lambda: LeaningRider(**LEANING | {"hinge_z": 0.8}), r"LeaningRider\.hinge_z = 0\.8 m .* other sign\?"),
+        (lambda: LeaningRider(**LEANING, hinge_tilt=10.0), r"LeaningRider\.hinge_tilt = 10 rad .* In degrees\?"),
+        (lambda: Arms.of_person(83.5, 183.0, grip=[0.55, 0.28, -1.05]), r"Arms\.upper_length = 34\.038 m"),
+        (lambda: changed(TRAILER, hitch_z=0.5), r"Trailer\.hitch_z = 0\.5 m .* With the other sign\?"),
+        (lambda: changed(TRAILER, height=-0.2), r"Trailer\.height = -0\.2 m .* With the other sign\?"),
+        (lambda: HeadTwist(1e3, height=400.0), r"HeadTwist\.height = 400 m .* In millimetres\?"),
+        (lambda: SteerByWire(**BAR | {"z": 1.0}), r"SteerByWire\.z = 1 m .* With the other sign\?"),
+        (lambda: Drag(height=-1.1), r"Drag\.height = -1\.1 m"),
+        (lambda: ConstantSpeed(250.0), r"ConstantSpeed\.speed = 250 m/s .* In km/h\?"),
+        (lambda: SteeringMotor(lag=20.0), r"SteeringMotor\.lag = 20 s .* In milliseconds\?"),
+        (lambda: SteeringMotor(delay=30.0), r"SteeringMotor\.delay = 30 s .* In milliseconds\?"),
+        (lambda: Tyre(rolling_resistance=-0.005), r"Tyre\.rolling_resistance = -0\.005 must .* With the other sign\?"),
+        (lambda: Tyre(rolling_resistance=5.0), r"Tyre\.rolling_resistance = 5 must lie between 0 and 1"),
+        (lambda: Tyre(load_lag=20.0), r"Tyre\.load_lag = 20 s"),
+        (lambda: LateralSlip(9e3, relaxation_length=100.0), r"LateralSlip\.relaxation_length = 100 m .* In milli"),
+        (lambda: LateralSlip(9e3, pneumatic_trail=30.0), r"LateralSlip\.pneumatic_trail = 30 m"),
+        (lambda: MagicFormula(14.0, friction=700.0), r"MagicFormula\.friction = 700 must lie between 0 and 10"),
+        (lambda: MagicFormula(14.0, shape=13.0), r"MagicFormula\.shape = 13 must lie between 0 and 3"),
+        (lambda: changed(schwalbe_energizer(), largest_slip=10.0), r"largest_slip = 10\.0 rad .* In degrees\?"),
+        (lambda: PathFollower(LaneChange(), limit=17.0), r"PathFollower\.limit = 17 rad .* In degrees\?"),
+    ],
+)
+def test_numbers_that_no_bicycle_has_are_refused_with_what_they_probably_are(made, words):
+    """Degrees for radians, millimetres for metres, newtons for kilograms, a mass centre below the ground."""
+    with pytest.raises(ValueError, match=words):
+        made()
+
+
+def test_a_member_of_a_batch_with_such_a_number_is_invalid():
+    swept = sweep(BENCHMARK, straight_ahead(BENCHMARK, 5.0), jnp.array([0.0, 0.1]), table={"zB": [-0.9, 0.9, -0.8]})
+    assert swept.counts == {"completed": 2, "invalid": 1}
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda bicycle: jk.accelerations(bicycle, 0.0, jnp.zeros(8), jnp.zeros(5)),
+        lambda bicycle: jk.simulate(bicycle, straight_ahead(bicycle, 5.0), jnp.array([0.0, 0.1])),
+        lambda bicycle: linearize(bicycle, straight_ahead(bicycle, 5.0), states=bicycle.lateral),
+    ],
+)
+def test_a_load_beyond_a_measured_tyre_is_told_with_the_tyre(ask):
+    """A wheel of 1409 N on a tyre that was measured up to 1000 N."""
+    city = Tyre(crown=0.022, lateral=schwalbe_energizer())
+    bicycle = BENCHMARK.with_parts(mB=200.0, rear_tyre=city, front_tyre=city)
+    with pytest.raises(ValueError, match=r"the rear tyre carries 1409 N, .* its MagicFormula89, 1000 N, at roll ="):
+        ask(bicycle)
+
+
+@pytest.mark.parametrize(
+    ("parts", "words"),
+    [
+        (
+            {"rider": (LeaningRider(**LEANING), LeaningRider(**LEANING))},
+            r"'rider_lean' .* of rider\[0\], .* rider\[1\]",
+        ),
+        (
+            {"rider": RIDER, "extra": [RIDER]},
+            r"extra\[0\], a RigidRider: .* point of the name 'left_shoulder'.*a class of your own",
+        ),
+        ({"extra": [TRAILER, TRAILER]}, r"'trailer_angle' stands twice in `coordinates`: of extra\[0\], a Trailer"),
+        (
+            {"control": (LeanSteerGains(), LeanSteerGains())},
+            r"'desired_roll' .* of control\[0\], a LeanSteerGains and",
+        ),
+        ({"drive": (Drag(), Drag())}, r"drive\[1\], a Drag: .* point of the name 'center of drag'"),
+    ],
+)
+def test_two_parts_of_one_kind_are_refused_by_their_places(parts, words):
+    """Their values would have one name."""
+    with pytest.raises(ValueError, match=words):
+        jk.accelerations(BENCHMARK.with_parts(**parts), 0.0, jnp.zeros(8), jnp.zeros(3))
+
+
+def test_what_is_left_without_a_rider_is_a_body():
+    """Here the moments of inertia would be 0.54, 7.82 and 8.86 kg m^2."""
+    with pytest.raises(ValueError, match=r"does not hold the rider's body\. Without it: .*triangle inequality"):
+        separate_rider(BENCHMARK, LeaningRider(**LEANING | {"Iyy": 1.2}))
+    rest = separate_rider(BENCHMARK, LeaningRider(**LEANING))
+    assert jnp.isfinite(jk.accelerations(rest, 0.0, jnp.zeros(9), jnp.zeros(4))).all()
+
+
+def test_a_parameter_of_a_part_has_one_name():
+    """As Python writes it: in a fit, a sweep, an export and a copy with other parameters."""
+    name, bicycle = "extra[0].mass", BENCHMARK.with_parts(extra=[TRAILER])
+    assert name in leaf_names(bicycle)
+    assert name in jk.export.parameters(bicycle)
+    assert find_leaves(bicycle, name)[0] == find_leaves(bicycle, lambda b: b.extra[0].mass)[0]
+    assert len(find_leaves(bicycle, "extra[0]")[0]) == len(find_leaves(bicycle, "extra")[0]) == 11
+    heavier = bicycle.with_parts(**{name: 30.0, "w": 1.1})
+    assert (float(heavier.extra[0].mass), float(heavier.w), float(bicycle.extra[0].mass)) == (30.0, 1.1, 20.0)
+    swept = sweep(bicycle, jk.assemble(bicycle, {}), jnp.array([0.0, 0.01]), table={name: [20.0, 30.0]})
+    assert swept.counts == {"completed": 2}
+    for wrong in ("extra.0.mass", "extra[1].mass"):
+        for ask in (find_leaves, lambda b, name: b.with_parts(**{name: 30.0})):
+            with pytest.raises(ValueError, match=r"did you mean 'extra\[0\]\.mass'"):
+                ask(bicycle, wrong)
+    with pytest.raises(ValueError, match=r"Trailer\.mass = -1\.0 must be positive"):
+        bicycle.with_parts(**{name: -1.0})
 
 
 def test_arms_belong_to_a_rider_in_any_field():

@@ -43,6 +43,10 @@ def now() -> int:
     return next(_moments)
 
 
+class NameTaken(ValueError):
+    """A body, a point or a frame with the name of another."""
+
+
 class Motion:
     """What `System.motion` returns: bodies, velocity residuals, and the frames and points that others ask for.
 
@@ -103,7 +107,7 @@ class Motion:
         for kind, there, new in (("point", self.points, points), ("frame", self.frames, frames)):
             twice = [name for name in new or {} if name in there]
             if twice:
-                raise ValueError(f"Motion.extended: there is a {kind} of the name {twice[0]!r} already.")
+                raise NameTaken(f"Motion.extended: there is a {kind} of the name {twice[0]!r} already.")
         Motion.__init__(
             more,
             (*self.bodies, *bodies),
@@ -127,7 +131,7 @@ class Motion:
                 if not isinstance(name, str):
                     raise TypeError(f"Motion: the name of {part!r} must be a string, got {name!r}.")
                 if name in named and not (name == UNNAMED and kind is Body):
-                    raise ValueError(
+                    raise NameTaken(
                         f"Motion: two parts have the name {name!r}, {_kind_of(named[name])} and {_kind_of(part)}: "
                         f"motion[{name!r}] could be either. Give them different names."
                     )

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+import math
+import operator
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +23,7 @@ def parameter(
     default: Any = dataclasses.MISSING,
     *,
     positive: bool = False,
+    within: tuple[float, float] = (-math.inf, math.inf),
     shape: tuple[int, ...] | None = None,
     unit: str = "",
 ) -> Any:
@@ -32,6 +36,8 @@ def parameter(
 
     - `default`: a number, or an array or nested lists of numbers; without one the parameter must be given.
     - `positive`: refuse zero and negative values, and let a fit move it on a logarithmic scale.
+    - `within`: the least and the largest value that can be, both allowed: a tilt in degrees, a mass centre below the
+        ground are refused. In a batch such a member is `invalid`.
     - `shape`: of the array, by default that of `default`, or `()` for a number. A value with leading axes more is a
         batch.
     - `unit`: as tables and pictures show it; no number is converted.
@@ -39,10 +45,10 @@ def parameter(
     if not isinstance(unit, str):
         raise TypeError(f'parameter(unit="N m"): a unit is a text for tables, got {unit!r}.')
     if default is dataclasses.MISSING:
-        return eqx.field(converter=to_float, metadata={"jaxkane": ParameterInfo(positive, shape or (), unit)})
+        return eqx.field(converter=to_float, metadata={"jaxkane": ParameterInfo(positive, shape or (), unit, within)})
     # A copy, as NumPy: a list that is changed later must not change the default, and JAX must not start yet.
     default = default if isinstance(default, jax.Array) or np.ndim(default) == 0 else np.array(default)
-    metadata = {"jaxkane": ParameterInfo(positive, np.shape(default) if shape is None else shape, unit)}
+    metadata = {"jaxkane": ParameterInfo(positive, np.shape(default) if shape is None else shape, unit, within)}
     return eqx.field(converter=to_float, metadata=metadata, default_factory=lambda: default)
 
 
@@ -100,11 +106,30 @@ class Learned(eqx.Module):
 
 @dataclasses.dataclass(frozen=True)
 class ParameterInfo:
-    """What `parameter` was given: whether the value must be positive, the shape of one value, and its unit."""
+    """What `parameter` was given: whether the value must be positive, the shape of one value, its unit, and the least
+    and the largest value."""
 
     positive: bool
     shape: tuple[int, ...]
     unit: str = ""
+    within: tuple[float, float] = (-math.inf, math.inf)
+
+    @property
+    def is_limited(self) -> bool:
+        """Whether some finite number cannot be."""
+        return self.positive or self.within != (-math.inf, math.inf)
+
+    def allows(self, x: Any) -> Any:
+        """Which numbers of an array can be; what is not finite cannot."""
+        least, most = self.within
+        facts = [x > 0] if self.positive else []
+        facts += [x >= least] if least > -math.inf else []
+        facts += [x <= most] if most < math.inf else []
+        return functools.reduce(operator.and_, facts, abs(x) < math.inf)
+
+
+ANY = ParameterInfo(False, ())
+"""Of a number about which nothing was declared."""
 
 
 def parameter_info(system: System | type[System]) -> dict[str, ParameterInfo]:
@@ -138,27 +163,26 @@ def in_batches(system: Any) -> list[str]:
 def with_parameters(system: Any, values: Mapping[str, Any]) -> Any:
     """The system with other values of some parameters, by the names of `parameters_in`; each part is made anew, and
     checked as any other."""
-    if not values:
-        return system
-    fields = {field.name for field in dataclasses.fields(system)}
-    own: dict[str, Any] = {}
-    inner: dict[str, dict[str, Any]] = {}
-    for name, value in values.items():
-        field, _, rest = name.partition(".")
-        if name in fields or not rest:  # the names of a mechanism's own parameters have dots too: "mass.forearm"
-            own[name] = value
-        else:
-            inner.setdefault(field, {})[rest] = value
-    for field, its in inner.items():
-        name, _, place = field.partition("[")
-        held = own.get(name, getattr(system, name))
-        if not place:
-            own[name] = with_parameters(held, its)
-            continue
-        parts = list(held)
-        parts[int(place[:-1])] = with_parameters(parts[int(place[:-1])], its)
-        own[name] = type(held)(parts)
-    return dataclasses.replace(system, **own)
+    return _remade(system, values, "") if values else system
+
+
+def _remade(part: Any, values: Mapping[str, Any], prefix: str) -> Any:
+    others: dict[str, Any] = {}
+    for field in dataclasses.fields(part):
+        name, value = prefix + field.name, getattr(part, field.name)
+        other = value
+        if name in values:
+            other = values[name]
+        elif isinstance(value, eqx.Module) and not isinstance(value, Learned):
+            other = _remade(value, values, f"{name}.")
+        elif isinstance(value, (list, tuple)):
+            each = [
+                _remade(x, values, f"{name}[{i}].") if isinstance(x, eqx.Module) else x for i, x in enumerate(value)
+            ]
+            other = value if all(x is y for x, y in zip(each, value, strict=True)) else type(value)(each)
+        if other is not value:
+            others[field.name] = other
+    return dataclasses.replace(part, **others) if others else part
 
 
 def to_float(value: Any) -> Any:
@@ -216,11 +240,34 @@ def check_parameter(label: str, value: Any, info: ParameterInfo) -> None:
         raise ValueError(f"{label} = {array} is not finite.")
     if info.positive and not np.all(array > 0):
         raise ValueError(f"{label} = {array} must be positive.")
+    if not np.all(info.allows(array)):
+        least, most = info.within
+        hint = " With the other sign?" if np.all(info.allows(-array)) else ""
+        if np.abs(array).max() > 2.0 * max(abs(least), abs(most)):
+            hint = _LIKELY.get(info.unit, "")
+        number = f"{array:.6g}" if array.ndim == 0 else f"{array}"
+        unit = f" {info.unit}" if info.unit else ""
+        raise ValueError(f"{label} = {number}{unit} must lie between {least:g} and {most:g}{unit}.{hint}")
+
+
+_LIKELY = {
+    "rad": " In degrees?",
+    "m": " In millimetres?",
+    "m/s": " In km/h?",
+    "kg": " In newtons?",
+    "s": " In milliseconds?",
+}
+"""What a number that is too large for its unit probably is in."""
 
 
 def leaf_name(path: tuple[Any, ...]) -> str:
     """A leaf's name as it is written in Python: "mass", "frame.mass", "links[2].mass"."""
     return jax.tree_util.keystr(path).lstrip(".")
+
+
+def names_of_leaf(path: tuple[Any, ...]) -> tuple[str, ...]:
+    """The names by which a leaf is meant: its own, and those of the parts that hold it."""
+    return tuple(leaf_name(path[:n]) for n in range(1, len(path) + 1))
 
 
 def learned_part(system: Any, path: tuple[Any, ...]) -> str:
@@ -239,17 +286,14 @@ def learned_part(system: Any, path: tuple[Any, ...]) -> str:
 
 def declared(system: Any, path: tuple[Any, ...]) -> ParameterInfo:
     """What `parameter` was given of the field that holds this leaf."""
-    found = _UNDECLARED
+    found = ANY
     for key in path:
         if isinstance(key, jax.tree_util.GetAttrKey):
             field = {f.name: f for f in dataclasses.fields(system)}.get(key.name)
-            found = field.metadata.get("jaxkane", _UNDECLARED) if field else _UNDECLARED
+            found = field.metadata.get("jaxkane", ANY) if field else ANY
             system = getattr(system, key.name)
         elif isinstance(key, jax.tree_util.SequenceKey):
             system = system[key.idx]
         elif isinstance(key, jax.tree_util.DictKey):
             system = system[key.key]
     return found
-
-
-_UNDECLARED = ParameterInfo(False, ())

@@ -107,6 +107,10 @@ class System(eqx.Module, metaclass=Kind):
         """
         return ()
 
+    def why_not_finite(self, motion: Motion, inputs: Mapping[str, Component]) -> str:
+        """Why loads are not finite at a state, in words: asked where they are not, for the error; "" if unknown."""
+        return ""
+
     def state_rates(self, t: Component, q: Any, u: Any, x: Any, motion: Motion, now: Any) -> Sequence[Component]:
         """Rates of the states of the first order, in the order of `states`; or by name, in a dict.
 

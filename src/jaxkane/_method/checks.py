@@ -85,9 +85,14 @@ def check_bodies(system: System, t: Any, q: Any) -> None:
         if fault:
             body = Reading(system).motion(t, *_at_rest(system, q)).bodies[i]
             message = f"{type(system).__name__}, body {body.name!r}: {fault}"
-            if _fault(mass, I) or _excess(I) > MEASURED:
+            if why_no_body(mass, I, system.check_inertia):
                 raise ValueError(message)
             warnings.warn(message, UserWarning, stacklevel=4)
+
+
+def why_no_body(mass: float, I: np.ndarray, check_inertia: bool) -> str:
+    """Why no body has this mass and inertia (3, 3), even as measured; "" where one can."""
+    return _fault(mass, I) or (_excess_in_words(I) if check_inertia and _excess(I) > MEASURED else "")
 
 
 def _fault(mass: float, I: np.ndarray) -> str:

@@ -67,12 +67,17 @@ def diagnosis(system: System, t: Any, q: Any, u: Any, inputs: Any = None) -> str
 
 def _loads_not_finite(system: System, t: Any, q: Any, u: Any, inputs: Any) -> str:
     now = Instant(system, t, q, u, inputs)
-    loads = now.loads(now.motion(now.t, now.q, now.u_all))
+    motion = now.motion(now.t, now.q, now.u_all)
+    reason = system.why_not_finite(motion, now.inputs)
+    if reason:
+        return reason
+    loads = now.loads(motion)
     wrong = [x for x in loads if not all(np.isfinite(float(c)) for c in x.vector.components)]
     places = [f"the force at {x.point.name!r}" if isinstance(x, Force) else "a torque" for x in wrong]
     if not places:
         return "the loads are not finite"
-    hint = " (between two points in one place there is no direction)" if len(places) > 1 else ""
+    opposite = len(places) > 1 and all(isinstance(x, Force) for x in wrong)
+    hint = " (between two points in one place there is no direction)" if opposite else ""
     return f"{_listed(places)} {'is' if len(places) == 1 else 'are'} not finite{hint}"
 
 

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._description.parameters import ParameterInfo, declared, in_batches, leaf_name
+from .._description.parameters import ANY, ParameterInfo, declared, in_batches, leaf_name
 from .._description.system import System
 from .._scalars.graph import Graph, NotScalarError, unrolled
 from .._scalars.jacobian import jacobian
@@ -94,7 +94,7 @@ class Argument(NamedTuple):
     name: str
     shape: tuple[int, ...]
     elements: tuple[str, ...]
-    info: ParameterInfo = ParameterInfo(False, ())
+    info: ParameterInfo = ANY
 
 
 class Formulas:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from .._description.parameters import parameters_in
+from .._description.parameters import ANY, ParameterInfo, parameters_in
 from .._description.system import State, System
 from .._method.checks import configuration_is_met
 from .._scalars.fuse import fused
@@ -33,9 +33,9 @@ def is_valid(system: System, state: State, t: Array, signals: Any, rises: Array 
     """Whether a motion can begin at `t`; `rises`: whether the times rise, None where that is known."""
     many = eqx.filter((system, state), _is_few, inverse=True)
     others = all_finite(many) & (True if rises is None else rises) & signals_are_sound(signals)
-    for value in _positive(system):
+    for value, info in _limited(system):
         if not _is_few(value):
-            others &= jnp.all(value > 0)
+            others &= jnp.all(info.allows(value))
     numbers, static = eqx.partition((system, state, t), eqx.is_array)
     return _is_sound(*eqx.combine(jax.lax.stop_gradient(numbers), static), others)
 
@@ -45,12 +45,13 @@ def _is_sound(system: System, state: State, t: Array, others: Array) -> Array:
     """Whether a motion can begin there, one answer from all the numbers; `others`: from those that are too many."""
     facts = [others, configuration_is_met(system, t, state.q)]
     facts += [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((system, state)) if _is_few(x)]
-    return functools.reduce(jnp.logical_and, [*facts, *(jnp.all(x > 0) for x in _positive(system) if _is_few(x))])
+    facts += [jnp.all(info.allows(x)) for x, info in _limited(system) if _is_few(x)]
+    return functools.reduce(jnp.logical_and, facts)
 
 
-def _positive(system: System) -> list[Array]:
-    """Values of the parameters that must be positive."""
-    return [value for _, value, info in parameters_in(system) if info.positive]
+def _limited(system: System) -> list[tuple[Array, ParameterInfo]]:
+    """Values of the parameters that cannot be any number, and what they can be."""
+    return [(value, info) for _, value, info in parameters_in(system) if info.is_limited]
 
 
 def safe(valid: Array, values: Any) -> Any:
@@ -59,11 +60,12 @@ def safe(valid: Array, values: Any) -> Any:
 
 
 def sound(system: System) -> System:
-    """The system with ones for parameters that are not finite, or not positive as they must be: behind a mask these
+    """The system with ones for parameters that are not finite, or that no description can have: behind a mask these
     would still spoil the reverse gradient of what is shared."""
-    must_be = {id(x) for x in _positive(system)}
-    scalars = lambda xs: _sound_scalars(_Positive(tuple(id(x) in must_be for x in xs)), xs)  # noqa: E731
-    return _replaced(system, scalars, lambda x: _sound_or_one(x, id(x) in must_be))
+    limits = {id(x): info for x, info in _limited(system)}
+    of = lambda x: limits.get(id(x), ANY)  # noqa: E731
+    scalars = lambda xs: _sound_scalars(_Limits(tuple(map(of, xs))), xs)  # noqa: E731
+    return _replaced(system, scalars, lambda x: _sound_or_one(x, of(x)))
 
 
 def _replaced(values: Any, scalars: Callable[[list[Array]], list[Array]], array: Callable[[Array], Array]) -> Any:
@@ -75,19 +77,19 @@ def _replaced(values: Any, scalars: Callable[[list[Array]], list[Array]], array:
     return eqx.combine(jax.tree.unflatten(treedef, found), jax.tree.map(array, many), rest)
 
 
-class _Positive(eqx.Module):
-    """Which of some numbers must be positive."""
+class _Limits(eqx.Module):
+    """What some numbers can be."""
 
-    these: tuple[bool, ...] = eqx.field(static=True)
+    these: tuple[ParameterInfo, ...] = eqx.field(static=True)
 
 
 @fused
-def _sound_scalars(positive: _Positive, values: list[Array]) -> list[Array]:
-    return [_sound_or_one(x, must_be) for x, must_be in zip(values, positive.these, strict=True)]
+def _sound_scalars(limits: _Limits, values: list[Array]) -> list[Array]:
+    return [_sound_or_one(x, info) for x, info in zip(values, limits.these, strict=True)]
 
 
-def _sound_or_one(x: Array, positive: bool) -> Array:
-    return jnp.where(jnp.isfinite(x) & (x > 0) if positive else jnp.isfinite(x), x, jnp.ones_like(x))
+def _sound_or_one(x: Array, info: ParameterInfo) -> Array:
+    return jnp.where(info.allows(x), x, jnp.ones_like(x))
 
 
 @fused

@@ -18,6 +18,7 @@ from .._description.points import Point
 from .._method.checks import is_concrete
 from .._scalars.components import add
 from .._scalars.types import Component, Scalar
+from ..catalog.bicycle import FAR
 from ._part import Part
 from ._rider import Rider
 
@@ -61,13 +62,13 @@ class Arms(Part):
     the grips. Where numbers are traced the coordinates become NaN instead.
     """
 
-    grip: Float[Array, 3] = parameter(shape=(3,), unit="m")
-    upper_length: Scalar = parameter(positive=True, unit="m")
-    fore_length: Scalar = parameter(positive=True, unit="m")
+    grip: Float[Array, 3] = parameter(within=(-FAR, FAR), shape=(3,), unit="m")
+    upper_length: Scalar = parameter(positive=True, within=(0.0, FAR), unit="m")
+    fore_length: Scalar = parameter(positive=True, within=(0.0, FAR), unit="m")
     upper_mass: Scalar = parameter(positive=True, unit="kg")
     fore_mass: Scalar = parameter(positive=True, unit="kg")
-    upper_center: Scalar = parameter(unit="m")
-    fore_center: Scalar = parameter(unit="m")
+    upper_center: Scalar = parameter(within=(-FAR, FAR), unit="m")
+    fore_center: Scalar = parameter(within=(-FAR, FAR), unit="m")
     upper_inertia: Float[Array, 3] = parameter(shape=(3,), positive=True, unit="kg m^2")
     fore_inertia: Float[Array, 3] = parameter(shape=(3,), positive=True, unit="kg m^2")
     shoulder_stiffness: Scalar | None = parameter(None, unit="N m/rad")

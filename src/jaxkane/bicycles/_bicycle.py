@@ -18,13 +18,13 @@ import jax.numpy as jnp
 from .._common.lookup import refuse_unknown
 from .._description.frames import Frame
 from .._description.motion import Motion
+from .._description.parameters import parameters_in, with_parameters
 from .._description.points import Point
 from .._description.vectors import Vector
 from .._method.right_hand_side import named_row
 from .._method.values import as_row
 from .._scalars.components import add
 from .._scalars.types import Component
-from ..catalog._bicycle_file import refuse_other_units
 from ..catalog.bicycle import WhippleBicycle
 from ._files import as_meijaard, read_yaml
 from ._ground import Ground
@@ -45,7 +45,7 @@ from ._part import Part
 from ._part_methods import as_tuple, by_name, commanded, label_of, refuse_misfits
 from ._rider import rider_of
 from ._tyre import Tyre
-from ._tyre_forces import deflection_rates, loads_of_tyres, transfer_rates, tyre_forces, tyre_loads
+from ._tyre_forces import deflection_rates, loads_of_tyres, overloaded, transfer_rates, tyre_forces, tyre_loads
 
 OFF_ROAD = 1e-3
 """[m]: a motion over a `Road` ends where a contact is further from it than that."""
@@ -95,9 +95,14 @@ class Bicycle(WhippleBicycle):
         refuse_misfits(self)
 
     def with_parts(self, **parts: Any) -> Self:
-        """A copy with other parts, or parameters, by the names of the fields."""
-        refuse_unknown(parts, [f.name for f in dataclasses.fields(self)], f"{type(self).__name__} has no field")
-        return dataclasses.replace(self, **parts)
+        """A copy with other parts by the names of the fields, or with other parameters by their names, those of a part
+        too: `with_parts(**{"extra[0].mass": 4.0})`."""
+        fields = [field.name for field in dataclasses.fields(self)]
+        made = dataclasses.replace(self, **{name: part for name, part in parts.items() if name in fields})
+        rest = {name: value for name, value in parts.items() if name not in fields}
+        names = [name for name, _, _ in parameters_in(made)]
+        refuse_unknown(rest, [*fields, *names], f"{type(self).__name__} has no field")
+        return with_parameters(made, rest)
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str]) -> Self:
@@ -114,7 +119,6 @@ class Bicycle(WhippleBicycle):
         kind, values = read_yaml(path)
         try:
             found, rider = as_meijaard(kind, values)
-            refuse_other_units(found)
             return cls.from_parameters(found | ({} if rider is None else {"rider": rider_of(rider)}))
         except ValueError as error:
             raise ValueError(f"{os.fspath(path)}: {error}") from None
@@ -232,6 +236,9 @@ class Bicycle(WhippleBicycle):
         found += loads_of_tyres(self, motion, values)
         found += [part.loads(self, t, q, u, motion, values) for part in self.parts]
         return found
+
+    def why_not_finite(self, motion, inputs):
+        return overloaded(self, motion, inputs)
 
     def state_rates(self, t, q, u, x, motion: Any, now):
         now = now.with_values(commanded(self, t, q, u, motion, now))

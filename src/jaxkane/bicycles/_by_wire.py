@@ -8,6 +8,7 @@ from .._description.bodies import Body
 from .._description.loads import Torque
 from .._description.parameters import parameter
 from .._scalars.types import Scalar
+from ..catalog.bicycle import ABOVE_GROUND, FAR
 from ._part import Part
 
 
@@ -33,8 +34,8 @@ class SteerByWire(Part):
     """
 
     mass: Scalar = parameter(positive=True, unit="kg")
-    x: Scalar = parameter(unit="m")
-    z: Scalar = parameter(unit="m")
+    x: Scalar = parameter(within=(-FAR, FAR), unit="m")
+    z: Scalar = parameter(within=ABOVE_GROUND, unit="m")
     Ixx: Scalar = parameter(positive=True, unit="kg m^2")
     Iyy: Scalar = parameter(positive=True, unit="kg m^2")
     Izz: Scalar = parameter(positive=True, unit="kg m^2")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from .._description.loads import Force
 from .._description.parameters import parameter
 from .._scalars.types import Scalar
+from ..catalog.bicycle import FAR
 from ..loads import smooth_abs
 from ._part import Part
 
@@ -17,8 +18,8 @@ class Drag(Part):
     """
 
     area: Scalar = parameter(0.5, positive=True, unit="m^2")
-    height: Scalar = parameter(1.1, unit="m")
-    ahead: Scalar = parameter(0.4, unit="m")
+    height: Scalar = parameter(1.1, within=(0.0, FAR), unit="m")
+    ahead: Scalar = parameter(0.4, within=(-FAR, FAR), unit="m")
     density: Scalar = parameter(1.2, positive=True, unit="kg/m^3")
 
     resists = True
@@ -47,7 +48,7 @@ class ConstantSpeed(Part):
     **Arguments:** `speed` [m/s].
     """
 
-    speed: Scalar = parameter(unit="m/s")
+    speed: Scalar = parameter(within=(-100.0, 100.0), unit="m/s")
 
     dependent_speeds = ("rear_wheel_rate",)
     units = {"holding_torque": "N m"}

@@ -6,6 +6,7 @@ that gravity is tilted; on a road of given height N.z is vertical.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
@@ -20,12 +21,14 @@ from .._description.points import Point
 from .._description.vectors import Vector
 from .._scalars.components import add, dot, mul, sub
 from .._scalars.types import Component, Scalar
+from ..catalog.bicycle import TILT
 from ._part import check_parameters
 
 if TYPE_CHECKING:
     from ._tyre import Contact
 
 Pair = tuple[Component, Component]
+TURN = 2.0 * math.pi
 _LOOK = np.outer([-1.0, 1.0], np.linspace(0.05, 1.5, 30)).ravel()  # [rad] from the contact
 
 
@@ -88,12 +91,12 @@ class Ground(eqx.Module):
 class Slope(Ground):
     """A plane that rises.
 
-    **Arguments:** `angle` [rad] by which it rises, `towards` the direction in it [rad] in which it does, as a yaw: 0
-    along x, pi/2 along y.
+    **Arguments:** `angle` [rad] by which it rises, less than a right angle; `towards` the direction in it [rad] in
+    which it does, as a yaw: 0 along x, pi/2 along y.
     """
 
-    angle: Scalar = parameter(unit="rad")
-    towards: Scalar = parameter(0.0, unit="rad")
+    angle: Scalar = parameter(within=TILT, unit="rad")
+    towards: Scalar = parameter(0.0, within=(-TURN, TURN), unit="rad")
 
     def gravity(self, g, N):
         uphill = N.vector(jnp.cos(self.towards), jnp.sin(self.towards), 0.0)

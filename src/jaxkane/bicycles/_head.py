@@ -9,6 +9,7 @@ from .._description.loads import Torque
 from .._description.parameters import parameter
 from .._description.points import Point
 from .._scalars.types import Scalar
+from ..catalog.bicycle import FAR
 from ._part import Part
 
 
@@ -25,7 +26,7 @@ class HeadTwist(Part):
 
     stiffness: Scalar = parameter(positive=True, unit="N m/rad")
     damping: Scalar = parameter(0.0, unit="N m s/rad")
-    height: Scalar = parameter(0.0, unit="m")
+    height: Scalar = parameter(0.0, within=(-FAR, FAR), unit="m")
 
     coordinates = ("head_twist",)
     speeds = ("head_twist_rate",)

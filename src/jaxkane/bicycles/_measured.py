@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from .._description.parameters import parameter
 from .._scalars.types import Component, Scalar
+from ..catalog.bicycle import FAR, TILT
 from ._slip import Slip
 
 _DEGREE = math.pi / 180.0
@@ -45,7 +46,7 @@ class MagicFormula89(Slip):
 
     force_coefficients: Float[Array, 14] = parameter(shape=(14,))
     moment_coefficients: Float[Array, 18] | None = parameter(None, shape=(18,))
-    relaxation_length: Scalar | None = parameter(None, positive=True, unit="m")
+    relaxation_length: Scalar | None = parameter(None, positive=True, within=(0.0, FAR), unit="m")
     largest_slip: float = eqx.field(default=10.0 * _DEGREE, static=True, converter=float)
     largest_load: float = eqx.field(default=1000.0, static=True, converter=float)
 
@@ -53,6 +54,8 @@ class MagicFormula89(Slip):
         for name in ("largest_slip", "largest_load"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"MagicFormula89.{name} = {getattr(self, name)} must be positive.")
+        if self.largest_slip > TILT[1]:
+            raise ValueError(f"MagicFormula89.largest_slip = {self.largest_slip} rad is a right angle. In degrees?")
 
     def force(self, slip, load, camber):
         a, alpha, Fz, gamma = self.force_coefficients, *self._in_degrees(slip, load, camber)

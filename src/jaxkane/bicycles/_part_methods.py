@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from .._common.lookup import not_there, refuse_unknown
+from .._description.motion import NameTaken
 from .._method.checks import is_concrete
 from .._scalars.components import add, component
 from .._scalars.types import Component
 from ._ground import Ground
 from ._head import HeadTwist
-from ._part import Part, called
+from ._part import NAMES, Part, called
 from ._tyre import Tyre
 
 if TYPE_CHECKING:
@@ -39,6 +41,7 @@ def refuse_misfits(bicycle: Bicycle) -> None:
         for part in as_tuple(getattr(bicycle, field)):
             if not isinstance(part, Part):
                 raise TypeError(f"{name}: `{field}` holds a Part of jaxkane.bicycles, got {called(part)}.")
+    _refuse_names_twice(bicycle)
     known = (*bicycle.coordinates, *bicycle.speeds, *bicycle.dependent_speeds, *bicycle.states)
     for part in bicycle.parts:
         part.check(bicycle)
@@ -52,6 +55,33 @@ def refuse_misfits(bicycle: Bicycle) -> None:
                 f"{name}: {end}_tyre.crown = {crown} m is the radius of the tyre's cross section, and must be less "
                 f"than that of its wheel, {radius} m."
             )
+
+
+def _refuse_names_twice(bicycle: Bicycle) -> None:
+    """Parts of one kind have the same names: values could not be told apart."""
+    owners: dict[str, int] = {}
+    for i, part in enumerate(bicycle.parts):
+        for kind in NAMES:
+            for name in getattr(part, kind):
+                if owners.setdefault(name, i) != i:
+                    raise ValueError(
+                        f"{type(bicycle).__name__}: the name {name!r} stands twice in `{kind}`: of "
+                        f"{place_of(bicycle, bicycle.parts[owners[name]])} and of {place_of(bicycle, part)}. {_APART}"
+                    )
+
+
+_APART = "Values are read by name: a second part of a kind is a class of your own, with names of its own."
+
+
+def place_of(bicycle: Bicycle, part: Part) -> str:
+    """Where a part stands, and what it is: "extra[0], a Trailer"."""
+    for field in dataclasses.fields(bicycle):
+        held = getattr(bicycle, field.name)
+        for i, each in enumerate(as_tuple(held)):
+            if each is part:
+                place = f"{field.name}[{i}]" if isinstance(held, (tuple, list)) else field.name
+                return f"{place}, {called(part)}"
+    return called(part)
 
 
 def label_of(part: Part, method: str) -> str:
@@ -68,7 +98,10 @@ def by_name(given: Any, label: str) -> Mapping[str, Any]:
 
 def moved(part: Part, bicycle: Bicycle, motion: BicycleMotion, t: Component, q: Any, u: Any) -> BicycleMotion:
     """The motion with what a part adds."""
-    found = part.motion(bicycle, motion, t, q, u)
+    try:
+        found = part.motion(bicycle, motion, t, q, u)
+    except NameTaken as error:
+        raise ValueError(f"{type(bicycle).__name__}: {place_of(bicycle, part)}: {error} {_APART}") from None
     if not isinstance(found, type(motion)):
         hint = " Does it end without a `return`?" if found is None else ""
         raise TypeError(f"{label_of(part, 'motion')} returns `motion.extended(...)`, got {found!r}.{hint}")

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from .._description.parameters import learned, parameter
 from .._scalars.types import Component, Scalar
+from ..catalog.bicycle import TILT
 from ._part import Part, check_parameters
 
 
@@ -61,9 +62,9 @@ class PathFollower(Part):
     """
 
     path: Any = learned()
-    preview: Scalar = parameter(2.0, positive=True, unit="s")
+    preview: Scalar = parameter(2.0, positive=True, within=(0.0, 100.0), unit="s")
     gain: Scalar = parameter(1.0)
-    limit: Scalar = parameter(0.3, positive=True, unit="rad")
+    limit: Scalar = parameter(0.3, positive=True, within=TILT, unit="rad")
 
     def commands(self, bicycle, t, q, u, motion, values):
         cos, sin = jnp.cos(q["yaw"]), jnp.sin(q["yaw"])

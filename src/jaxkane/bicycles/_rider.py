@@ -16,9 +16,10 @@ from .._description.frames import Frame
 from .._description.loads import Torque
 from .._description.parameters import in_batches, parameter
 from .._description.points import Point
-from .._method.checks import is_concrete
+from .._method.checks import is_concrete, why_no_body
 from .._scalars.types import Scalar
 from ..catalog import read_bicycle_file
+from ..catalog.bicycle import ABOVE_GROUND, FAR, TILT
 from ._part import Part
 
 if TYPE_CHECKING:
@@ -36,9 +37,9 @@ class Rider(Part):
     "right_shoulder". A rider of your own gives `carried`.
     """
 
-    mass: Scalar = parameter(positive=True, unit="kg")
-    x: Scalar = parameter(unit="m")
-    z: Scalar = parameter(unit="m")
+    mass: Scalar = parameter(positive=True, within=(0.0, 300.0), unit="kg")
+    x: Scalar = parameter(within=(-FAR, FAR), unit="m")
+    z: Scalar = parameter(within=ABOVE_GROUND, unit="m")
     Ixx: Scalar = parameter(positive=True, unit="kg m^2")
     Iyy: Scalar = parameter(positive=True, unit="kg m^2")
     Izz: Scalar = parameter(positive=True, unit="kg m^2")
@@ -89,7 +90,7 @@ class RigidRider(Rider):
     [m]: x, y and z of the right shoulder, for `Arms`; the left one is its mirror image.
     """
 
-    shoulder: Float[Array, 3] | None = parameter(None, shape=(3,), unit="m")
+    shoulder: Float[Array, 3] | None = parameter(None, within=(-FAR, FAR), shape=(3,), unit="m")
 
     def carried(self, bicycle, motion, q, u):
         B = motion["B"]
@@ -116,12 +117,12 @@ class LeaningRider(Rider):
     x, y and z of the right shoulder, for `Arms`; the left one is its mirror image.
     """
 
-    hinge_x: Scalar = parameter(unit="m")
-    hinge_z: Scalar = parameter(unit="m")
-    hinge_tilt: Scalar | None = parameter(None, unit="rad")
+    hinge_x: Scalar = parameter(within=(-FAR, FAR), unit="m")
+    hinge_z: Scalar = parameter(within=ABOVE_GROUND, unit="m")
+    hinge_tilt: Scalar | None = parameter(None, within=TILT, unit="rad")
     stiffness: Scalar = parameter(0.0, unit="N m/rad")
     damping: Scalar = parameter(0.0, unit="N m s/rad")
-    shoulder: Float[Array, 3] | None = parameter(None, shape=(3,), unit="m")
+    shoulder: Float[Array, 3] | None = parameter(None, within=(-FAR, FAR), shape=(3,), unit="m")
 
     coordinates = ("rider_lean",)
     speeds = ("rider_lean_rate",)
@@ -157,8 +158,8 @@ def separate_rider(bicycle: Bicycle, rider: Rider) -> Bicycle:
 
     With a rider who does not lean its motion is that of the bicycle before.
 
-    **Raises:** `ValueError` where B has not the mass or the inertia that the rider's body takes, and for a bicycle that
-    has a rider already, who is none of B.
+    **Raises:** `ValueError` where what is left of B is no body: without mass, or with moments of inertia that no body
+    has; and for a bicycle that has a rider already, who is none of B.
     """
     if bicycle.rider is not None:
         raise ValueError("separate_rider: the bicycle has a rider already, whom its frame B does not count.")
@@ -170,7 +171,17 @@ def separate_rider(bicycle: Bicycle, rider: Rider) -> Bicycle:
     rest = [a - b for a, b in zip(left, taken, strict=True)]  # about the rear contact
     Ixx, Iyy, Izz, Ixz = (a - b for a, b in zip(rest, _about(m, x, z, 0.0, 0.0, 0.0, 0.0), strict=True))
     if is_concrete(bicycle, rider) and not (in_batches(bicycle) or in_batches(rider)):
-        _refuse_impossible(np.array([m, Ixx, Iyy, Izz, Ixz]))
+        if not m > 0:
+            raise ValueError(
+                f"separate_rider: the rider is as heavy as the frame B that should count it; {m:.4g} kg left."
+            )
+        inertia = np.array([(Ixx, 0.0, Ixz), (0.0, Iyy, 0.0), (Ixz, 0.0, Izz)], dtype=float)
+        fault = why_no_body(float(m), inertia, bicycle.check_inertia)
+        if fault:
+            raise ValueError(
+                f"separate_rider: the frame B does not hold the rider's body. Without it: {fault} Is the rider's mass "
+                "counted in B at all? If not: bicycle.with_parts(rider=...)."
+            )
     B = {"mB": m, "xB": x, "zB": z, "IBxx": Ixx, "IByy": Iyy, "IBzz": Izz, "IBxz": Ixz}
     return bicycle.with_parts(**B, rider=rider)
 
@@ -178,15 +189,3 @@ def separate_rider(bicycle: Bicycle, rider: Rider) -> Bicycle:
 def _about(m: Scalar, x: Scalar, z: Scalar, Ixx: Any, Iyy: Any, Izz: Any, Ixz: Any) -> tuple[Any, Any, Any, Any]:
     """Central moments and the product of a body, about the point from which x and z are measured."""
     return Ixx + m * z * z, Iyy + m * (x * x + z * z), Izz + m * x * x, Ixz - m * x * z
-
-
-def _refuse_impossible(values: np.ndarray) -> None:
-    m, Ixx, Iyy, Izz, Ixz = values
-    if not m > 0:
-        raise ValueError(f"separate_rider: the rider is as heavy as the frame B that should count it; {m:.4g} kg left.")
-    if not (Iyy > 0 and Ixx + Izz > 0 and Ixx * Izz > Ixz * Ixz):
-        raise ValueError(
-            "separate_rider: the frame B does not hold the rider's body: what is left of its inertia is no body's "
-            f"(Ixx = {Ixx:.4g}, Iyy = {Iyy:.4g}, Izz = {Izz:.4g}, Ixz = {Ixz:.4g} kg m^2). Is the rider's mass counted "
-            "in B at all? If not: bicycle.with_parts(rider=...)."
-        )

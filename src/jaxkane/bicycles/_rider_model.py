@@ -54,7 +54,7 @@ class SequentialLoopRider(Part):
     heading: Scalar = parameter(0.0)
     deviation: Scalar = parameter(0.0, unit="rad/m")
     path: Any = eqx.field(default=None, converter=lambda path: None if path is None else Learned(path))
-    preview: Scalar = parameter(0.0, unit="s")
+    preview: Scalar = parameter(0.0, within=(0.0, 100.0), unit="s")
     frequency: Scalar = parameter(30.0, positive=True, unit="rad/s")
     damping: Scalar = parameter(0.707, positive=True)
     command: str = eqx.field(static=True, default=STEER)

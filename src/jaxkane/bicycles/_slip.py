@@ -10,6 +10,7 @@ and Vehicle Dynamics*, section 7.2.1), which is finite and right at rest, where 
 from __future__ import annotations
 
 import abc
+import math
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -17,6 +18,7 @@ import jax.numpy as jnp
 
 from .._description.parameters import parameter
 from .._scalars.types import Component, Scalar
+from ..catalog.bicycle import FAR
 from ._part import check_parameters
 
 CREEPING = 0.01
@@ -28,6 +30,9 @@ class Slip(eqx.Module):
 
     if TYPE_CHECKING:
         relaxation_length: Scalar | None
+        largest_load: float
+    else:
+        largest_load = math.inf  # [N], beyond which `force` is NaN
 
     def __check_init__(self) -> None:
         check_parameters(self)
@@ -86,8 +91,8 @@ class LateralSlip(_Aligning):
 
     cornering_stiffness: Scalar = parameter(positive=True, unit="N/rad")
     camber_stiffness: Scalar | None = parameter(None, unit="N/rad")
-    relaxation_length: Scalar | None = parameter(None, positive=True, unit="m")
-    pneumatic_trail: Scalar | None = parameter(None, unit="m")
+    relaxation_length: Scalar | None = parameter(None, positive=True, within=(0.0, FAR), unit="m")
+    pneumatic_trail: Scalar | None = parameter(None, within=(-FAR, FAR), unit="m")
     twisting_stiffness: Scalar | None = parameter(None, unit="N m/rad")
 
     def force(self, slip, load, camber):
@@ -111,12 +116,12 @@ class MagicFormula(_Aligning):
     """
 
     stiffness: Scalar = parameter(positive=True, unit="1/rad")
-    friction: Scalar = parameter(1.0, positive=True)
-    shape: Scalar = parameter(1.3, positive=True)
+    friction: Scalar = parameter(1.0, positive=True, within=(0.0, 10.0))
+    shape: Scalar = parameter(1.3, positive=True, within=(0.0, 3.0))
     curvature: Scalar = parameter(0.0)
     camber_ratio: Scalar | None = parameter(None)
-    relaxation_length: Scalar | None = parameter(None, positive=True, unit="m")
-    pneumatic_trail: Scalar | None = parameter(None, unit="m")
+    relaxation_length: Scalar | None = parameter(None, positive=True, within=(0.0, FAR), unit="m")
+    pneumatic_trail: Scalar | None = parameter(None, within=(-FAR, FAR), unit="m")
     twisting_stiffness: Scalar | None = parameter(None, unit="N m/rad")
 
     def force(self, slip, load, camber):
@@ -136,7 +141,7 @@ class LongitudinalSlip(Slip):
     """
 
     stiffness: Scalar = parameter(positive=True, unit="N")
-    relaxation_length: Scalar | None = parameter(None, positive=True, unit="m")
+    relaxation_length: Scalar | None = parameter(None, positive=True, within=(0.0, FAR), unit="m")
 
     def force(self, slip, load, camber):
         return self.stiffness * slip

@@ -46,8 +46,8 @@ class SteeringMotor(Part):
         steer feels ratio^2 * rotor_inertia, and the frame the gyroscopic moment.
     """
 
-    lag: Scalar | None = parameter(None, positive=True, unit="s")
-    delay: Scalar | None = parameter(None, positive=True, unit="s")
+    lag: Scalar | None = parameter(None, positive=True, within=(0.0, 5.0), unit="s")
+    delay: Scalar | None = parameter(None, positive=True, within=(0.0, 5.0), unit="s")
     limit: Scalar | None = parameter(None, positive=True, unit="N m")
     rotor_inertia: Scalar | None = parameter(None, positive=True, unit="kg m^2")
     ratio: Scalar = parameter(1.0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from .._description.bodies import Body
 from .._description.parameters import parameter
 from .._scalars.types import Scalar
+from ..catalog.bicycle import ABOVE_GROUND, FAR
 from ._part import Part
 
 
@@ -20,17 +21,17 @@ class Trailer(Part):
     [m]: of the mass centre, before the axle and above it; `Ixx`, `Iyy`, `Izz` [kg m^2] about it.
     """
 
-    hitch_x: Scalar = parameter(unit="m")
-    hitch_z: Scalar = parameter(unit="m")
-    length: Scalar = parameter(positive=True, unit="m")
-    wheel_radius: Scalar = parameter(positive=True, unit="m")
+    hitch_x: Scalar = parameter(within=(-FAR, FAR), unit="m")
+    hitch_z: Scalar = parameter(within=ABOVE_GROUND, unit="m")
+    length: Scalar = parameter(positive=True, within=(0.0, FAR), unit="m")
+    wheel_radius: Scalar = parameter(positive=True, within=(0.0, FAR), unit="m")
     mass: Scalar = parameter(positive=True, unit="kg")
-    center: Scalar = parameter(unit="m")
-    height: Scalar = parameter(unit="m")
+    center: Scalar = parameter(within=(-FAR, FAR), unit="m")
+    height: Scalar = parameter(within=(0.0, FAR), unit="m")
     Ixx: Scalar = parameter(positive=True, unit="kg m^2")
     Iyy: Scalar = parameter(positive=True, unit="kg m^2")
     Izz: Scalar = parameter(positive=True, unit="kg m^2")
-    track: Scalar = parameter(0.6, unit="m")
+    track: Scalar = parameter(0.6, within=(0.0, FAR), unit="m")
 
     coordinates = ("trailer_angle", "trailer_pitch")
     dependent_coordinates = ("trailer_pitch",)

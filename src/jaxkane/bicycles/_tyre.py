@@ -59,8 +59,8 @@ class Tyre(eqx.Module):
     crown: Scalar | None = parameter(None, positive=True, unit="m")
     lateral: Slip | None = None
     longitudinal: LongitudinalSlip | None = None
-    rolling_resistance: Scalar | None = parameter(None)
-    load_lag: Scalar | None = parameter(None, positive=True, unit="s")
+    rolling_resistance: Scalar | None = parameter(None, within=(0.0, 1.0))
+    load_lag: Scalar | None = parameter(None, positive=True, within=(0.0, 5.0), unit="s")
 
     def __check_init__(self) -> None:
         check_parameters(self)

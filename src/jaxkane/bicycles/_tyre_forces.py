@@ -44,6 +44,18 @@ def carried_loads(bicycle: Bicycle, motion: Any, values: Mapping[str, Component]
     return found
 
 
+def overloaded(bicycle: Bicycle, motion: Any, values: Mapping[str, Component]) -> str:
+    """Which tyre carries more than its law holds for, in words."""
+    carried = carried_loads(bicycle, motion, values)
+    return " and ".join(
+        f"the {end} tyre carries {float(carried[end]):.4g} N, more than the largest_load of its {type(law).__name__}, "
+        f"{law.largest_load:g} N,"
+        for end, tyre in tyres_of(bicycle)
+        for _, law in tyre.laws
+        if float(carried[end]) > law.largest_load
+    )
+
+
 def transfer_rates(bicycle: Bicycle, motion: Any, now: Any) -> Iterator[Component]:
     """Of the loads that follow what the ground carries, over the weight [1/s]."""
     felt = carried_loads(bicycle, motion, now) if load_transfers(bicycle) else {}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 
@@ -54,15 +54,3 @@ def read_bicycle_file(
     if faults:
         raise ValueError(f"{os.fspath(path)}: " + "; ".join(faults) + ".")
     return values, deviations
-
-
-def refuse_other_units(values: Mapping[str, float]) -> None:
-    """Refuse a tilt of the steer axis that must be in degrees, and lengths that must be in millimetres.
-
-    **Raises:** `ValueError`.
-    """
-    if abs(values.get("lam", 0.0)) >= 0.5 * math.pi:
-        raise ValueError(f"lam = {values['lam']:g} rad tilts the steer axis by more than a right angle. In degrees?")
-    for name in ("w", "rR", "rF"):
-        if values.get(name, 0.0) > 20.0:
-            raise ValueError(f"{name} = {values[name]:g} m is longer than any bicycle. In millimetres?")

@@ -18,7 +18,7 @@ from .._description.points import Point, inertial
 from .._description.system import System
 from .._description.vectors import Vector
 from .._scalars.types import Scalar
-from ._bicycle_file import read_bicycle_file, refuse_other_units
+from ._bicycle_file import read_bicycle_file
 from ._entry import entry
 
 # Meijaard et al. (2007), Table 1: the benchmark bicycle.
@@ -29,6 +29,13 @@ _BENCHMARK = {
     "xH": 0.9, "zH": -0.7, "mH": 4.0, "IHxx": 0.05892, "IHyy": 0.06, "IHzz": 0.00708, "IHxz": -0.00756,
     "rF": 0.35, "mF": 3.0, "IFxx": 0.1405, "IFyy": 0.28,
 }  # fmt: skip
+
+FAR = 20.0
+"""[m]: no length or place of a bicycle is larger."""
+ABOVE_GROUND = (-FAR, 0.0)
+"""[m]: z of what is above the ground, since z points down."""
+TILT = (-1.57, 1.57)
+"""[rad]: less than a right angle."""
 
 # What other sources write out although the model implies it: the name, and what it must be equal to.
 _IMPLIED = {"IRzz": "IRxx", "IFzz": "IFxx", "yB": None, "yH": None}
@@ -75,32 +82,32 @@ class WhippleBicycle(System):
     `super().motion(t, q, u).extended([...])`.
     """
 
-    w: Scalar = parameter(positive=True, unit="m")
-    c: Scalar = parameter(unit="m")
-    lam: Scalar = parameter(unit="rad")
-    rR: Scalar = parameter(positive=True, unit="m")
+    w: Scalar = parameter(positive=True, within=(0.0, FAR), unit="m")
+    c: Scalar = parameter(within=(-FAR, FAR), unit="m")
+    lam: Scalar = parameter(within=TILT, unit="rad")
+    rR: Scalar = parameter(positive=True, within=(0.0, FAR), unit="m")
     mR: Scalar = parameter(positive=True, unit="kg")
     IRxx: Scalar = parameter(positive=True, unit="kg m^2")
     IRyy: Scalar = parameter(positive=True, unit="kg m^2")
-    xB: Scalar = parameter(unit="m")
-    zB: Scalar = parameter(unit="m")
+    xB: Scalar = parameter(within=(-FAR, FAR), unit="m")
+    zB: Scalar = parameter(within=ABOVE_GROUND, unit="m")
     mB: Scalar = parameter(positive=True, unit="kg")
     IBxx: Scalar = parameter(positive=True, unit="kg m^2")
     IByy: Scalar = parameter(positive=True, unit="kg m^2")
     IBzz: Scalar = parameter(positive=True, unit="kg m^2")
     IBxz: Scalar = parameter(unit="kg m^2")
-    xH: Scalar = parameter(unit="m")
-    zH: Scalar = parameter(unit="m")
+    xH: Scalar = parameter(within=(-FAR, FAR), unit="m")
+    zH: Scalar = parameter(within=ABOVE_GROUND, unit="m")
     mH: Scalar = parameter(positive=True, unit="kg")
     IHxx: Scalar = parameter(positive=True, unit="kg m^2")
     IHyy: Scalar = parameter(positive=True, unit="kg m^2")
     IHzz: Scalar = parameter(positive=True, unit="kg m^2")
     IHxz: Scalar = parameter(unit="kg m^2")
-    rF: Scalar = parameter(positive=True, unit="m")
+    rF: Scalar = parameter(positive=True, within=(0.0, FAR), unit="m")
     mF: Scalar = parameter(positive=True, unit="kg")
     IFxx: Scalar = parameter(positive=True, unit="kg m^2")
     IFyy: Scalar = parameter(positive=True, unit="kg m^2")
-    g: Scalar = parameter(9.81, unit="m/s^2")
+    g: Scalar = parameter(9.81, within=(0.0, 1000.0), unit="m/s^2")
     steer_damping: Scalar = parameter(0.0, unit="N m s/rad")
 
     coordinates = ("roll", "rear_wheel_angle", "steer", "yaw", "pitch", "front_wheel_angle", "x", "y")
@@ -158,7 +165,6 @@ class WhippleBicycle(System):
         """
         values, _ = read_bicycle_file(path, known=(*parameter_info(cls), *_IMPLIED, *_PARTS_OF_H, "v"))
         try:
-            refuse_other_units(values)
             return cls.from_parameters({name: x for name, x in values.items() if name not in (*_PARTS_OF_H, "v")})
         except ValueError as error:
             raise ValueError(f"{os.fspath(path)}: {error}") from None

@@ -11,6 +11,7 @@ import numpy as np
 
 from .._description.system import System
 from .._method.description_facts import configuration_residual
+from .._method.diagnose import diagnosis
 from .._method.right_hand_side import rates, values_of
 from .._scalars.versions import compiled
 from ._cyclic import cyclic_coordinates
@@ -73,6 +74,9 @@ def check_state(system: System, t, q, u, x, w, steady: bool) -> None:
         raise ValueError(f"{name}: {', '.join(bad)} is not finite: there is no linear model there.")
     if h.size and not np.abs(h).max() <= tol:
         raise ValueError(f"{name}: the coordinates violate the configuration constraints by {h}. Use assemble.")
+    if not np.all(np.isfinite(np.concatenate([q_dot, u_dot]))):
+        wrong = diagnosis(system, t, q, u, values_of(system, x, inputs_by_name(system, w)))
+        raise ValueError(wrong or f"{name}: rates are not finite there: there is no linear model.")
     if not steady:
         return
     found = {f"{k} is accelerated by": y for k, y in zip(system.speeds, u_dot, strict=True)}

@@ -1,8 +1,8 @@
-"""Parameters of a system by name, path or function: the places of its leaves."""
+"""Parameters of a system by name or function: the places of its leaves."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from ..._common.lookup import hint
-from ..._description.parameters import leaf_name
+from ..._description.parameters import leaf_name, names_of_leaf
 from ..._description.system import System
 
 
@@ -26,11 +26,14 @@ def find_leaves(system: System, where: str | Callable[[Any], Any]) -> tuple[list
     """Numbers of the leaves that are meant, and all (path, leaf)."""
     title = type(system).__name__
     leaves, structure = jax.tree_util.tree_flatten_with_path(system)
-    numbered = jax.tree.unflatten(structure, range(len(leaves)))  # where a leaf stands, its place in the list
-    try:
-        chosen = jax.tree.leaves(_follow(numbered, where) if isinstance(where, str) else where(numbered))
-    except (AttributeError, IndexError, KeyError, TypeError):
-        chosen = []
+    if isinstance(where, str):
+        chosen = [i for i, (path, _) in enumerate(leaves) if where in names_of_leaf(path)]
+    else:
+        numbered = jax.tree.unflatten(structure, range(len(leaves)))  # where a leaf stands, its place in the list
+        try:
+            chosen = jax.tree.leaves(where(numbered))
+        except (AttributeError, IndexError, KeyError, TypeError):
+            chosen = []
     if not chosen or not all(isinstance(i, int) and 0 <= i < len(leaves) for i in chosen):
         known = [leaf_name(path) for path, _ in leaves]
         raise ValueError(f"{title} has no parameter {where!r}; {hint(str(where), known, 'it has')}")
@@ -44,9 +47,3 @@ def find_leaves(system: System, where: str | Callable[[Any], Any]) -> tuple[list
 def leaf_names(system: System) -> tuple[str, ...]:
     """The names of all parameters of a system, by which they can be freed."""
     return tuple(leaf_name(path) for path, _ in jax.tree_util.tree_flatten_with_path(system)[0])
-
-
-def _follow(tree: Any, path: str) -> Any:
-    for part in path.split("."):
-        tree = tree[part] if isinstance(tree, Mapping) else tree[int(part)] if part.isdigit() else getattr(tree, part)
-    return tree
