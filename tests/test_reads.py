@@ -1,9 +1,11 @@
 """Programs follow what their code reads: a global, an attribute, a closure, a function that changed between calls."""
 
 import array
+import collections
 import dataclasses
 import functools
 import gc
+import importlib
 import re
 import sys
 import threading
@@ -180,6 +182,214 @@ def test_modules_that_are_imported_inside(where, monkeypatch):
     assert [accelerate(s) for s in systems] == pytest.approx([9.81] * len(systems), rel=RTOL)
     vars(moon)["gravity"] = 1.62
     assert [accelerate(s) for s in systems] == pytest.approx([1.62] * len(systems), rel=RTOL)
+
+
+@pytest.mark.parametrize(
+    "line", ["from .numbers_of_it import gravity", "from . import numbers_of_it as it", "from .. import moon as it"]
+)
+def test_relative_imports_inside_a_method(line, monkeypatch, tmp_path):
+    """The module is imported by the first call itself, when what the method reads has been looked at already."""
+    inner = tmp_path / "outer" / "inner"
+    inner.mkdir(parents=True)
+    for path in (tmp_path / "outer" / "__init__.py", inner / "__init__.py"):
+        path.touch()
+    for path in (tmp_path / "outer" / "moon.py", inner / "numbers_of_it.py"):
+        path.write_text("gravity = 9.81\n")
+    read = "gravity" if line.endswith("gravity") else "it.gravity"
+    (inner / "drop.py").write_text(f"def fall(self):\n    {line}\n    return {read}\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    fall = importlib.import_module("outer.inner.drop").fall
+    system = type("Drop", (Drop,), {"gravity": fall, "__module__": "outer.inner.drop"})()
+    assert accelerate(system) == pytest.approx(9.81, rel=RTOL)
+    vars(sys.modules["outer.moon" if "moon" in line else "outer.inner.numbers_of_it"])["gravity"] = 1.62
+    assert accelerate(system) == pytest.approx(1.62, rel=RTOL)
+    for name in ("", ".moon", ".inner", ".inner.drop", ".inner.numbers_of_it"):
+        sys.modules.pop(f"outer{name}", None)
+
+
+class DictOfAUser(dict):
+    pass
+
+
+class ListOfAUser(list):
+    pass
+
+
+def places():
+    """By name: what reads a number, and what changes it."""
+    module, made, objects = types.ModuleType("moon"), DictOfAUser(), np.array([9.81], dtype=object)
+    listed, chain = ListOfAUser(), collections.ChainMap({}, {"gravity": 9.81})
+    module.gravity = made.gravity = listed.gravity = 9.81
+    user = collections.UserDict(gravity=9.81)
+    holder = type("Holder", (), {"module": module, "__module__": __name__})
+    by_attribute = lambda m: m.gravity  # noqa: E731
+    own = lambda: own.gravity  # noqa: E731
+    own.gravity = 9.81
+    yield "module given to a function", lambda: by_attribute(module), lambda: setattr(module, "gravity", 1.62)
+    yield "module of a class", lambda: by_attribute(holder.module), lambda: setattr(module, "gravity", 1.62)
+    yield "module in a list", lambda: [m.gravity for m in [module]], lambda: setattr(module, "gravity", 1.62)
+    yield "attribute of a function", own, lambda: setattr(own, "gravity", 1.62)
+    yield "attribute of a dict's class", lambda: made.gravity, lambda: setattr(made, "gravity", 1.62)
+    yield "attribute of a list's class", lambda: listed.gravity, lambda: setattr(listed, "gravity", 1.62)
+    yield "method of a dict's class", lambda: made, lambda: setattr(DictOfAUser, "__missing__", lambda d, k: 1.62)
+    yield "ChainMap", lambda: chain["gravity"], lambda: chain.maps[1].update(gravity=1.62)
+    yield "UserDict", lambda: user["gravity"], lambda: user.update(gravity=1.62)
+    yield "array of objects", lambda: objects[0], lambda: objects.__setitem__(0, 1.62)
+
+
+@pytest.mark.parametrize("name", [name for name, *_ in places()])
+def test_places_that_are_looked_into(name):
+    read, change = {name: both for name, *both in places()}[name]
+    before = version_of(read)
+    assert version_of(read) == before
+    change()
+    assert version_of(read) != before
+
+
+class Bead(jk.System):
+    """A particle on a line, whose place, mass, force, sensor and state follow GRAVITY."""
+
+    mass: jk.Scalar = jk.parameter(2.0)
+    coordinates, speeds, inputs, states = ("x",), ("v",), ("push",), ("lag",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        arm = N.rotate(1, GRAVITY * q[0], GRAVITY * u[0])
+        P = O.moving(GRAVITY * q[0] * N.x, GRAVITY * u[0] * N.x)
+        body = jk.Body(self.mass * GRAVITY, 0.0, P, name="bead")
+        return jk.Motion([body], points={"P": P, "O": O.fixed(0.0 * N.x)}, frames={"arm": arm})
+
+    def loads(self, t, q, u, motion, inputs):
+        return [jk.Force((inputs["push"] - q[0]) * motion.N.x, motion.bodies[0])]
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return [now["push"] - GRAVITY * x[0]]
+
+    def outputs(self, t, q, u, motion, now):
+        return {"reading": GRAVITY * q[0]}
+
+    def events(self, t, q, u):
+        return {"there": q[0] - 2.0 + 1e-3 * GRAVITY}
+
+
+class Ring(jk.System):
+    """A bead on a ring, the square of whose radius is GRAVITY."""
+
+    coordinates, speeds, dependent_coordinates = ("x", "y"), ("v",), ("y",)
+
+    def q_dot(self, t, q, u):
+        return -q[1] * u[0], q[0] * u[0]
+
+    def configuration_constraints(self, t, q):
+        return [q[0] ** 2 + q[1] ** 2 - GRAVITY]
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q[0] * N.x + q[1] * N.y, -q[1] * u[0] * N.x + q[0] * u[0] * N.y))])
+
+
+class Still(jk.System):
+    """A particle on a spring, which reads nothing."""
+
+    mass: jk.Scalar = jk.parameter(2.0)
+    coordinates, speeds, inputs = ("x",), ("v",), ("push",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(self.mass, 0.0, O.moving(q[0] * N.x, u[0] * N.x))])
+
+    def loads(self, t, q, u, motion, inputs):
+        return [jk.Force((inputs["push"] - q[0]) * motion.N.x, motion.bodies[0])]
+
+
+class Pressed(Still):
+    def loads(self, t, q, u, motion, inputs):
+        return [jk.Force((GRAVITY - q[0]) * motion.N.x, motion.bodies[0])]
+
+
+PLACE = jk.State(np.array([0.5]), np.array([0.3]), np.array([0.2]))
+CENTER = jk.State(np.zeros(1), np.zeros(1), np.zeros(1))
+HALF = jk.State(np.array([0.5]), np.zeros(1))
+TWO = {"mass": np.array([1.0, 2.0])}
+
+
+def at_an_instant(name):
+    more = {"speed_rates": ({"lag": 0.2},), "state_rates": ({"lag": 0.2},), "outputs": ({"lag": 0.2},)}
+    return lambda: getattr(jk, name)(Bead(), 0.0, [0.5], [0.3], *more.get(name, ()))
+
+
+def fixed_ride():
+    """A motion as it was found with the first number, to ask of it what depends on the second."""
+    if "ride" not in vars(fixed_ride):
+        fixed_ride.ride = jk.simulate(Bead(), PLACE, TS, **SHORT)
+    return fixed_ride.ride
+
+
+def cost_of_a_fit():
+    trial = jk.fit.Trial(TS, {"x": TS}, sigma=1.0)
+    problem = jk.fit.Problem.of(Pressed(), trial, ["mass"], simulation=jk.fit.Simulation(**SHORT))
+    return cost(problem, problem.start)
+
+
+QUESTIONS: dict[str, Callable[[], Any]] = {
+    "generalized_inertia_forces": lambda: jk.generalized_inertia_forces(Bead(), 0.0, [0.5], [0.3], u_dot=[1.0]),
+    **{
+        name: at_an_instant(name)
+        for name in "accelerations equations_of_motion mass_matrix forcing generalized_active_forces kinetic_energy "
+        "speed_rates state_rates positions velocities orientations partial_velocities "
+        "outputs".split()
+    },
+    "assemble": lambda: jk.assemble(Ring(), {"x": 1.0}, {}).q,
+    "constraint_forces": lambda: jk.constraint_forces(Hung(), 0.0, [0.0], [0.0])["P"],
+    "regressor": lambda: jk.fit.regressor(Hung(), 0.0, [0.5], [0.3], u_dot=[0.0]).matrix,
+    "numpy": lambda: jk.export.numpy(Bead()),
+    "symbolic.equations": lambda: repr(vars(jk.symbolic.equations(Bead()))),
+    "symbolic.linearize": lambda: repr(jk.symbolic.linearize(Hung()).A),
+}
+QUESTIONS_THAT_COMPILE: dict[str, Callable[[], Any]] = {
+    "simulate": lambda: jk.simulate(Bead(), PLACE, TS, **SHORT).q,
+    "simulate with inputs": lambda: jk.simulate(Still(), HALF, TS, {"push": lambda t, s: GRAVITY}, **SHORT).q,
+    "speed_rates of a ride": lambda: jk.speed_rates(Bead(), fixed_ride()),
+    "positions of a ride": lambda: jk.positions(Bead(), fixed_ride()),
+    "outputs of a ride": lambda: jk.outputs(Bead(), fixed_ride()),
+    "linearize": lambda: tuple(jk.stability.linearize(Bead(), CENTER, outputs=["reading"])),
+    "equilibrium": lambda: jk.stability.equilibrium(Pressed()).q,
+    "sweep": lambda: jk.sweep.sweep(Bead(), PLACE, TS, table=TWO, **SHORT).q,
+    "sweep(reduce)": lambda: jk.sweep.sweep(Still(), HALF, TS, table=TWO, reduce=REDUCE, **SHORT).values,
+    "sweep from functions": lambda: jk.sweep.sweep(Still(), START, TS, table=TWO, **SHORT).q,
+    "sweep of functions": lambda: jk.sweep.sweep(SYSTEM, HALF, TS, table={"m": TWO["mass"]}, **SHORT).q,
+    "audit": lambda: repr(jk.audit(Bead(), fixed_ride())),
+    "Problem": cost_of_a_fit,
+}
+CENTER_OF_STILL = jk.State(np.zeros(1), np.zeros(1))
+OUTPUTS = {"f": lambda t, q, u: GRAVITY * q["x"]}
+REDUCE = lambda ride: GRAVITY * ride["x"][-1]  # noqa: E731
+START = lambda system, row: jk.State(jnp.full(1, GRAVITY), jnp.zeros(1))  # noqa: E731
+SYSTEM = lambda row: Still(GRAVITY * row["m"])  # noqa: E731
+
+
+def bytes_of(answer):
+    return answer if isinstance(answer, str) else [np.asarray(x).tobytes() for x in jax.tree.leaves(answer)]
+
+
+@pytest.mark.parametrize(
+    "name", [*QUESTIONS, *(pytest.param(name, marks=pytest.mark.slow) for name in QUESTIONS_THAT_COMPILE)]
+)
+def test_every_public_function_sees_the_change(name, monkeypatch):
+    ask = (QUESTIONS | QUESTIONS_THAT_COMPILE)[name]
+    fixed_ride()
+    before = bytes_of(ask())
+    monkeypatch.setattr(sys.modules[__name__], "GRAVITY", 1.62)
+    after = bytes_of(ask())
+    jk.forget()
+    assert before != after == bytes_of(ask())
+
+
+def test_output_functions_of_a_linear_model_are_looked_into(monkeypatch):
+    model = lambda: jk.stability.linearize(Still(), CENTER_OF_STILL, outputs=OUTPUTS)  # noqa: E731
+    assert float(model().C[0, 0]) == pytest.approx(9.81, rel=RTOL)
+    monkeypatch.setattr(sys.modules[__name__], "GRAVITY", 1.62)
+    assert float(model().C[0, 0]) == pytest.approx(1.62, rel=RTOL)
 
 
 class Controller:

@@ -19,6 +19,7 @@ import jaxkane as jk
 from jaxkane._common.digest import digest
 from jaxkane._common.whole_file import write_whole
 from jaxkane.sweep._files import Folder
+from jaxkane.sweep._fingerprint import digest_of
 
 TS = np.linspace(0.0, 0.2, 3)
 REST = jk.State(np.zeros(1), np.zeros(1))
@@ -101,6 +102,21 @@ def test_numbers_that_inputs_and_reduce_read_belong_to_the_sweep(tmp_path):
     np.testing.assert_array_equal(run(tmp_path, inputs=inputs, reduce=reduce).values, first)
 
 
+def test_numbers_in_the_closure_of_a_callback_belong_to_the_sweep(tmp_path):
+    """A function that the program calls back is part of it, with all that it reads."""
+
+    def inputs(push):
+        called = lambda t: np.asarray(push + 0.0 * t)  # noqa: E731
+        like = jax.ShapeDtypeStruct((), float)
+        return {"push": lambda t, state: jax.pure_callback(called, like, t, vmap_method="expand_dims")}
+
+    few = {"table": {"mass": [1.0, 2.0]}}
+    first = run(tmp_path, inputs=inputs(1.0), **few)
+    np.testing.assert_array_equal(run(tmp_path, inputs=inputs(1.0), **few).q, first.q)
+    with pytest.raises(ValueError, match="It differs in program"):
+        run(tmp_path, inputs=inputs(2.0), **few)
+
+
 @pytest.mark.slow
 def test_a_digest_outlives_the_process_and_tells_programs_apart():
     code = """
@@ -145,6 +161,21 @@ first = found(1.0), digest({"a": np.ones(2), "b": {"c", "d", "e"}})
     script = [sys.executable, "-c", code + "print(first)"]
     run = subprocess.run(script, env=env, capture_output=True, text=True, timeout=300, check=True)
     assert run.stdout.strip() == str(here["first"])
+
+
+def callback_of(k):
+    called = lambda x: x * k if k in {"one", "two", 1.0, 2.0} else x  # noqa: E731
+    return lambda x: jax.pure_callback(called, jax.ShapeDtypeStruct((), float), x)
+
+
+def root_of(k):
+    return lambda x: jax.lax.custom_root(lambda y: y - k * x, x, lambda f, x: x * k, lambda f, y: y)
+
+
+@pytest.mark.parametrize("made", [callback_of, root_of])
+def test_digests_of_programs_that_stand_within_an_operation(made):
+    program = lambda k: digest_of(jax.make_jaxpr(made(k))(1.0))  # noqa: E731
+    assert program(1.0) == program(1.0) != program(2.0)
 
 
 def test_digests_of_programs():

@@ -12,7 +12,7 @@ import enum
 import hashlib
 import re
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -20,9 +20,12 @@ import numpy as np
 from jax.core import Tracer
 
 
-def digest(value: Any) -> str:
-    """Sixteen hexadecimal digits of data: numbers, arrays, and what holds them."""
-    return _Hash().of(value)
+def digest(value: Any, code: Callable[[Any], bytes] | None = None) -> str:
+    """Sixteen hexadecimal digits of data: numbers, arrays, and what holds them.
+
+    `code`: gives a digest of a function that a program calls back, with all that it reads; by default its name.
+    """
+    return _Hash(code).of(value)
 
 
 # Where and under which name a program runs is not what it computes.
@@ -34,8 +37,9 @@ _ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+|0x[0-9a-fA-F]{8,}")
 
 
 class _Hash:
-    def __init__(self, programs: dict[int, tuple[Any, str]] | None = None) -> None:
+    def __init__(self, code: Callable[[Any], bytes] | None, programs: dict[int, tuple[Any, str]] | None = None) -> None:
         self.sha = hashlib.sha256()
+        self.code = code
         self.programs = {} if programs is None else programs  # those that were read: one is often called many times
 
     def of(self, value: Any) -> str:
@@ -67,10 +71,10 @@ class _Hash:
             for item in value:
                 self.add(item)
         elif isinstance(value, (set, frozenset)):
-            self.say("set", *sorted(digest(item) for item in value))
+            self.say("set", *sorted(digest(item, self.code) for item in value))
         elif hasattr(value, "eqns") or (hasattr(value, "jaxpr") and hasattr(value, "consts")):
             if id(value) not in self.programs:
-                inner = _Hash(self.programs)
+                inner = _Hash(self.code, self.programs)
                 inner.program(value)
                 self.programs[id(value)] = value, inner.sha.hexdigest()
             self.say(self.programs[id(value)][1])
@@ -79,12 +83,14 @@ class _Hash:
 
     def thing(self, value: Any) -> None:
         """What is neither a number nor a program."""
-        inner = getattr(value, "program", None)
+        inner, params = getattr(value, "program", None), getattr(value, "params", None)
         if inner is not None:  # of scalars, see `_scalars.fuse`
             self.add(inner)
-        elif isinstance(value, types.FunctionType):  # that is called back
-            self.say("function", value.__qualname__, value.__code__.co_code, *value.__code__.co_names)
-            self.add([x for x in value.__code__.co_consts if not isinstance(x, types.CodeType)])
+        elif isinstance(params, Mapping):  # an operation that holds programs itself: `jax.lax.custom_root`
+            self.say("operation", type(value).__qualname__)
+            self.add(params)
+        elif self.code is not None and hasattr(value, "callback_func"):  # of `jax.pure_callback`, `io_callback`
+            self.say("called back", self.code(value.callback_func))
         elif isinstance(value, (type, types.BuiltinFunctionType, np.dtype)):
             self.say("named", getattr(value, "__qualname__", value))
         elif dataclasses.is_dataclass(value):

@@ -36,12 +36,11 @@ from .jax_internals import (
     jaxpr_as_fun,
     new_primitive,
     no_tangent,
-    settings,
 )
 from .native import Scalars
 from .pieces import in_pieces, replaced
 from .repetition import PROGRAM, foreign, is_plain, reads_of, without_repetition
-from .versions import naming_what_is_kept, on_forget, settling, version_of
+from .versions import key_of, naming_what_is_kept, on_forget, settling
 
 _MOST_LANES = 128  # in XLA's hands: with more, intermediates no longer stay in the cache
 
@@ -57,35 +56,32 @@ def fused(f: Callable[..., Any]) -> Callable[..., Any]:
     """
 
     @functools.lru_cache(maxsize=256)
-    def program_for(treedef, avals, version, label, _):
-        traced = settling(f)
-        program, out = jax.make_jaxpr(lambda *leaves: traced(*jax.tree.unflatten(treedef, leaves)), return_shape=True)(
-            *_specs(avals)
-        )
+    def program_for(key, label):
+        traced, unflatten = settling(f), functools.partial(jax.tree.unflatten, key.structure)
+        program, out = jax.make_jaxpr(lambda *leaves: traced(*unflatten(leaves)), return_shape=True)(*_specs(key.types))
         if any(isinstance(c, Tracer) for c in program.consts):
             raise _CapturedError
         inside = list(foreign(program.jaxpr))
         if any(where for _, where in inside):
             _tell_foreign(label, dict.fromkeys(name for name, where in inside if where))
-        steady = range(treedef.children()[0].num_leaves)
+        steady = range(key.structure.children()[0].num_leaves)
         return None if inside else (_Program(program, label, frozenset(steady)), jax.tree.structure(out))
 
     on_forget(program_for.cache_clear)
 
-    def find(leaves, treedef, args):
+    def find(*args):
         if FUSES is not None:
-            return None
-        label = _label(args[0])
+            return [], None
+        label, (leaves, key) = _label(args[0]), key_of(*args)
         try:
             with naming_what_is_kept(label):
-                return program_for(treedef, tuple(map(jax.typeof, leaves)), version_of(args), label, settings())
+                return leaves, program_for(key, label)
         except _CapturedError:
-            return None
+            return leaves, None
 
     @functools.wraps(f)
     def call(*args):
-        leaves, treedef = jax.tree.flatten(args)
-        found = find(leaves, treedef, args)
+        leaves, found = find(*args)
         if found is None:
             with naming_what_is_kept(_label(args[0])):
                 return f(*args)
@@ -100,8 +96,7 @@ def is_native(f: Callable[..., Any], *args: Any) -> bool:
     """Whether a fused function of these becomes a native kernel, a call of which costs nothing to compile."""
     if not native.is_on() or jax.default_backend() != "cpu":
         return False
-    leaves, treedef = jax.tree.flatten(args)
-    found = vars(f)["find"](leaves, treedef, args)
+    _, found = vars(f)["find"](*args)
     return bool(found and found[0].scalars())
 
 

@@ -41,8 +41,7 @@ def in_numbers(f: Callable[..., Any], *args: Any) -> Any:
 
     A function that is no program of scalars is evaluated by JAX.
     """
-    leaves, treedef = jax.tree.flatten(args)
-    found = vars(f)["find"](leaves, treedef, args)
+    leaves, found = vars(f)["find"](*args)
     numbers = found and _numbers_of(found[0])
     if not numbers:
         return jax.device_get(f(*jax.tree.map(jnp.asarray, args)))
@@ -54,30 +53,28 @@ def derivative_in_numbers(f: Callable[..., Any], args: Sequence[Any], directions
 
     **Arguments:** `directions`: for every argument None, or arrays (..., d).
     """
-    leaves, treedef = jax.tree.flatten(args)
     along = [
         dx
         for x, dx in zip(args, directions, strict=True)
         for dx in ([None] * len(jax.tree.leaves(x)) if dx is None else jax.tree.leaves(dx))
     ]
     moves = tuple(dx is not None for dx in along)
-    found = vars(f)["find"](leaves, treedef, args)
+    leaves, found = vars(f)["find"](*args)
     numbers = found and _numbers_of(found[0].tangent(moves))
     moving = [np.asarray(dx) for dx in along if dx is not None]
     if not numbers:
-        return jax.device_get(_by_jax(f, leaves, treedef, moves, moving))
+        return jax.device_get(_by_jax(f, args, moves, moving))
     return jax.tree.unflatten(found[1], numbers([*leaves, *moving], moving[0].shape[-1:]))
 
 
 def is_in_numbers(f: Callable[..., Any], *args: Any) -> bool:
     """Whether `in_numbers` evaluates a fused function itself."""
-    leaves, treedef = jax.tree.flatten(args)
-    found = vars(f)["find"](leaves, treedef, args)
+    _, found = vars(f)["find"](*args)
     return bool(found and _numbers_of(found[0]))
 
 
-def _by_jax(f: Any, leaves: Sequence[Any], treedef: Any, moves: Sequence[bool], moving: Sequence[np.ndarray]) -> Any:
-    leaves = [jnp.asarray(x) for x in leaves]
+def _by_jax(f: Any, args: Sequence[Any], moves: Sequence[bool], moving: Sequence[np.ndarray]) -> Any:
+    leaves, treedef = jax.tree.flatten(jax.tree.map(jnp.asarray, tuple(args)))
 
     def of_moving(*xs: Any) -> Any:
         new = iter(xs)

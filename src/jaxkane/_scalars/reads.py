@@ -5,28 +5,31 @@ closures, defaults, and the code of the functions that it calls. They are part o
 kept (`fuse.fused`, `versions.compiled`), by a digest that is formed once. After that, a look at every place where
 something was found costs some microseconds.
 
-It does not see what is read through objects of libraries, C extensions, `getattr` with a name that is put together, or
-arrays above a megabyte that are changed in place: for these there is `forget`.
+It does not see what is read from the environment or a file, through objects of libraries, C extensions, `getattr` with
+a name that is put together, or arrays above a megabyte that are changed in place: for these there is `forget`.
 """
 
 from __future__ import annotations
 
 import argparse
 import collections
+import contextlib
 import dataclasses
 import dis
 import enum
 import functools
 import hashlib
+import importlib.util
 import itertools
 import os
+import pickle
 import sys
 import sysconfig
 import types
 import weakref
 from collections.abc import Mapping
 from operator import is_
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jax.core import Tracer
@@ -39,7 +42,14 @@ _MISSING: Any = type("_Missing", (), {"__repr__": lambda self: "missing"})()
 # Libraries are taken to stay as they are. Catalogue files are descriptions like a user's.
 _LIBRARIES = frozenset("jax jaxlib numpy scipy equinox jaxtyping diffrax optimistix lineax optax".split())
 _INSTALLED = tuple({sysconfig.get_path(name) + os.sep for name in ("stdlib", "platstdlib", "purelib", "platlib")})
-_NAMESPACES = (types.SimpleNamespace, argparse.Namespace)
+# Objects of Python's library whose attributes are the user's own.
+_NAMESPACES = (
+    types.SimpleNamespace,
+    argparse.Namespace,
+    collections.ChainMap,
+    collections.UserDict,
+    collections.UserList,
+)
 NUMBERS = frozenset((type(None), bool, int, float, complex, str, bytes, type(...), type(NotImplemented)))
 
 
@@ -65,10 +75,13 @@ def is_of_library(kind: type) -> bool:
 
 
 class Reads:
-    """All places that the code of `root` reads, with what was found there; `version` is a digest of it."""
+    """All places that the code of `root` reads, with what was found there; `version` is a digest of it.
 
-    def __init__(self, root: Any):
-        self.root = root
+    `lasting`: the digest is the same in another process, where what cannot be looked into is told by its pickle.
+    """
+
+    def __init__(self, root: Any, lasting: bool = False):
+        self.root, self.lasting = root, lasting
         self.used = 0
         self.is_passing = False  # something in it is being traced, and must not be held on to
         self.named: list[tuple[Mapping[str, Any], str, Any]] = []
@@ -79,7 +92,8 @@ class Reads:
         self.mappings: list[tuple[Mapping[Any, Any], tuple[Any, ...], tuple[Any, ...]]] = []
         self.arrays: list[tuple[np.ndarray, np.ndarray]] = []
         walk = _Walk(self)
-        walk.value(root, frozenset())
+        walk.value(root)
+        walk.into_modules()
         self.version = walk.sha.digest()
         self.kept = walk.seen  # an identity means nothing once its object is gone
 
@@ -125,6 +139,8 @@ class _Walk:
         self.sha = hashlib.blake2b(digest_size=16)
         self.seen: dict[Any, tuple[int, Any]] = {}
         self.depth = 0
+        self.names: set[str] = set()  # in all the code: of a module, what these name is read
+        self.modules: list[types.ModuleType] = []
 
     def say(self, *words: Any) -> None:
         for word in words:
@@ -139,33 +155,34 @@ class _Walk:
         self.seen[key] = len(self.seen), keep
         return True
 
-    def value(self, value: Any, names: frozenset[str]) -> None:
-        """`names`: those that the code has in which the value was found, as `constants.gravity` has "gravity"."""
+    def value(self, value: Any) -> None:
         kind = type(value)
         if kind in NUMBERS:
             self.say(kind.__name__, value if kind is bytes else repr(value))
         elif isinstance(value, types.ModuleType):
-            self.module(value, names)
+            self.say("module", value.__name__)
+            if not _is_library(value.__name__) and self.is_new(id(value), value):
+                self.modules.append(value)
         elif self.is_new(id(value), value):
             if self.depth > 100 or len(self.seen) > _MOST_PLACES:
                 return self.opaque(value)
             self.depth += 1
-            self.composite(value, names)
+            self.composite(value)
             self.depth -= 1
 
-    def composite(self, value: Any, names: frozenset[str]) -> None:
+    def composite(self, value: Any) -> None:
         if isinstance(value, types.FunctionType):
             self.function(value)
         elif isinstance(value, type):
             self.a_class(value)
         elif isinstance(value, (types.MethodType, staticmethod, classmethod)):
-            self.parts("method", (value.__func__, getattr(value, "__self__", None)), names)
+            self.parts("method", (value.__func__, getattr(value, "__self__", None)))
         elif isinstance(value, property):
-            self.parts("property", (value.fget, value.fset), names)
+            self.parts("property", (value.fget, value.fset))
         elif isinstance(value, (functools.partial, functools.partialmethod)):
-            self.parts("partial", (value.func, value.args, value.keywords), names)
+            self.parts("partial", (value.func, value.args, value.keywords))
         elif isinstance(value, functools.cached_property):
-            self.parts("property", (value.func,), names)
+            self.parts("property", (value.func,))
         elif isinstance(value, Tracer):
             self.reads.is_passing = True
             self.opaque(value)
@@ -177,64 +194,72 @@ class _Walk:
             self.say(type(value).__qualname__)
             if not isinstance(value, (tuple, frozenset)):
                 self.reads.sequences.append((value, tuple(value)))
-            self.parts("items", tuple(value), names)
+            is_set = isinstance(value, (set, frozenset))  # whose order differs from process to process
+            self.parts("items", tuple(sorted(value, key=repr) if is_set else value))
+            self.own(value)
         elif isinstance(value, (dict, types.MappingProxyType)):
-            self.mapping(value, names)
+            self.mapping(value)
+            self.own(value)
         elif isinstance(value, enum.Enum):
-            self.parts("enum", (type(value).__qualname__, value.name, value.value), names)
+            self.parts("enum", (type(value).__qualname__, value.name, value.value))
         else:
-            self.an_object(value, names)
+            self.an_object(value)
 
-    def parts(self, kind: str, parts: tuple[Any, ...], names: frozenset[str]) -> None:
+    def parts(self, kind: str, parts: tuple[Any, ...]) -> None:
         self.say(kind, len(parts))
         for part in parts:
-            self.value(part, names)
+            self.value(part)
 
-    def mapping(self, mapping: Mapping[Any, Any], names: frozenset[str]) -> None:
+    def mapping(self, mapping: Mapping[Any, Any]) -> None:
         items = tuple(mapping.items())
         self.reads.mappings.append((mapping, tuple(k for k, _ in items), tuple(v for _, v in items)))
         for key, value in items:
-            self.parts("entry", (key, value), names)
+            self.parts("entry", (key, value))
 
-    def module(self, module: types.ModuleType, names: frozenset[str]) -> None:
-        """Of a module that is no library, what the code names there."""
-        self.say("module", module.__name__)
-        if _is_library(module.__name__):
-            return
-        for name in sorted(names & vars(module).keys()):
-            if self.is_new((id(module), name), module):
-                self.place(vars(module), name, names)
+    def into_modules(self) -> None:
+        """Of modules that are no libraries, what the code names, wherever in it: `constants.gravity` may be read by a
+        function that is given `constants`."""
+        self.depth = 0
+        read = -1
+        while read < len(self.seen):  # what stands there may be code with more names, and other modules
+            read = len(self.seen)
+            for module in tuple(self.modules):
+                for name in sorted(self.names & vars(module).keys()):
+                    self.place(vars(module), name)
 
-    def place(self, where: dict[str, Any], name: str, names: frozenset[str]) -> None:
-        value = where.get(name, _MISSING)
-        self.reads.named.append((where, name, value))
-        self.say(name)
-        self.value(value, names)
+    def place(self, where: dict[str, Any], name: str) -> None:
+        """What stands in a dict of globals, or of modules, by name."""
+        if self.is_new((id(where), name), None):
+            value = where.get(name, _MISSING)
+            self.reads.named.append((where, name, value))
+            self.say(name)
+            self.value(value)
 
     def function(self, f: types.FunctionType) -> None:
         self.say("function", f.__qualname__)
         self.reads.functions.append((f, f.__code__, f.__defaults__, f.__kwdefaults__))
-        if "__wrapped__" in vars(f):  # which IPython's autoreload changes, and not the closure
-            self.reads.named.append((vars(f), "__wrapped__", f.__wrapped__))
         cells = f.__closure__ or ()
         if _is_library(f.__globals__.get("__name__") or "__main__"):
-            # Of a library's decorator, what it decorates.
+            # Of a library's decorator, what it decorates; IPython's autoreload changes the attribute, not the closure.
+            self.reads.named.append((vars(f), "__wrapped__", vars(f).get("__wrapped__", _MISSING)))
             inside = [_inside(cell) for cell in cells] + [vars(f).get("__wrapped__")]
-            self.parts("decorates", tuple(x for x in inside if callable(x)), frozenset())
+            self.parts("decorates", tuple(x for x in inside if callable(x)))
             return
         self.code(f.__code__)
-        globals_, imported, names = _names_of(f.__code__)
-        for name in globals_:
-            if self.is_new((id(f.__globals__), name), None) or isinstance(f.__globals__.get(name), types.ModuleType):
-                self.place(f.__globals__, name, names)
-        for name in imported:
-            if name in sys.modules:
-                self.place(sys.modules, name, names)
+        read = _names_of(f.__code__)
+        self.names |= read.names
+        for name in read.globals:
+            self.place(f.__globals__, name)
+        for level, name in read.imported:
+            if module := _absolute(level, name, f.__globals__):
+                self.place(sys.modules, module)
         for cell in cells:
             value = _inside(cell)
             self.reads.cells.append((cell, value))
-            self.value(value, names)
-        self.parts("defaults", (f.__defaults__, f.__kwdefaults__, vars(f).get("__wrapped__")), names)
+            self.value(value)
+        self.parts("defaults", (f.__defaults__, f.__kwdefaults__))
+        if vars(f):
+            self.mapping(vars(f))
 
     def code(self, code: types.CodeType) -> None:
         self.say("code", code.co_code, *code.co_names, "|", *code.co_varnames, "|", *code.co_freevars)
@@ -242,7 +267,8 @@ class _Walk:
             if isinstance(constant, types.CodeType):
                 self.code(constant)
             else:
-                self.say(type(constant).__name__, repr(constant))
+                is_set = isinstance(constant, frozenset)
+                self.say(type(constant).__name__, sorted(map(repr, constant)) if is_set else repr(constant))
 
     def a_class(self, cls: type) -> None:
         self.say("class", cls.__module__, cls.__qualname__)
@@ -252,61 +278,102 @@ class _Walk:
                 continue
             self.reads.mappings.append((own, tuple(own), tuple(own.values())))
             for name, value in tuple(own.items()):
-                plain = not (name.startswith("__") and name.endswith("__"))
+                plain = not (name.startswith("__") and name.endswith("__")) and name != "_abc_impl"
                 if plain or (isinstance(value, types.FunctionType) and value.__code__.co_filename != "<string>"):
                     self.say(name)
-                    self.value(value, frozenset())
+                    self.value(value)
 
     def array(self, array: np.ndarray) -> None:
+        if array.dtype == object:
+            self.reads.sequences.append((array, tuple(array)))
+            return self.parts("objects", (array.shape, *array.flat))
         if array.nbytes > _LARGEST_ARRAY or array.dtype.hasobject:
             return self.opaque(array)
         self.reads.arrays.append((array, array.copy()))
         self.say("array", array.dtype.str, array.shape, array.tobytes())
 
-    def an_object(self, thing: Any, names: frozenset[str]) -> None:
+    def an_object(self, thing: Any) -> None:
         kind = type(thing)
-        own = getattr(thing, "__dict__", None)
+        if not is_of_library(kind) or kind in _NAMESPACES:
+            self.say("object")
+            return self.own(thing)
+        attributes = getattr(thing, "__dict__", None)
+        wrapped = attributes.get("__wrapped__") if isinstance(attributes, dict) else None
+        if isinstance(attributes, dict) and dataclasses.is_dataclass(thing):
+            self.say("object", kind.__qualname__)
+            self.mapping(attributes)
+        elif wrapped is not None:  # a function that is compiled, or remembers
+            self.parts("wrapper", (wrapped,))
+        else:
+            self.opaque(thing)
+
+    def own(self, thing: Any) -> None:
+        """The class and the attributes of an object that is no library's."""
+        kind = type(thing)
         if is_of_library(kind) and kind not in _NAMESPACES:
-            wrapped = own.get("__wrapped__") if isinstance(own, dict) else None
-            if isinstance(own, dict) and dataclasses.is_dataclass(thing):
-                self.say("object", kind.__qualname__)
-                self.mapping(own, names)
-            elif wrapped is not None:  # a function that is compiled, or remembers
-                self.parts("wrapper", (wrapped,), names)
-            else:
-                self.opaque(thing)
             return
-        self.say("object")
-        self.value(kind, names)
-        if isinstance(own, dict):
-            self.mapping(own, names)
+        self.value(kind)
+        if isinstance(attributes := getattr(thing, "__dict__", None), dict):
+            self.mapping(attributes)
         for base in kind.__mro__:
             for name, member in vars(base).items():
                 if isinstance(member, types.MemberDescriptorType) and not is_of_library(base):
                     value = getattr(thing, name, _MISSING)
                     self.reads.attributes.append((thing, name, value))
-                    self.parts("slot", (name, value), names)
+                    self.parts("slot", (name, value))
 
     def opaque(self, thing: Any) -> None:
-        """What cannot be looked into is told by which object it is."""
-        self.say("opaque", type(thing).__qualname__, _serial(thing))
+        """What cannot be looked into is told by which object it is, or by its pickle."""
+        which: Any = None
+        if not self.reads.lasting:
+            which = _serial(thing)
+        else:
+            with contextlib.suppress(Exception):  # a lock, a stream: it has no numbers
+                which = pickle.dumps(thing)
+        self.say("opaque", type(thing).__qualname__, which)
+
+
+class _Names(NamedTuple):
+    """Of a function's code: the globals that it reads; the modules that it imports, with the number of dots before
+    each; and all names in it."""
+
+    globals: tuple[str, ...]
+    imported: tuple[tuple[int, str], ...]
+    names: frozenset[str]
 
 
 @functools.lru_cache(maxsize=1024)
-def _names_of(code: types.CodeType) -> tuple[tuple[str, ...], tuple[str, ...], frozenset[str]]:
-    """Of a function's code: the globals that it reads, the modules that it imports, and all names in it."""
-    read, imported, names = {}, {}, set()
+def _names_of(code: types.CodeType) -> _Names:
+    read: dict[str, None] = {}
+    imported: dict[tuple[int, str], None] = {}
+    names: set[str] = set()
     codes = [code]
     while codes:
         now = codes.pop()
         names |= {*now.co_names, *now.co_varnames, *now.co_freevars}
         codes += [c for c in now.co_consts if isinstance(c, types.CodeType)]
+        constants: list[Any] = []
         for i in dis.get_instructions(now):
             if i.opname in ("LOAD_GLOBAL", "LOAD_NAME"):  # the latter in the body of a class
                 read[i.argval] = None
             elif i.opname == "IMPORT_NAME":
-                imported[i.argval] = None
-    return tuple(name for name in read if not name.startswith("__")), tuple(imported), frozenset(names)
+                level, of_it = constants[-2:]
+                of_it = [f"{i.argval}.{name}".removeprefix(".") for name in of_it or ()]  # modules too, some of them
+                imported.update(dict.fromkeys((level, name) for name in (i.argval, *of_it)))
+            elif i.opname in ("LOAD_CONST", "LOAD_SMALL_INT"):
+                constants.append(i.argval)
+    return _Names(tuple(name for name in read if not name.startswith("__")), tuple(imported), frozenset(names))
+
+
+def _absolute(level: int, name: str, where: dict[str, Any]) -> str | None:
+    """The whole name of a module that code imports, whose globals are `where`; None where that belongs to a library."""
+    if level:
+        package = where.get("__package__") or where.get("__name__", "").rpartition(".")[0]
+        try:
+            name = importlib.util.resolve_name("." * level + name, package)
+        except ImportError:
+            return None
+    return None if name in sys.modules and _is_library(name) else name
 
 
 _serials: dict[int, tuple[Any, int]] = {}

@@ -19,9 +19,9 @@ from jax.core import Tracer
 
 from .components import add, is_exact, mul, sub
 from .graph import OPERATORS
-from .jax_internals import FUSES, ClosedJaxpr, Literal, bound, settings
+from .jax_internals import FUSES, ClosedJaxpr, Literal, bound
 from .repetition import is_plain, without_repetition
-from .versions import naming_what_is_kept, on_forget, settling, version_of
+from .versions import Key, key_of, naming_what_is_kept, on_forget, settling
 
 
 def recorded(f: Callable[..., dict[str, Any]]) -> Callable[..., Any]:
@@ -34,8 +34,8 @@ def recorded(f: Callable[..., dict[str, Any]]) -> Callable[..., Any]:
     """
 
     @functools.lru_cache(maxsize=256)
-    def record_for(treedef: Any, avals: Any, n: int, dtype: Any, version: bytes, _: Any) -> _Record | None:
-        arrays = [jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type) for a in avals]
+    def record_for(treedef: Any, key: Key, n: int, dtype: Any) -> _Record | None:
+        arrays = [jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type) for a in key.types]
         record = _Record(settling(f), treedef, [*arrays, *[jax.ShapeDtypeStruct((), dtype)] * n])
         # What reads a value of the trace that is under way must not outlive that.
         return None if any(isinstance(c, Tracer) for c in record.program.consts) else record
@@ -46,12 +46,11 @@ def recorded(f: Callable[..., dict[str, Any]]) -> Callable[..., Any]:
     def call(part: str, arrays: Any, components: Any, memory: dict[Any, Any]) -> Any:
         if FUSES is not None:
             return f(arrays, components)[part]
-        given, row = jax.tree.leaves(arrays), jax.tree.leaves(components)
+        (given, key), row = key_of(arrays), jax.tree.leaves(components)  # of components only numbers are read
         dtype = jnp.result_type(*([x for x in row if not is_exact(x)] or [float]))
         treedef = jax.tree.structure((arrays, components))
-        avals, version = tuple(map(jax.typeof, given)), version_of(arrays, components)
         with naming_what_is_kept(type(arrays).__name__):
-            record = record_for(treedef, avals, len(row), dtype, version, settings())
+            record = record_for(treedef, key, len(row), dtype)
             if record is None:
                 return f(arrays, components)[part]
         row = [x if is_exact(x) or x.dtype == dtype else x.astype(dtype) for x in row]

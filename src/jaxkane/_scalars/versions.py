@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import functools
 import gc
 import itertools
 import threading
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import numpy as np
 
+from .jax_internals import settings
 from .reads import NUMBERS, Reads, is_of_library
 
 _MOST_KEPT = 256
@@ -66,26 +68,27 @@ def _roots(value: Any, found: list[Any]) -> list[Any]:
     """Classes, functions and objects in a tree of arguments whose code, or contents, a program depends on."""
     kind = type(value)
     parts: Any = ()
-    if kind is tuple or kind is list:
-        parts = value
-    elif kind is dict:
-        parts = value.values()
-    elif isinstance(value, eqx.Module):
+    is_tree = True
+    if isinstance(value, eqx.Module):
         # Its numbers are arguments of the program, and what is static in it is compared with them.
         parts = vars(value).values()
-        if not is_of_library(kind):
-            found.append(kind)
     elif isinstance(value, (jax.Array, np.generic)):  # a tracer too
         _nothing_to_read.add(kind)
     elif isinstance(value, jax.tree_util.Partial):
         parts = value.func, value.args, value.keywords
+    elif isinstance(value, (tuple, list)):
+        parts = value
+    elif isinstance(value, dict):
+        parts = value.values()
     elif not jax.tree_util.all_leaves([value]):
         own = getattr(value, "__dict__", None)
         parts = own.values() if own else jax.tree.leaves(value, is_leaf=lambda x: x is not value)
-        if not is_of_library(kind):
-            found.append(kind)
-    elif isinstance(value, type) or callable(value) or not is_of_library(kind):
-        found.append(value)
+    else:
+        is_tree = False
+        if isinstance(value, type) or callable(value) or dataclasses.is_dataclass(value) or not is_of_library(kind):
+            found.append(value)
+    if is_tree and not is_of_library(kind):
+        found.append(kind)
     for part in parts:
         if type(part) not in _nothing_to_read:
             _roots(part, found)
@@ -95,6 +98,21 @@ def _roots(value: Any, found: list[Any]) -> list[Any]:
 def version_of(*values: Any) -> bytes:
     """A digest of all that the code in these values reads at this moment, for the key of a program."""
     return b"".join([_forgotten, *[_reads_of(root).version for root in _roots(values, [])]])
+
+
+class Key(NamedTuple):
+    """On what a program depends that is traced of these arguments."""
+
+    structure: Any
+    types: tuple[Any, ...]
+    version: bytes
+    settings: Any
+
+
+def key_of(*args: Any) -> tuple[list[Any], Key]:
+    """The numbers of the arguments, and the key under which what is traced of them is kept."""
+    leaves, structure = jax.tree.flatten(args)
+    return leaves, Key(structure, tuple(map(jax.typeof, leaves)), version_of(*args), settings())
 
 
 def kept_from_a_trace(label: str) -> TypeError:

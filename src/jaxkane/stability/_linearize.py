@@ -135,7 +135,7 @@ def linearize(
         wrong = is_wrong(*origin, steady)
     # Numbers in the place of NaN, which would spoil the gradients of callers who do not use it (0 * NaN).
     at = tuple(jnp.where(jnp.all(jnp.isfinite(y)), y, 0.1) for y in (t, q, u, x, w))
-    model, follows = _derivatives((system, *at), _Choice(dependent, kept, rows), _Functions(functions))
+    model, follows = _derivatives((system, *at), _Choice(dependent, kept, rows), functions)
     if is_concrete(*origin, model) and not (follows and all(np.isfinite(M).all() for M in model)):
         raise ValueError(_why_not(origin, dependent, bool(follows)))
     A, B, C, D = nan_where(wrong | ~follows, model, origin)
@@ -172,13 +172,6 @@ def _states(system: System, states: Sequence[str] | None, dependent: tuple[str, 
     return tuple(states)
 
 
-class _Functions(dict):
-    """Output functions by name, as a static argument: known by their identity."""
-
-    def __hash__(self):  # type: ignore[override]
-        return hash(tuple((k, id(f)) for k, f in self.items()))
-
-
 class _Choice(eqx.Module):
     """What a model is to hold, by names."""
 
@@ -188,7 +181,7 @@ class _Choice(eqx.Module):
 
 
 @compiled
-def _derivatives(at, choice: _Choice, functions: _Functions):
+def _derivatives(at, choice: _Choice, functions: dict[str, Callable[..., Any]]):
     q, w = at[2], at[5]
     T = _tangents(*at[:3], choice)
     x = jnp.zeros(len(choice.states), q.dtype)
@@ -200,7 +193,7 @@ def _derivatives(at, choice: _Choice, functions: _Functions):
     return (A, B, C, D), follows
 
 
-def _at_deviation(x, w, at, T, choice: _Choice, functions: _Functions):
+def _at_deviation(x, w, at, T, choice: _Choice, functions: dict[str, Callable[..., Any]]):
     """Rates of the states (n,) and the outputs (p,), where the states deviate by x (n,), at inputs w (m,)."""
     system, t, q, u, x1, _ = at
     names, speeds = system.coordinates, (*system.speeds, *system.dependent_speeds)

@@ -10,6 +10,7 @@ import equinox as eqx
 import jax
 
 from .._common.digest import digest
+from .._scalars.reads import Reads
 from ._solve import Job, Part
 
 
@@ -18,7 +19,12 @@ def traced(job: Job, own: Any) -> tuple[str, Part]:
     numbers, rest = eqx.partition(job, eqx.is_array)  # numbers that are arguments are recorded by name elsewhere
     whole = lambda own, numbers: eqx.combine(numbers, rest).whole(own)  # noqa: E731
     program, like = jax.make_jaxpr(whole, return_shape=True)(own, numbers)
-    return digest(program), like
+    return digest_of(program), like
+
+
+def digest_of(program: Any) -> str:
+    """The digest of a program of JAX; of functions that it calls back, with all that their code reads."""
+    return digest(program, lambda f: Reads(f, lasting=True).version)
 
 
 def versions() -> dict[str, str]:
