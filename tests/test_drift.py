@@ -1,5 +1,7 @@
 """Drift of configuration constraints, how it is held, and constraints that cannot be solved."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +10,7 @@ from test_other_systems import FourBarLinkage
 
 import jaxkane as jk
 from jaxkane import best_dependent_speeds
-from jaxkane._method.drift import relative_condition
+from jaxkane._method.drift import dependent_speeds_from, relative_condition
 
 HELD = 1e-9
 
@@ -75,7 +77,18 @@ def test_the_best_dependent_speeds_of_the_bicycle():
     # in the order of conditioning, and those of one's own among them
     conditions = [x for _, x in across.choices]
     assert conditions == sorted(conditions)
-    assert len(conditions) == 20
+    assert len(conditions) == 10  # the best, and three for each of its three speeds
+
+
+def test_the_best_of_many_choices_is_found():
+    rng = np.random.default_rng(5)
+    for _ in range(3):
+        C = rng.normal(size=(5, 18)) * np.where(np.arange(18) < 12, 1e-4, 1.0)  # 8568 choices; the first are bad
+        speeds = tuple(f"u{i}" for i in range(18))
+        chosen = dependent_speeds_from(C, np.zeros(5), speeds, speeds[:5], "Many")
+        least = min(relative_condition(C, c) for c in itertools.combinations(range(12, 18), 5))
+        assert chosen.choices[0][1] <= 1.2 * least
+        assert chosen.condition == relative_condition(C, range(5))
 
 
 class Twice(jk.System):

@@ -5,7 +5,6 @@ Knows the constraints of a description; knows no mechanism and no integrator.
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 from jaxtyping import Array, Float
 
 from .._description.system import System
@@ -22,8 +22,6 @@ from .._scalars.types import Component
 from .description_facts import configuration_residual
 from .kane import Instant
 from .values import as_array, refuse_incomplete
-
-_MOST_CHOICES = 3000
 
 
 def correction(system: System, t: Component, q: Array) -> Float[Array, " n_q"]:
@@ -55,9 +53,9 @@ class DependentSpeeds(eqx.Module):
 
     Attributes:
 
-    - `choices`: pairs of names and the condition number of their C_dep, beside the coefficients of the other speeds, at
-        most 3000 of them, the best first; infinite where the residuals cannot be solved for these speeds. It compares
-        speeds of one unit best.
+    - `choices`: pairs of names and the condition number of their C_dep, beside the coefficients of the other speeds; the
+        best first, with all that differ from it by one speed, and the current one. Infinite where the residuals cannot
+        be solved for these speeds. It compares speeds of one unit best.
     - `current`: the names that the system chose, and `condition` their condition number.
     - `n_residuals`; `rank`: the number of them that are independent.
     - `redundant`: places of residuals that follow from those before them, and `conflicting`: those among them that no
@@ -144,13 +142,32 @@ def dependent_speeds_from(
         weights = np.linalg.lstsq(C[kept].T, C[i], rcond=None)[0]
         if abs(c0[i] - weights @ c0[kept]) > 1e-9 * max(_size(c0), 1.0):
             conflicting.append(i)
-    choices = list(itertools.islice(itertools.combinations(range(len(speeds)), k), _MOST_CHOICES))
     own = tuple(speeds.index(s) for s in current)
-    conditions = {c: relative_condition(C, c) for c in {*choices, own}}
+    condition = relative_condition(C, own)
+    conditions = {tuple(sorted(own)): condition} | _best_choices(C)
     ranked = sorted(((tuple(speeds[i] for i in c), float(x)) for c, x in conditions.items()), key=lambda pair: pair[1])
-    return DependentSpeeds(
-        tuple(ranked), current, float(conditions[own]), k, ranks[-1], redundant, tuple(conflicting), name
-    )
+    return DependentSpeeds(tuple(ranked), current, condition, k, ranks[-1], redundant, tuple(conflicting), name)
+
+
+def _best_choices(C: np.ndarray) -> dict[tuple[int, ...], float]:
+    """The best conditioned choice of as many columns as C has rows, and those beside it, which differ in one column.
+
+    A QR factorization with column pivoting begins; then columns are exchanged, one by one, while that improves it.
+    """
+    if not np.isfinite(C).all():
+        return {}
+    k, n = C.shape
+    factors: Any = scipy.linalg.qr(_by_rows(C), mode="r", pivoting=True)
+    best = tuple(sorted(factors[1][:k].tolist()))
+    conditions = {best: relative_condition(C, best)}
+    while True:
+        others = [j for j in range(n) if j not in best]
+        beside = [tuple(sorted({*best, j} - {i})) for i in best for j in others]
+        conditions = {c: conditions.get(c) or relative_condition(C, c) for c in (best, *beside)}
+        better = min(conditions, key=lambda c: conditions[c])
+        if not conditions[better] < conditions[best]:
+            return conditions
+        best = better
 
 
 def relative_condition(C: np.ndarray, dependent: Sequence[int]) -> Any:
@@ -164,14 +181,19 @@ def relative_condition(C: np.ndarray, dependent: Sequence[int]) -> Any:
     """
     finite: Any = np.isfinite(C).all(axis=(-2, -1))
     C = np.where(finite[..., None, None], C, 1.0)
-    size = np.abs(C).max(axis=-1, keepdims=True)
-    C = C / np.where(size > 0, size, 1.0)
+    C = _by_rows(C)
     largest = np.linalg.svd(C, compute_uv=False)[..., 0]
     smallest = np.linalg.svd(C[..., list(dependent)], compute_uv=False)[..., -1]
     with np.errstate(divide="ignore", invalid="ignore"):
         condition = np.where(smallest > 1e-14 * largest, largest / smallest, np.inf)
     condition = np.where(finite, condition, np.nan)
     return condition if condition.ndim else float(condition)
+
+
+def _by_rows(C: np.ndarray) -> np.ndarray:
+    """Each row divided by its largest entry."""
+    size = np.abs(C).max(axis=-1, keepdims=True)
+    return C / np.where(size > 0, size, 1.0)
 
 
 def _size(x: np.ndarray) -> float:
