@@ -211,6 +211,38 @@ def test_a_rigid_loop_is_a_body():
     np.testing.assert_allclose(rate[speed], jk.accelerations(both, 0.0, [0.4], [0.9])[0], rtol=1e-10)
 
 
+@pytest.mark.parametrize(
+    "turned", [(1.0, 0.0, 0.0, 0.0), (0.0, 0.6, -0.8, 0.0), (0.5, 0.5, 0.5, 0.5), (0.0, 0.0, 0.0, 1.0)]
+)
+def test_a_turned_weld_holds_in_one_orientation_only(turned):
+    TOLERANCE = 1e-9
+    slab = {"mass": 1.0, "inertia": (0.1, 0.2, 0.25)}
+    sites = [Site("on a", "a", (0.0, 0.0, 0.1)), Site("on b", "b", (0.0, 0.0, -0.1), turned)]
+    welded = mechanism(
+        [Link("a", None, free("a"), **slab), Link("b", None, free("b"), **slab)],
+        sites=sites,
+        loops=[Loop("on a", "on b", rigid=True)],
+    )
+    assert {"a_x", "a_y", "a_z", "a_e1", "a_e2", "a_e3"}.isdisjoint(welded.dependent_coordinates)
+    x, y, z, w = turned
+    for guess in [(0.0, 0.0, 0.0, 1.0), (w, -z, y, -x), (y, -x, w, -z)]:  # the others are half a turn away
+        q = [*(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), *(0.0, 0.0, 0.2), *guess]
+        state = jk.assemble(welded, q)
+        (A, P), (B, Q) = welded.motion(0.0, state.q, np.zeros(12)).sites.values()
+        np.testing.assert_allclose(A.matrix(B), np.eye(3), rtol=0, atol=TOLERANCE)
+        np.testing.assert_allclose(Q.position_from(P).to(A), 0.0, rtol=0, atol=TOLERANCE)
+
+
+def test_a_rigid_loop_in_a_plane_is_not_closed_half_a_turn_away():
+    links = [Link("a", None, hinge("a"), mass=1.0), Link("b", "a", hinge("b"), (0.5, 0.0, 0.0), mass=1.0)]
+    links.append(Link("c", "b", hinge("c"), (0.5, 0.0, 0.0), mass=1.0))
+    sites = [Site("hand", "c"), Site("goal", None, (0.7, 0.2, 0.0), ("3-1-2", (np.pi, 0.0, 0.0)))]
+    arm = mechanism(links, sites=sites, loops=[Loop("goal", "hand", rigid=True)])
+    for start in (-3.0, 0.0, 3.0):
+        q = jk.assemble(arm, [0.3, 0.4, start]).q
+        np.testing.assert_allclose(np.cos(sum(q)), -1.0, rtol=1e-12)
+
+
 def test_a_coupling_is_a_gear():
     gears = [Link(n, None, hinge(n), mass=1.0, inertia=(0, 0, I)) for n, I in (("g", 0.2), ("p", 0.03))]
     geared = mechanism(gears, loops=[Coupling("p", "g", (0.1, -3.0))], actuators=[Actuator("T", "g")])

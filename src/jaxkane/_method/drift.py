@@ -53,9 +53,9 @@ class DependentSpeeds(eqx.Module):
 
     Attributes:
 
-    - `choices`: pairs of names and the condition number of their C_dep, beside the coefficients of the other speeds; the
-        best first, with all that differ from it by one speed, and the current one. Infinite where the residuals cannot
-        be solved for these speeds. It compares speeds of one unit best.
+    - `choices`: pairs of names and the condition number of their C_dep, beside the coefficients of the other speeds:
+        the best first, with all that differ from it by one speed, and the current one. Infinite where the residuals
+        cannot be solved for these speeds. It compares speeds of one unit best.
     - `current`: the names that the system chose, and `condition` their condition number.
     - `n_residuals`; `rank`: the number of them that are independent.
     - `redundant`: places of residuals that follow from those before them, and `conflicting`: those among them that no

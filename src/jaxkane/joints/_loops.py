@@ -15,6 +15,7 @@ from jax.core import Tracer
 
 from .._common.lookup import not_there
 from ._mechanism import Field, Mechanism, class_of
+from ._shapes import Shape
 from ._structure import Structure
 
 
@@ -35,23 +36,29 @@ def _with_dependent(
     dependent: Sequence[str] | None,
     norms: list[str],
 ) -> Structure:
-    trial = class_of(structure, fields)(**_numbers(values))
-    C, G = _slopes(trial)  # (k,n) by speeds, (k,n_q) by coordinates
-    kept = _independent_rows(C)
-    if not any(isinstance(x, Tracer) or np.ndim(x) for x in values.values()):
-        _check_what_follows(trial, kept)
+    trial = jax.tree.map(float, class_of(structure, fields)(**_numbers(values)))  # read by Python, not by JAX
+    q = _trial_coordinates(trial)
+    kept = _independent_rows(_slopes_by_speeds(trial, q))
+    closed = _closed(trial, q, kept)
+    if closed is not None and not any(isinstance(x, Tracer) or np.ndim(x) for x in values.values()):
+        _check_what_follows(trial, closed, kept)
+    q = q if closed is None else closed
+    C, G = _slopes_by_speeds(trial, q)[kept], _slopes_by_coordinates(trial, q)[kept]  # (k,n) (k,n_q)
     names = (*trial.speeds, *trial.dependent_speeds)
     if dependent is None:
         follows = [f"{x.first}_rate" for x in structure.couplings]
-        speeds = [names[i] for i in _pivots(C[kept] * [1e3 if name in follows else 1.0 for name in names])]
+        preferred = C * [1e3 if name in follows else 1.0 for name in names]
+        speeds = [names[i] for i in _columns(preferred, _by_joints(structure, names, lambda joint: joint.speeds))]
         if all(name.endswith("_rate") for name in speeds):
             coordinates = [*(name.removesuffix("_rate") for name in speeds), *norms]
         else:
-            coordinates = [trial.coordinates[i] for i in _pivots(np.concatenate([G[kept], _norm_slopes(trial)]))]
+            G = np.concatenate([G, _norm_slopes(trial, q)])
+            groups = _by_joints(structure, trial.coordinates, lambda joint: joint.coordinates)
+            coordinates = [trial.coordinates[i] for i in _columns(G, groups)]
     else:
         speeds, coordinates = _chosen(structure, dependent, len(kept)), [*dependent, *norms]
         places = [names.index(s) for s in speeds]
-        if np.linalg.svd(C[kept][:, places], compute_uv=False)[-1] < 1e-9 * np.abs(C).max():
+        if np.linalg.svd(C[:, places], compute_uv=False)[-1] < 1e-9 * np.abs(C).max():
             raise ValueError(f"`dependent`: what closes the loops cannot be solved for {', '.join(dependent)}.")
     start, loops = 0, []
     for loop in structure.loops:
@@ -89,13 +96,10 @@ def _numbers(values: dict[str, Any]) -> dict[str, Any]:
     return {name: number(x) for name, x in values.items()}
 
 
-def _slopes(trial: Mechanism) -> tuple[np.ndarray, np.ndarray]:
-    """Derivatives of the loops' residuals by all speeds and by all coordinates, near the reference."""
-    q, residuals = _trial_coordinates(trial), _residuals(trial)
-    still = np.zeros(len(trial.speeds) + len(trial.dependent_speeds))
+def _slopes_by_speeds(trial: Mechanism, q: np.ndarray) -> np.ndarray:
+    still, residuals = np.zeros(len(trial.speeds) + len(trial.dependent_speeds)), _residuals(trial)
     c = lambda u: np.array([float(x) for x in residuals(q, u)[1]])  # noqa: E731
-    C = np.array([c(e) - c(still) for e in np.eye(len(still))]).T
-    return C, _slopes_by_coordinates(trial, q)
+    return np.array([c(e) - c(still) for e in np.eye(len(still))]).T
 
 
 def _slopes_by_coordinates(trial: Mechanism, q: np.ndarray) -> np.ndarray:
@@ -132,31 +136,36 @@ def _residuals(trial: Mechanism) -> Callable[[np.ndarray, np.ndarray], tuple[lis
     return residuals
 
 
-def _check_what_follows(trial: Mechanism, kept: list[int]) -> None:
+def _closed(trial: Mechanism, q: np.ndarray, kept: list[int]) -> np.ndarray | None:
+    """Coordinates near these at which the residuals that are kept are zero; None where there are none to be found."""
+    residuals, still = _residuals(trial), np.zeros(len(trial.speeds) + len(trial.dependent_speeds))
+    weights = np.ones(len(q))  # what will be dependent moves most
+    for i, group in enumerate(_by_joints(trial.structure, trial.coordinates, lambda joint: joint.coordinates)):
+        weights[group] = max(0.1**i, 1e-3)
+    for _ in range(50):
+        h = np.array([float(x) for x in residuals(q, still)[0]])[kept]
+        if np.abs(h).max(initial=0.0) < 1e-9:
+            return q
+        norms = 0.5 * _norm_slopes(trial, q)
+        rows = np.concatenate([_slopes_by_coordinates(trial, q)[kept], norms])
+        step = weights * np.linalg.lstsq(rows * weights, -np.concatenate([h, np.zeros(len(norms))]), rcond=None)[0]
+        q = _normalized(trial, q + step / max(1.0, 2.0 * np.linalg.norm(step)))
+    return None  # not closed from here: `assemble` says so
+
+
+def _check_what_follows(trial: Mechanism, closed: np.ndarray, kept: list[int]) -> None:
     """Residuals that are left out, since they follow from the others, have to be zero where those are.
 
     **Raises:** `ValueError` for one that is not, as where a loop in a plane ends beside its beginning.
     """
-    residuals, q = _residuals(trial), _trial_coordinates(trial)
-    still, index = np.zeros(len(trial.speeds) + len(trial.dependent_speeds)), np.arange(len(q))
-    for _ in range(50):
-        h = np.array([float(x) for x in residuals(q, still)[0]])
-        if len(kept) == len(h):
-            return
-        if np.abs(h[kept]).max(initial=0.0) < 1e-9:
-            break
-        ends = np.flatnonzero(_norm_slopes(trial).any(axis=0))  # of the Euler parameters
-        norms = np.array([np.where((i - 4 < index) & (index <= i), q, 0.0) for i in ends]).reshape(len(ends), len(q))
-        rows = np.concatenate([_slopes_by_coordinates(trial, q)[kept], norms])
-        step = np.linalg.lstsq(rows, -np.concatenate([h[kept], np.zeros(len(norms))]), rcond=None)[0]
-        q = _normalized(trial, q + step / max(1.0, 2.0 * np.linalg.norm(step)))
-    else:
-        return  # not closed from here: `assemble` says so
-    worst = max((i for i in range(len(h)) if i not in kept), key=lambda i: abs(h[i]))
-    if abs(h[worst]) > 1e-6:
+    still = np.zeros(len(trial.speeds) + len(trial.dependent_speeds))
+    h = np.abs([float(x) for x in _residuals(trial)(closed, still)[0]])
+    h[kept] = 0.0
+    worst = int(np.argmax(h))
+    if h[worst] > 1e-6:
         raise ValueError(
             f"{trial.structure.name}: {_closing(trial.structure)[worst]} can never hold: it stays off by "
-            f"{abs(h[worst]):.3g} wherever the joints are, and all else that closes loops is met. The sites of a loop "
+            f"{h[worst]:.3g} wherever the joints are, and all else that closes loops is met. The sites of a loop "
             "in a plane are at one height across it, and two that hold one joint agree."
         )
 
@@ -171,14 +180,14 @@ def _by_name(names: Sequence[str], x: np.ndarray) -> dict[str, float]:
     return {name: float(a) for name, a in zip(names, x, strict=True)}
 
 
-def _norm_slopes(trial: Mechanism) -> np.ndarray:
+def _norm_slopes(trial: Mechanism, q: np.ndarray) -> np.ndarray:
+    """Derivatives of the norms of Euler parameters by all coordinates (norms, n_q)."""
     rows = []
     for joint in trial.structure.joints:
         if len(joint.coordinates) > 1:
-            row = np.zeros(len(trial.coordinates))
-            row[trial.coordinates.index(joint.name + joint.coordinates[-1][0])] = 2.0
-            rows.append(row)
-    return np.array(rows).reshape(len(rows), len(trial.coordinates))
+            last, places = trial.coordinates.index(joint.name + joint.coordinates[-1][0]), np.arange(len(q))
+            rows.append(np.where((last - 4 < places) & (places <= last), 2.0 * q, 0.0))
+    return np.array(rows).reshape(len(rows), len(q))
 
 
 def _independent_rows(C: np.ndarray) -> list[int]:
@@ -187,11 +196,28 @@ def _independent_rows(C: np.ndarray) -> list[int]:
     return sorted(int(i) for i in order[:rank])
 
 
-def _pivots(A: np.ndarray) -> list[int]:
-    """The columns by which A is best solved, as many as it has rows."""
-    return [int(i) for i in _qr(A)[1][: len(A)]]
+def _by_joints(
+    structure: Structure, names: Sequence[str], endings: Callable[[Shape], tuple[tuple[str, str], ...]]
+) -> list[list[int]]:
+    """Places of what is solved for first, and so on: balls and free links, those at the end of the tree first, so that
+    a free link that is welded follows as a whole; then hinges and sliders."""
+    groups = [[names.index(x) for x in joint.names(endings(joint))] for joint in reversed(structure.joints)]
+    return [group for group in groups if len(group) > 1] + [[i for group in groups if len(group) == 1 for i in group]]
+
+
+def _columns(A: np.ndarray, groups: list[list[int]]) -> list[int]:
+    """The columns by which A is best solved, as many as it has rows: of the first groups all that are independent."""
+    chosen, size = [], np.linalg.norm(A, axis=0)
+    for group, least in (*((group, 1e-2) for group in groups), (range(A.shape[1]), 0.0)):
+        rest = [i for i in group if i not in chosen]
+        if rest and len(chosen) < len(A):
+            Q = np.linalg.qr(A[:, chosen])[0]
+            R, order = _qr(A[:, rest] - Q @ (Q.T @ A[:, rest]))
+            good = [rest[j] for j, r in zip(order, np.abs(np.diag(R)), strict=False) if r > least * size[rest[j]]]
+            chosen += good[: len(A) - len(chosen)]
+    return chosen
 
 
 def _qr(A: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    found: Any = scipy.linalg.qr(A, mode="economic", pivoting=True)
-    return found[1], found[2]
+    factors: Any = scipy.linalg.qr(A, mode="economic", pivoting=True)
+    return factors[1], factors[2]

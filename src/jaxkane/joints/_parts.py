@@ -81,7 +81,7 @@ class Actuator:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Loop:
-    """Two sites that are in one place: what closes a loop; `rigid`, with one orientation too.
+    """Two sites that are in one place: what closes a loop; `rigid`, with one orientation too, and not half a turn away.
 
     Those of the three (six) residuals count that are independent of each other at trial coordinates; of a loop in a
     plane two (three).

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, ClassVar
+
+import jax.numpy as jnp
 
 from .._description.bodies import Body
 from .._description.frames import Frame
@@ -10,7 +13,7 @@ from .._description.loads import Force
 from .._description.motion import Motion
 from .._description.points import Point, inertial
 from .._description.system import System
-from .._scalars.components import ZERO3, add, component, dot, is_zero, mul, sub, total
+from .._scalars.components import ZERO3, add, component, dot, is_exact, is_zero, mul, scale3, sub, total
 from .._scalars.types import Component, Triple
 from ..rotations import Matrix
 from ._shapes import Placed, Shape
@@ -132,8 +135,7 @@ class Tree(System):
             apart = Q.position_from(P).components_in(A)
             parting = (Q.velocity - P.velocity).components_in(A)
             if loop.rigid:
-                x, y, z = (axis.components_in(A) for axis in (B.x, B.y, B.z))
-                apart = (*apart, z[1], x[2], y[0])  # cosines between axes that are across
+                apart = (*apart, *_turned_apart(A, B))
                 parting = (*parting, *(B.angular_velocity - A.angular_velocity).components_in(A))
             rows = [i for i in range(loop.size) if (i in loop.kept) != left_out]
             h += [apart[i] for i in rows]
@@ -162,6 +164,23 @@ def _moved(P: Point, F: Frame, r: Triple) -> Point:
 
 def _turned(F: Frame, orientation: Matrix | None, name: str) -> Frame:
     return F if orientation is None else Frame(f"{name}, placed", F, orientation, ZERO3)
+
+
+def _turned_apart(A: Frame, B: Frame) -> Triple:
+    """The axis by which B is turned from A, times twice the tangent of half the angle: zero in one orientation only."""
+    x, y, z = (axis.components_in(A) for axis in (B.x, B.y, B.z))
+    sines = sub(y[2], z[1]), sub(z[0], x[2]), sub(x[1], y[0])
+    size = dot(x, x)  # of Euler parameters that `assemble` moves it is not yet 1
+    cosines = total((math.sqrt(size) if is_exact(size) else jnp.sqrt(size), x[0], y[1], z[2]))
+    if is_exact(cosines):
+        return scale3(2.0 / cosines, sines) if cosines > _HALF_A_TURN else (1.0, 1.0, 1.0)
+    # Half a turn away no direction is nearest: there the residuals say that it is far, and `assemble` starts beside.
+    is_far = jnp.abs(cosines) < _HALF_A_TURN
+    factor = 2.0 / jnp.where(is_far, 1.0, cosines)
+    return tuple(jnp.where(is_far, 1.0, mul(factor, x)) for x in sines)  # type: ignore[return-value]
+
+
+_HALF_A_TURN = 1e-6  # 1 + the sum of the direction cosines: within 0.06 degrees of it
 
 
 def _polynomial(coefficients: tuple[float, ...], x: Component) -> tuple[Component, Component]:
