@@ -12,7 +12,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
 from jaxtyping import Array, Float
 
 from .._description.system import System
@@ -156,6 +155,8 @@ def _best_choices(C: np.ndarray) -> dict[tuple[int, ...], float]:
     """
     if not np.isfinite(C).all():
         return {}
+    import scipy.linalg  # late: importing the library stays quick
+
     k, n = C.shape
     factors: Any = scipy.linalg.qr(_by_rows(C), mode="r", pivoting=True)
     best = tuple(sorted(factors[1][:k].tolist()))
