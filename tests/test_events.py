@@ -384,11 +384,66 @@ class Both(eqx.Module):
         ({"stabilize": -1.0}, "`stabilize` must be a rate"),
         ({"max_steps": 0}, "`max_steps` must be a whole number"),
         ({"max_steps": 2.5}, "`max_steps` must be a whole number"),
+        ({"step": 0.1, "rtol": 1e-6}, "`step` fixes the steps of integration, `rtol` and `atol` let them"),
+        ({"step": 0.1, "atol": 1e-6}, "`step` fixes the steps of integration, `rtol` and `atol` let them"),
     ],
 )
 def test_options_that_contradict_themselves(options, message):
     with pytest.raises(ValueError, match=message):
         dropped(1.0, **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"solver": diffrax.Tsit5}, r"`solver` is an instance, not a class: solver=diffrax.Tsit5\(\)"),
+        ({"solver": "Tsit5"}, r"`solver` is one of diffrax, as diffrax.Tsit5\(\) is a solver; got 'Tsit5'"),
+        (
+            {"adjoint": diffrax.DirectAdjoint},
+            r"`adjoint` is an instance, not a class: adjoint=diffrax.DirectAdjoint\(\)",
+        ),
+        ({"adjoint": True}, "`adjoint` is one of diffrax"),
+        ({"project": "no"}, "`project` is True or False, got 'no'"),
+        ({"progress": 1}, "`progress` is True or False, got 1"),
+    ],
+)
+def test_options_of_another_type(options, message):
+    with pytest.raises(TypeError, match=message):
+        dropped(1.0, **options)
+
+
+def branching(t, state):
+    return 1.0 if t > 0.5 else 0.0
+
+
+def by_numpy(t, state):
+    return np.polyval([1.0, 0.0], t)
+
+
+@pytest.mark.parametrize(
+    ("inputs", "label"),
+    [
+        ({"drive": branching}, "The input 'drive'"),
+        ({"drive": by_numpy}, "The input 'drive'"),
+        ({"drive": lambda t, s: float(s["h"])}, "The input 'drive'"),
+        (lambda t, s: {"drive": branching(t, s)}, "The function of the inputs"),
+    ],
+)
+def test_inputs_that_ask_for_values_of_what_is_traced(inputs, label):
+    with pytest.raises(
+        TypeError, match=rf"{label} asks for the value .*jnp.polyval .* jnp.where\(a > b, x, y\) for `if`"
+    ):
+        jk.simulate(Particle(), jk.State(jnp.ones(1), jnp.ones(1)), TS, inputs)
+
+
+class Deciding(Particle):
+    def events(self, t, q, u):
+        return {"low": q["h"] if q["h"] > 0.1 else 1.0}
+
+
+def test_an_event_that_asks_for_the_value_of_what_is_traced():
+    with pytest.raises(TypeError, match=r"Deciding.events asks for the value .* jnp.where\(a > b, x, y\) for `if`"):
+        dropped(1.0, system=Deciding())
 
 
 def test_samples_that_are_none():

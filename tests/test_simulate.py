@@ -381,7 +381,7 @@ def test_what_is_refused(arguments, error, message):
 
 
 def test_an_unknown_adjoint_and_an_unknown_name():
-    with pytest.raises(ValueError, match="adjoint is one of"):
+    with pytest.raises(ValueError, match="`adjoint` is one of"):
         jk.simulate(PENDULUM, START, TS, adjoint="backwards")
     with pytest.raises(KeyError, match="no 'theta3' in this trajectory; did you mean 'theta"):
         _ = jk.simulate(PENDULUM, START, TS)["theta3"]

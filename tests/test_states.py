@@ -283,3 +283,31 @@ def variant(**members):
 def test_what_is_wrong_is_named(members, message):
     with pytest.raises((ValueError, TypeError, KeyError, NotImplementedError), match=message):
         jk.simulate(variant(**members), jk.State([0.0], [0.0]), ts)
+
+
+class Plain(jk.System):
+    """The same cart without states of the first order."""
+
+    coordinates = ("place",)
+    speeds = ("speed",)
+    motion = Cart.motion
+    mass: jk.Scalar = jk.parameter(2.0)
+
+
+@pytest.mark.parametrize("joined", [lambda base, rate: (*base, rate), lambda base, rate: {**base, "wear": rate}])
+def test_a_base_without_states_gives_none(joined):
+    rate = 0.5
+
+    class Worn(Plain):
+        states = ("wear",)
+
+        def state_rates(self, t, q, u, x, motion, now):
+            return joined(super().state_rates(t, q, u, x, motion, now), rate + 0.0 * x["wear"])
+
+    assert float(jk.state_rates(Worn(), 0.0, [0.0], [0.0])["wear"]) == rate
+
+
+def test_states_without_rates_are_refused():
+    kind = type("Unrated", (Plain,), {"states": ("wear",)})
+    with pytest.raises(NotImplementedError, match="define state_rates"):
+        jk.state_rates(kind(), 0.0, [0.0], [0.0])

@@ -276,16 +276,16 @@ class Pulled(jk.System):
 
 @pytest.mark.parametrize(("options", "kinks", "anew"), [({}, 11, False), ({"input_delay": ["left"]}, 2 * 23, True)])
 def test_inputs_that_share_their_times_share_their_kinks(options, kinks, anew, monkeypatch):
-    import jaxkane._simulation.steps as steps
+    import jaxkane._simulation.ride as ride
 
-    seen, original = [], steps.sample_times
-    monkeypatch.setattr(steps, "sample_times", lambda *a: seen.append(original(*a)) or seen[-1])
+    seen, original = [], ride.kinks_of
+    monkeypatch.setattr(ride, "kinks_of", lambda *a, **more: seen.append(original(*a, **more)) or seen[-1])
     t = np.linspace(0.0, 1.0, 11)
     trial = Trial(t, {"x": 0.1 * t**2}, {"left": np.sin(t), "right": np.cos(t)}, sigma=0.1)
     problem = Problem.of(Pulled(), trial, "mass", simulation=Simulation(rtol=1e-6), **options)
     window = jax.tree.map(lambda x: x[0], problem.windows)
     jax.eval_shape(problem.model.simulate, window, window.start, problem.start.b[0], problem.start.x)
-    assert [(times.shape[0], several) for times, several in seen] == [(kinks, anew)]
+    assert [(each.times.shape[0], each.anew) for each in seen] == [(kinks, anew)]
 
 
 @pytest.mark.slow

@@ -5,9 +5,10 @@ Knows classes and what they are given; knows no mechanism.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import equinox as eqx
@@ -77,6 +78,26 @@ _ASKED_FOR_A_VALUE = (
 )
 
 
+_COUNTS = (
+    " A number that a description counts with, as that of its links, is a static field: "
+    "`links: int = equinox.field(static=True)`."
+)
+
+
+@contextlib.contextmanager
+def naming_what_has_no_value(label: str, more: str = "") -> Iterator[None]:
+    """Where a function of the user asks a traced number for its value, the error says which and what to write."""
+    try:
+        yield
+    except _ASKED_FOR_A_VALUE as error:
+        raise TypeError(
+            f"{label} asks for the value of a number that has none while it is traced: time, coordinates, speeds, "
+            "parameters, and what follows from them. Write jnp.sin for np.sin and math.sin (jnp.polyval for "
+            "np.polyval), jnp.where(a > b, x, y) for `if`, jnp.maximum and jnp.minimum for max and min, and neither "
+            f"float() nor .item().{more}"
+        ) from error
+
+
 def _named(method: Callable[..., Any], name: str) -> Callable[..., Any]:
     """A method of a description, of that name, whose `q`, `u` and `x` may be any sequence, and are read by place and
     by name."""
@@ -94,16 +115,8 @@ def _named(method: Callable[..., Any], name: str) -> Callable[..., Any]:
         if name == "state_rates" and len(rest) > 1:
             rest = (rest[0], _values(rest[1], self.states, f"{type(self).__name__}: x"), *rest[2:])
         began = now()
-        try:
+        with naming_what_has_no_value(f"{type(self).__name__}.{name}", _COUNTS):
             found = method(self, t, q, *rest, **more)
-        except _ASKED_FOR_A_VALUE as error:
-            raise TypeError(
-                f"{type(self).__name__}.{name} asks for the value of a number that has none while the "
-                "description is traced: time, coordinates, speeds, parameters, and what follows from them. Write "
-                "jnp.sin for np.sin and math.sin, jnp.where(a > b, x, y) for `if`, jnp.maximum and jnp.minimum for max "
-                "and min, and neither float() nor .item(). A number that a description counts with, as that of its "
-                "links, is a static field: `links: int = equinox.field(static=True)`."
-            ) from error
         if isinstance(found, Motion) and found.made < began:
             raise kept_from_a_trace(type(self).__name__)
         return found

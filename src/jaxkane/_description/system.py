@@ -111,7 +111,9 @@ class System(eqx.Module, metaclass=Kind):
         """Why loads are not finite at a state, in words: asked where they are not, for the error; "" if unknown."""
         return ""
 
-    def state_rates(self, t: Component, q: Any, u: Any, x: Any, motion: Motion, now: Any) -> Sequence[Component]:
+    def state_rates(
+        self, t: Component, q: Any, u: Any, x: Any, motion: Motion, now: Any
+    ) -> Sequence[Component] | Mapping[str, Component]:
         """Rates of the states of the first order, in the order of `states`; or by name, in a dict.
 
             states = ("motor_torque",)
@@ -119,8 +121,11 @@ class System(eqx.Module, metaclass=Kind):
             def state_rates(self, t, q, u, x, motion, now):
                 return ((now["command"] - x["motor_torque"]) / self.lag,)
 
-        `now` is a `Now`: inputs and states by name, and accelerations, for the filter of an accelerometer.
+        `now` is a `Now`: inputs and states by name, and accelerations, for the filter of an accelerometer. Of a class
+        without states there are none: `super().state_rates(...)` gives an empty dict.
         """
+        if type(self).state_rates is not System.state_rates or not self.states:
+            return {}
         raise NotImplementedError(
             f"{type(self).__name__} has states ({', '.join(self.states)}): define state_rates(self, t, q, u, x, "
             "motion, now), one rate for each."

@@ -55,7 +55,7 @@ class ToKinks(diffrax.AbstractAdaptiveStepSizeController[Any, Any]):
         keep, next_t0, next_t1, jumped, state, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
         )
-        i = jnp.argmin(jnp.abs(self.times - next_t0))
+        i = jnp.minimum(jnp.searchsorted(self.times, next_t0 - self._here), len(self.times) - 1)
         at_kink = keep & (jnp.abs(next_t0 - self.times[i]) <= self._here)
         next_t0 = jnp.where(at_kink, self.times[i] + 0.25 * self._here, next_t0)
         return keep, next_t0, self._end(next_t0, next_t1), jumped | at_kink if self.anew else jumped, state, result

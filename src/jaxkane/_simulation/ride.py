@@ -27,7 +27,7 @@ from .._scalars.versions import compiled
 from .events import Events, at_zero, events_of
 from .loops import keeping
 from .settings import Settings, refuse_held
-from .signals import evaluate, for_fixed_steps, with_own_times, without_nonsense
+from .signals import Kinks, evaluate, for_fixed_steps, kinks_of, samples_of, with_own_times, without_nonsense
 from .stages import WrittenOut
 from .steps import Times, controller_of, times_of
 from .trajectory import Status, Trajectory
@@ -63,6 +63,7 @@ class _Asked(NamedTuple):
     start: Array
     ts: Array
     times: Times
+    kinks: Kinks | None
     valid: Array
     rates: Callable[..., Any]
     args: Any
@@ -105,13 +106,17 @@ def solve(
     stepped = sound(system)
     system, state = safe(valid, (system, state))
     signals = without_nonsense(signals, valid)
+    y = packed(state)
+    state_at = lambda t, y: _now(system, t, unpacked(system, y))  # noqa: E731
+    kinks = kinks_of(signals, _calling_samples(system), times.start, y, state_at, fixed=settings.step is not None)
     constrained = has_configuration_constraints(system, times.start, state.q)
     asked = _Asked(
         system=system,
         signals=signals,
-        start=packed(state),
+        start=y,
         ts=ts,
         times=times,
+        kinks=kinks,
         valid=valid,
         rates=_rates(valid, settings.stabilize if constrained else 0.0),
         args=(stepped, signals, disturbance),
@@ -122,6 +127,15 @@ def solve(
     if asked.events.names:
         found = _to_event(asked, found)
     return _trajectory(asked, _everywhere(asked, found, constrained and settings.project), origin)
+
+
+def _calling_samples(system: System) -> dict[str, Callable[..., Any]]:
+    """The right-hand side (t, state) of a system that has samples among its parameters, by the system's name."""
+
+    def rates(t: Array, now: Now) -> Array:
+        return packed_rates(system, t, packed(State(now.q, now.u, now.x)), {})
+
+    return {type(system).__name__: rates} if samples_of(system) else {}
 
 
 def _rates(valid: Array, stabilize: float) -> Callable[..., Any]:
@@ -165,7 +179,7 @@ def _integrated(asked: _Asked) -> _Found:
         None,
         asked.start,
         asked.args,
-        stepsize_controller=controller_of(times, asked.rates, asked.events, stepped, asked.signals, settings),
+        stepsize_controller=controller_of(times, asked.rates, asked.events, stepped, asked.kinks, settings),
         **keeping(asked.ts, settings.adjoint, anew=settings.progress),
         max_steps=settings.max_steps,
         progress_meter=diffrax.TqdmProgressMeter() if settings.progress else diffrax.NoProgressMeter(),
@@ -254,9 +268,13 @@ def _trajectory(asked: _Asked, found: _Found, origin: Array) -> Trajectory:
     )
 
 
+def _now(system: System, t: Component, state: State) -> Now:
+    return Now(state.q, state.u, state.x, t, system)
+
+
 def inputs_at(system: System, signals: Any, t: Component, state: State, all_of_them: bool = False):
     """The inputs by name, at one time: all, or those that are given."""
-    values = evaluate(signals, t, Now(state.q, state.u, state.x, t, system))
+    values = evaluate(signals, t, _now(system, t, state))
     names = checked_inputs(system, values) if all_of_them else values
     return {name: jnp.asarray(values.get(name, 0.0), dtype=state.q.dtype) for name in names}
 

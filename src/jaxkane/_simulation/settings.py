@@ -64,9 +64,12 @@ def settings_for(
 ) -> Settings:
     """The options of `simulate`, with defaults that follow the type of the times; `rising`: whether these are known to
     rise, as they do where `checked_times` saw their values."""
+    _check_kinds(solver, adjoint, project=project, progress=progress)
+    if step is not None and not (rtol is None and atol is None):
+        raise ValueError(
+            "`step` fixes the steps of integration, `rtol` and `atol` let them follow the error: give one."
+        )
     default = 1e-8 if ts.dtype == jnp.float64 else 1e-5
-    if isinstance(adjoint, str) and adjoint not in ADJOINTS:
-        raise ValueError(f"adjoint is one of {', '.join(ADJOINTS)}, or a diffrax adjoint; got {adjoint!r}.")
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(
             "adjoint=BacksolveAdjoint() solves the motion backwards, without its events, inputs and samples: its "
@@ -90,6 +93,25 @@ def settings_for(
         stabilize=float(stabilize),
         rising=rising,
     )
+
+
+def _check_kinds(solver: Any, adjoint: Any, **flags: Any) -> None:
+    """Refuse options of the wrong type. **Raises:** `TypeError`, or `ValueError` for the name of no adjoint."""
+    if isinstance(adjoint, str):
+        if adjoint not in ADJOINTS:
+            raise ValueError(f"`adjoint` is one of {', '.join(ADJOINTS)}, or a diffrax adjoint; got {adjoint!r}.")
+        adjoint = None
+    for label, value, kind in (
+        ("solver", solver, diffrax.AbstractSolver),
+        ("adjoint", adjoint, diffrax.AbstractAdjoint),
+    ):
+        if isinstance(value, type) and issubclass(value, kind):
+            raise TypeError(f"`{label}` is an instance, not a class: {label}=diffrax.{value.__name__}().")
+        if value is not None and not isinstance(value, kind):
+            raise TypeError(f"`{label}` is one of diffrax, as diffrax.Tsit5() is a solver; got {value!r}.")
+    for label, value in flags.items():
+        if not isinstance(value, (bool, np.bool_)):
+            raise TypeError(f"`{label}` is True or False, got {value!r}.")
 
 
 def refuse_held(solver: Any, signals: Any) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,6 +13,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .._common.lookup import refuse_unknown
+from .._description.prepared import naming_what_has_no_value
+from .._scalars.jax_internals import ClosedJaxpr, Jaxpr, Literal, bound
 from .._scalars.types import Component, Inputs
 
 
@@ -34,7 +36,8 @@ class Samples(eqx.Module):
         Samples(ts + delay, values, hold=True)
 
     Steps of error control end at the times, so that a motion is as exact as without kinks and jumps, and has its
-    derivative by the times too: by a delay.
+    derivative by the times too: by a delay. So they do where a function of (t, state) calls the samples at t, or at
+    t - delay. Samples of anything but time are refused: that is what `jnp.interp` is for.
 
     Attributes: `ts` (n_t,) [s], `values` (n_t,); `hold`: whether each value lasts until the next.
     """
@@ -58,25 +61,58 @@ class Samples(eqx.Module):
                 raise ValueError(f"Samples: `{label}` are not all finite: fill the gaps, or leave that stretch out.")
 
     def __call__(self, t: Component, state: Any = None) -> Component:
-        # Comparing with every sample is one short vector operation; a bisection is a loop of many small kernels.
+        i = _PLACES["held" if self.hold else "linear"](self.ts, t)
         if self.hold:
-            return self._held(t)
-        i = jnp.clip(jnp.sum(self.ts <= t) - 1, 0, self.ts.shape[0] - 2)
+            return self.values[i]
         t0, t1, x0, x1 = self.ts[i], self.ts[i + 1], self.values[i], self.values[i + 1]
         # On a kink the derivative by a time is that of the right side; that of `jnp.clip` is the mean of both.
         w = (t - t0) / (t1 - t0)
         return x0 + (x1 - x0) * jnp.where(w >= 1.0, jnp.ones_like(w), jnp.where(w < 0.0, jnp.zeros_like(w), w))
-
-    def _held(self, t: Component) -> Component:
-        return self.values[jnp.clip(jnp.sum(self.ts <= t) - 1, 0, self.ts.shape[0] - 1)]
 
 
 class _OnGrid(Samples):
     """Held samples for steps that end at them but for a rounding error: the end of a step is the beginning of the next
     sample, whichever way it was rounded."""
 
-    def _held(self, t: Component) -> Component:
-        return super()._held(t + 1e-4 * (self.ts[1] - self.ts[0]))
+    def __call__(self, t: Component, state: Any = None) -> Component:
+        return self.values[_PLACES["held on a grid"](self.ts, t)]
+
+
+_FEW = 2048  # comparing with so many samples is one short vector operation; a bisection, a loop of small kernels
+
+
+def _count(ts: Array, t: Array) -> Array:
+    return jnp.searchsorted(ts, t, side="right", method="compare_all" if ts.size <= _FEW else "scan")
+
+
+@jax.custom_batching.custom_vmap
+def _count_until(ts: Array, t: Array) -> Array:
+    return _count(ts, t)
+
+
+@_count_until.def_vmap
+def _(size: int, is_batched: Any, ts: Array, t: Array) -> tuple[Array, bool]:
+    if is_batched[0]:
+        return jax.vmap(_count, (0, 0 if is_batched[1] else None))(ts, t), True
+    # Of many times, comparisons would take memory for each sample at each time.
+    return jnp.searchsorted(ts, t, side="right"), True
+
+
+def _place(kind: str) -> Any:
+    """Where a time stands among those of samples; under its name `called_samples` finds it in a traced program."""
+
+    def place(ts: Array, t: Component) -> Array:
+        ts, at = jax.lax.stop_gradient((ts, jnp.asarray(t, ts.dtype)))
+        if kind == "held on a grid":
+            at = at + 1e-4 * (ts[1] - ts[0])
+        return jnp.clip(_count_until(ts, at) - 1, 0, ts.shape[0] - (2 if kind == "linear" else 1))
+
+    place.__name__ = place.__qualname__ = _NAMED + kind
+    return jax.jit(place)
+
+
+_NAMED = "place among samples, "
+_PLACES = {kind: _place(kind) for kind in ("linear", "held", "held on a grid")}
 
 
 def as_signals(inputs: Inputs, names: Sequence[str], ts: Array, system_name: str) -> Any:
@@ -114,7 +150,7 @@ def _as_signal(name: str, value: Any, ts: Array) -> Any:
 
 
 def samples_of(signals: Any) -> list[Samples]:
-    """All signals that are samples."""
+    """The signals that are samples."""
     return [x for x in jax.tree.leaves(signals, is_leaf=_is_samples) if _is_samples(x)]
 
 
@@ -152,13 +188,127 @@ def with_own_times(given: Any) -> Any:
     return jax.tree.map(there, given.signals, is_leaf=_is_samples)
 
 
-def sample_times(signals: Any, dtype: Any) -> tuple[Array, bool] | None:
-    """All times at which some signal has a kink or a jump, in their order, and whether a step that begins at one of
-    them needs a right-hand side of its own: behind a jump, and where two signals may have their kinks at one time and
-    not together. None where there is none."""
-    distinct = {id(x.ts): x.ts.astype(dtype) for x in samples_of(signals)}
-    anew = len(distinct) > 1 or any(x.hold for x in samples_of(signals))
-    return (jnp.sort(jnp.concatenate(list(distinct.values()))), anew) if distinct else None
+class Kinks(NamedTuple):
+    """The `times` at which some signal has a kink or a jump, in their order; whether there are `jumps`; and whether a
+    step that begins at one of them needs a right-hand side of its own (`anew`): behind a jump, and where two signals
+    may have their kinks at one time and not together."""
+
+    times: Array
+    jumps: bool
+    anew: bool
+
+
+def kinks_of(
+    signals: Any, others: Mapping[str, Any], t: Array, y: Array, state_of: Callable[..., Any], fixed: bool
+) -> Kinks | None:
+    """The `Kinks` of signals, with those of the samples that functions call. None where there are none.
+
+    **Arguments:** `others`: functions (t, state) that are no inputs, by what they are called in a message; a time `t`,
+    and a packed state `y` of which `state_of(t, y)` makes what the functions take; `fixed`: whether the steps have one
+    length.
+
+    **Raises:** `ValueError` where the times of samples do not follow from how a function calls them.
+    """
+    named = {} if callable(signals) else signals
+    own = [x for x in named.values() if _is_samples(x)]
+    functions = {_label_of(name): f for name, f in named.items() if callable(f) and not _is_samples(f)}
+    functions |= {_label_of(None): signals} if callable(signals) else {}
+    called = [
+        kink
+        for label, f in {**functions, **others}.items()
+        for kink in _called_samples(label, f, t, y, state_of, fixed)
+    ]
+    distinct = {id(x.ts): x.ts.astype(t.dtype) for x in own}
+    times = [*distinct.values(), *(x.astype(t.dtype) for x, _ in called)]
+    jumps = any(x.hold for x in own) or any(kind != "linear" for _, kind in called)
+    return Kinks(jnp.sort(jnp.concatenate(times)), jumps, jumps or len(times) > 1) if times else None
+
+
+def _called_samples(
+    label: str, f: Any, t: Array, y: Array, state_of: Callable[..., Any], fixed: bool
+) -> list[tuple[Array, str]]:
+    """When the samples act that a function of (t, state) calls, and of which kind they are: those that it calls at
+    t - delay act later by the delay."""
+    arrays = lambda x: [each for each in jax.tree.leaves(x) if eqx.is_array(each)]  # noqa: E731
+    program = jax.make_jaxpr(lambda t, y: arrays(_asked(label, f, t, state_of(t, y))))(t, y)
+    calls: list[_Call] = []
+    _follow(program.jaxpr, [*program.consts, _Shifted(jnp.zeros_like(t)), _MOVING], calls)
+    times: list[tuple[Array, str]] = []
+    for ts, offset, kind in calls:
+        if fixed and kind == "held":
+            raise ValueError(
+                f"{label} calls Samples under a zero-order hold, which steps of one length cannot meet to the last "
+                "digit: give the Samples as the input itself; or leave out `step`, and the steps end where they jump."
+            )
+        if not fixed and offset is None:
+            raise ValueError(
+                f"{label} calls Samples at something else than t or t - delay, so that the steps of integration cannot "
+                "end at their kinks and jumps. Give Samples whose own times are moved or scaled, as "
+                "jaxkane.Samples(0.5 * ts + delay, values)(t); for a table over anything but time use jnp.interp."
+            )
+        if offset is not None:
+            earlier = jnp.expand_dims(offset, -1)  # of a batch: one for each of its members
+            shape = jnp.broadcast_shapes(ts.shape, earlier.shape)
+            times.append((jnp.ravel(jnp.broadcast_to(ts, shape) - jnp.broadcast_to(earlier, shape)), kind))
+    return times
+
+
+class _Shifted(NamedTuple):
+    """In a traced program: t + `offset`."""
+
+    offset: Any
+
+
+_MOVING = object()  # in a traced program: any other number that follows from the time or the state
+
+
+class _Call(NamedTuple):
+    """That samples of the times `ts` and of this `kind` are called at t + `offset`; None for any other time."""
+
+    ts: Any
+    offset: Any
+    kind: str
+
+
+def _follow(program: Any, inputs: list[Any], calls: list[_Call]) -> list[Any]:
+    """What a traced program makes of its inputs, each a number that is known, `_Shifted` or `_MOVING`; the samples that
+    it calls are added to `calls`."""
+    values = dict(zip([*program.constvars, *program.invars], inputs, strict=True))
+    for equation in program.eqns:
+        xs = [x.val if isinstance(x, Literal) else values[x] for x in equation.invars]
+        operation, name = equation.primitive.name, str(equation.params.get("name", ""))
+        is_known = [x is not _MOVING and not isinstance(x, _Shifted) for x in xs]
+        ys: Any = [_MOVING] * len(equation.outvars)
+        if all(is_known) and not equation.effects:
+            ys = bound(equation, xs)
+            ys = ys if equation.primitive.multiple_results else [ys]
+        elif name.startswith(_NAMED):
+            offset = xs[1].offset if isinstance(xs[1], _Shifted) and is_known[0] else None
+            calls.append(_Call(xs[0], offset, name.removeprefix(_NAMED)))
+        elif operation in _SHIFTS and is_known.count(False) == 1 and isinstance(xs[is_known.index(False)], _Shifted):
+            if operation != "sub" or not is_known[0]:
+                ys = [_Shifted(bound(equation, [x.offset if isinstance(x, _Shifted) else x for x in xs]))]
+        else:
+            for inner in _programs_in(equation.params):
+                n = len(inner.jaxpr.invars)
+                passed = xs[1:] if operation == "cond" else xs
+                if operation in ("scan", "while") or len(passed) != n:
+                    passed = [_MOVING] * n
+                results = _follow(inner.jaxpr, [*inner.consts, *passed], calls)
+                ys = results if operation != "cond" and len(results) == len(ys) else ys
+        values |= zip(equation.outvars, ys, strict=True)
+    return [x.val if isinstance(x, Literal) else values[x] for x in program.outvars]
+
+
+_SHIFTS = ("add", "sub", "convert_element_type", "broadcast_in_dim", "reshape", "squeeze", "copy")
+
+
+def _programs_in(params: Mapping[str, Any]) -> list[Any]:
+    """The programs that an equation of a traced program runs."""
+    values = [x for value in params.values() for x in (value if isinstance(value, (tuple, list)) else [value])]
+    return [
+        x if isinstance(x, ClosedJaxpr) else ClosedJaxpr(x, ()) for x in values if isinstance(x, (ClosedJaxpr, Jaxpr))
+    ]
 
 
 def for_fixed_steps(signals: Any) -> Any:
@@ -199,6 +349,15 @@ def _plain(signals: Any) -> Any:
 def evaluate(signals: Any, t: Component, state: Any) -> dict[str, Component]:
     """The inputs' values at one time."""
     if callable(signals):
-        values: Any = signals(t, state)
+        values: Any = _asked(_label_of(None), signals, t, state)
         return dict(values)
-    return {name: signal(t, state) if callable(signal) else signal for name, signal in signals.items()}
+    return {name: _asked(_label_of(name), f, t, state) if callable(f) else f for name, f in signals.items()}
+
+
+def _label_of(name: str | None) -> str:
+    return "The function of the inputs" if name is None else f"The input {name!r}"
+
+
+def _asked(label: str, f: Any, t: Component, state: Any) -> Any:
+    with naming_what_has_no_value(label):
+        return f(t, state)

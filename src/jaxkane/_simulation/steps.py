@@ -19,7 +19,7 @@ from .by_error import ByError
 from .events import Events, watched
 from .kinks import ToKinks
 from .settings import Settings
-from .signals import sample_times
+from .signals import Kinks
 from .stops import AdaptiveToStops, Limits, Quantities, ToStops
 
 
@@ -67,7 +67,7 @@ def controller_of(
     vector_field: Callable[..., Array],
     events: Events,
     system: System,
-    signals: Any,
+    kinks: Kinks | None,
     settings: Settings,
 ) -> ToStops:
     """The controller of the steps, which ends the motion: at the last time, at the events, and before the dependent
@@ -78,7 +78,6 @@ def controller_of(
 
     controller: Any = ByError(times.tolerance)  # pyright: ignore[reportCallIssue]
     kind: Any = AdaptiveToStops
-    kinks = sample_times(signals, times.end.dtype)
     first = times.first
     if settings.step is not None:
         # A fixed step is spread evenly over the whole time: a rounding error must not make it one step more, after
@@ -86,6 +85,6 @@ def controller_of(
         first = (1.0 + jnp.finfo(times.end.dtype).eps ** 0.5) * settings.step
         controller, kind = diffrax.ConstantStepSize(), ToStops
     elif kinks is not None:
-        controller = ToKinks(controller, *kinks, end=times.end)
+        controller = ToKinks(controller, kinks.times, kinks.anew, end=times.end)
     stops = events.names or system.dependent_speeds
     return kind(controller, watch if stops else None, first, Limits(events.directions, times.end, times.numbers))

@@ -52,7 +52,7 @@ class Simulation:
         solver = diffrax.Bosh3() if fixed else diffrax.Tsit5()
         return settings_for(
             t,
-            rtol=1e-6 if self.rtol is None else self.rtol,
+            rtol=None if fixed else 1e-6 if self.rtol is None else self.rtol,
             atol=self.atol,
             solver=solver if self.solver is None else self.solver,
             step=1.0 if fixed else None,
