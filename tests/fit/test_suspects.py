@@ -6,6 +6,7 @@ import types
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from systems import Track
 
 import jaxkane as jk
 from jaxkane.fit import (
@@ -25,6 +26,7 @@ from jaxkane.fit import (
     suspects,
 )
 from jaxkane.fit._analysis.candidates import groups_of
+from jaxkane.fit._analysis.score import bic_change
 
 TS = np.linspace(0.0, 2.0, 41)
 NOISE = {"angle": 0.004, "rate": 0.02}
@@ -299,3 +301,46 @@ def test_a_delay_of_what_is_held_is_asked_by_itself(held):
     asked = [Candidate("a", "mass"), Candidate("late", Delay("push")), Candidate("b", "stiffness")]
     groups = [[c.name for c in group] for group in groups_of(types.SimpleNamespace(problem=problem), asked)]
     assert groups == ([["a", "b"], ["late"]] if held else [["a", "late", "b"]])
+
+
+class Squared(Track):
+    """What is pushed acts by its square: neither system is a part of the other."""
+
+    def loads(self, t, q, u, motion, inputs):
+        return super().loads(t, q, u, motion, {"push": inputs["push"] ** 2})
+
+
+def test_the_criterion_of_what_is_not_nested():
+    """By hand, n log(after / before) + k log n; residuals that correlate are fewer."""
+    rtol = 1e-12
+    assert bic_change(3836.0, 455.0, 0, 400, 0.0) == pytest.approx(400 * np.log(455 / 3836), rel=rtol)
+    assert bic_change(100.0, 99.0, 2, 400, 0.0) == pytest.approx(400 * np.log(0.99) + 2 * np.log(400), rel=rtol)
+    assert bic_change(100.0, 90.0, 2, 400, 0.5) == pytest.approx(400 / 3 * np.log(0.9) + 2 * np.log(400 / 3), rel=rtol)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("n", "criterion"), [(4, "trials left out"), (1, "BIC")])
+def test_what_is_not_nested_is_no_matter_of_an_f_test(n, criterion):
+    """Another system without one parameter more, beside what is promising, with one refit."""
+    rng, times, trials = np.random.default_rng(7), np.linspace(0.0, 3.0, 31), []
+    for i in range(n):
+        push = 2.0 * np.sin(2.0 * times + i)
+        ride = jk.simulate(Squared(gain=1.5, drift=-0.4), jk.State({"x": 0.2}, {"x_dot": 0.0}), jnp.asarray(times),
+                           {"push": jnp.asarray(push)}, step=0.05)  # fmt: skip
+        x = np.asarray(ride["x"]) + rng.normal(0.0, 0.05, times.size)
+        trials.append(Trial(times, {"x": x}, {"push": push}, sigma=0.05, initial={"x": 0.2}, name=f"push {i}"))
+    posed = {"optimizer": LeastSquares(), "simulation": Simulation(step=0.1)}
+    right, wrong = (fit(system, trials, ["gain", "drift"], **posed) for system in (Squared(), Track()))
+    asked = [Candidate("squared", system=Squared()), Offset("x"), Offset("push")]
+    found = suspects(wrong, asked, refits=1)
+    row = next(row for row in found.rows if row.name == "squared")
+    assert row.cost == pytest.approx(right.cost, rel=1e-4)
+    assert row.cost < 0.1 * wrong.cost
+    assert (row.criterion, row.verdict, np.isnan(row.p)) == (criterion, "stands", True)
+    assert found.taken == ("squared",)
+    assert f"squared (not nested: by {criterion})" in found.conclusion
+    assert criterion in str(found)
+    back = suspects(right, Candidate("not squared", system=Track()))
+    assert not back.taken
+    assert back.rows[0].criterion == criterion
+    assert suspects(wrong, asked, refits=0).rows[-1].verdict == "not nested, not fitted"

@@ -198,9 +198,9 @@ def _system_of(fit: Fit, candidates: Sequence[Candidate]) -> System:
         other = candidate.system
         if other is None or bool(eqx.tree_equal(other, system)):
             continue
-        if not isinstance(other, type(system)) and isinstance(system, type(other)):
-            continue  # the one there has what this one has
-        if not isinstance(other, type(system)) and system is not fit.problem.system:
+        if system is not fit.problem.system and not isinstance(other, type(system)):  # that of a candidate before
+            if isinstance(system, type(other)):
+                continue  # the one there has what this one has
             raise ValueError(f"{candidate.name}: {type(other).__name__} is no {type(system).__name__}.")
         system = other
     return system

@@ -158,6 +158,13 @@ def independent_share(correlation: float) -> float:
     return (1 - c) / (1 + c)
 
 
+def bic_change(before: float, after: float, more: int, n: int, correlation: float) -> float:
+    """By how much a model with `more` unknowns changes the Bayesian information criterion (Schwarz 1978) of n residuals
+    of unknown variance, nested or not: below zero it is the better one."""
+    n_independent = max(independent_share(correlation) * n, 1.0)
+    return float(n_independent * np.log(max(after, 1e-300) / max(before, 1e-300)) + more * np.log(n_independent))
+
+
 def chance(drop: float, k: int, least: float, freedom: int, correlation: float) -> float:
     """The probability that k unknowns which mean nothing lower a sum of squares by `drop` to `least` (Fisher's F)."""
     if freedom <= 0 or k == 0 or not drop > 0:

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from .._result.result import Fit
 from .._result.tables import plain, table
 
-HEAD = ("candidate", "estimate", "std. error", "promised", "fitted", "p", "left out", "verdict")
+HEAD = ("candidate", "estimate", "std. error", "promised", "fitted", "p", "criterion", "left out", "verdict")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -20,7 +20,9 @@ class Suspect:
     - `parameters`: what it frees; `values`: by name, of these and of all that was free; `errors`: of these. Fitted
         where `cost` is a number, else as the linearization has them.
     - `promised`, `cost`: the sum of squares by the linearization, and fitted (NaN where it was not). `p`: the
-        probability that chance promises as much.
+        probability that chance promises as much, of what is nested. `criterion`: what decides beside the trials left
+        out: "score test" before it is fitted, "F test" or "Wald test" after; of what is not nested "trials left out"
+        alone, or "BIC" where none can be left out.
     - `predicted`: the sum of squares of trials that are left out in turn; unknowns of the trials' own, which those that
         are left out find too, count twice the variance of a residual each.
     - `objections`: what is not plausible, in words. `verdict`: why it does not stand, or "stands"; `stands`.
@@ -33,6 +35,7 @@ class Suspect:
     promised: float = math.nan
     cost: float = math.nan
     p: float = math.nan
+    criterion: str = ""
     predicted: float = math.nan
     objections: tuple[str, ...] = ()
     verdict: str = ""
@@ -50,8 +53,8 @@ class Suspect:
         known = [name for name in self.parameters if not math.isnan(self.errors[name])]
         estimates = ", ".join(f"{self.values[name]:.4g}" for name in known)
         errors = ", ".join(f"{self.errors[name]:.2g}" for name in known)
-        numbers = (number(self.promised), number(self.cost), number(self.p, ".2g"), number(self.predicted))
-        return (self.name, estimates, errors, *numbers, self.verdict)
+        tested = (number(self.promised), number(self.cost), number(self.p, ".2g"), self.criterion)
+        return (self.name, estimates, errors, *tested, number(self.predicted), self.verdict)
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -96,7 +99,9 @@ class Suspects:
         if not self.taken:
             return f"Nothing is taken: no candidate stands at a level of {self.level:g}."
         left = "" if math.isnan(self.left_out[0]) else f" (of trials left out: {self.left_out[0]:.5g} before)"
-        return f"Taken: {', '.join(self.taken)}. Sum of squares {self.before.cost:.6g} -> {self.fit.cost:.6g}{left}."
+        best = zip(self.taken, self.rounds, strict=False)
+        taken = [f"{name} (not nested: by {r[0].criterion})" if math.isnan(r[0].p) else name for name, r in best]
+        return f"Taken: {', '.join(taken)}. Sum of squares {self.before.cost:.6g} -> {self.fit.cost:.6g}{left}."
 
     def __str__(self) -> str:
         parts = [

@@ -43,18 +43,23 @@ def suspects(
     chance promises as much. Residuals that are correlated count as what they are (see the page on identification).
     The most promising ones are then fitted, together with all that is free, from the same compiled program.
 
-    A candidate stands where (1) chance promises so much with a probability below `level`, over all candidates
-    together (Bonferroni); (2) fitted, it keeps that; (3) no parameter becomes implausible, its own or one that was
-    free; (4) trials that are left out in turn are predicted better with it. Of those that stand, the one that predicts
-    best is taken; with `depth` above one the others are tried again beside it, and so on, until none stands.
+    A nested candidate, which changes nothing where it starts, stands where (1) chance promises so much with a
+    probability below `level`, over all candidates together (Bonferroni); (2) fitted, it keeps that; (3) no parameter
+    becomes implausible, its own or one that was free; (4) trials left out in turn are predicted better with it.
+    Of those that stand, the one that predicts best is taken; with `depth` above one the others are tried again beside
+    it, and so on, until none stands.
+
+    What is not nested, as another system whose motion differs from the start, promises nothing before it is fitted, and
+    always is, besides the `refits`. In the place of (1) nothing is asked where trials can be left out, and where there
+    is one alone, whether the Bayesian information criterion is lower. The `criterion` of each says what decided.
 
     **Arguments:**
 
     - `fit`: one that has converged. `candidates`: a list of names of parameters, `Free`, `Gain`, `Offset`, `Delay`,
         `Inertia`, and `Candidate`, which may be several of these together, what every trial has its own of, or another
         system. Each starts where it is neutral.
-    - `depth`: how many may be taken, one after the other. `refits`: how many are fitted in each round; None for all
-        that the data can distinguish. `level`: of the test.
+    - `depth`: how many may be taken, one after the other. `refits`: how many that are nested are fitted in each round;
+        None for all that the data can distinguish, 0 for none at all. `level`: of the test.
     - `plausible`: by name, (lower, upper), or a share of the start such as 0.2. Else what `Candidate.plausible` says,
         three deviations of a prior, and a factor of 2.5 from a start that is not zero. A `Free` with bounds that starts
         on one of them, as friction at zero, is searched for on both sides and believed on one.

@@ -18,7 +18,7 @@ from .._result.result import Fit
 from .candidates import Candidate, groups_of
 from .extended import Extended, extended
 from .plausible import Plausible, plausible_of
-from .score import beside_zero, chance, independent_share, is_clustered, score, solved
+from .score import beside_zero, bic_change, chance, independent_share, is_clustered, score, solved
 from .standing import Folds, Standing, rows_of, without_priors
 from .suspected import Suspect
 
@@ -46,10 +46,11 @@ class Trying:
         promises = [promise for group in groups_of(self.fit, left) for promise in self._linearized(group, bar)]
         rows, found = {promise.row.name: promise.row for promise in promises}, {}
         able = [h for h in promises if h.extended is not None and not h.row.verdict]
+        nested, others = ([h for h in able if h.nested is nested] for nested in (True, False))
         if refits is not None:
-            able = [h for h in able if not h.nested or h.row.p < self.share]
-            able = sorted(able, key=lambda h: (bool(h.objections), h.row.promised))[:refits]
-        for promise in able:
+            nested = [h for h in nested if h.row.p < self.share]
+            nested = sorted(nested, key=lambda h: (bool(h.objections), h.row.promised))[:refits]
+        for promise in nested + (others if refits != 0 else []):  # what is not nested promises nothing before its fit
             bar.set_postfix_str(promise.row.name)
             rows[promise.row.name], after = self._fitted(promise)
             found |= {} if after is None else {promise.row.name: after}
@@ -110,6 +111,7 @@ class Trying:
             errors=_errors(row_names, slopes[np.ix_(new, new)], found.covariance),
             promised=was.cost - found.drop if nested else float("nan"),
             p=found.p if nested else float("nan"),
+            criterion="score test" if nested else "",
             predicted=left_out,
             verdict=_undetermined(more, new, found) if nested else "",
         )
@@ -137,9 +139,15 @@ class Trying:
             rows, range(n), range(n, len(found.names)), freedom=was.freedom, more=count, correlation=after.correlation
         )
         slopes = np.asarray(slopes_of(problem.parameters, found.point.x))
-        p = chance(was.cost - after.cost, k, after.cost, after.freedom, after.correlation)
-        if not count and is_clustered(rows, k, after.correlation):
-            p = beside_zero(np.asarray(found.point.x - start.x)[n:], now.covariance, len(rows.data))
+        p, criterion, verdict = float("nan"), "trials left out", ""
+        if promise.nested:
+            p, criterion = chance(was.cost - after.cost, k, after.cost, after.freedom, after.correlation), "F test"
+            if not count and is_clustered(rows, k, after.correlation):
+                p = beside_zero(np.asarray(found.point.x - start.x)[n:], now.covariance, len(rows.data))
+                criterion = "Wald test"
+        elif self.folds is None:
+            change, criterion = bic_change(was.cost, after.cost, k, self.fit.problem.size[0], after.correlation), "BIC"
+            verdict = "" if change < 0 else f"its BIC is higher by {change:.3g}"
         before = set(common.plausible.objections(was.values))
         row = dataclasses.replace(
             row,
@@ -147,6 +155,8 @@ class Trying:
             errors=_errors(found.names[n:], slopes[n:, n:], now.covariance),
             cost=after.cost,
             p=p,
+            criterion=criterion,
+            verdict=verdict,
             predicted=after.left_out(self.folds) + _own_share(count, after.cost, after.freedom, after.correlation),
             objections=tuple(o for o in common.plausible.objections(after.values) if o not in before),
         )
@@ -163,8 +173,9 @@ class Trying:
         doubts = (
             (bool(row.verdict), row.verdict),
             (not np.isnan(row.p) and row.p >= self.share, "no more than chance"),
+            (not fitted and np.isnan(row.p), "not nested, not fitted"),
             (not fitted, "promising, not fitted"),
-            (fitted and not row.cost < was.cost, "its fit does not keep what it promises"),
+            (fitted and not row.cost < was.cost, "its fit lowers nothing"),
             (bool(row.objections), f"not plausible: {', '.join(row.objections)}"),
             (row.predicted >= was.left_out(self.folds), "does not predict trials left out"),
         )
