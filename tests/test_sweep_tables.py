@@ -7,9 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import Array, Float
 
 import jaxkane as jk
 from jaxkane.catalog import DoublePendulum, WhippleBicycle
+from jaxkane.sweep._members import Row, members_of
 
 PENDULUM = DoublePendulum(mass=1.0, length=1.0)
 REST = jk.State(np.zeros(2), np.zeros(2))
@@ -121,6 +123,23 @@ def test_sweeps_have_derivatives():
         ({"mass": [None, 2.0]}, ValueError, "'mass' must hold a row of numbers"),
         ({"mass": 3.0}, ValueError, "'mass' must hold a row of numbers"),
         ({"rider": ["a", "b"]}, ValueError, "are text, which labels a member and changes nothing"),
+        (
+            {"mass": ["1.0", "2.0"], "theta1": [0.1, 0.2]},
+            ValueError,
+            "'mass' is text, .* of that name .parameter",
+        ),
+        ({"theta1": ["a", "b"], "mass": [1.0, 2.0]}, ValueError, "'theta1' is text, .* of that name .coordinate"),
+        (
+            {"elbow_torque": ["1", "2"], "mass": [1.0, 2.0]},
+            ValueError,
+            "'elbow_torque' is text, .* of that name .input",
+        ),
+        ({"mass": [1.0 + 2.0j, 2.0]}, ValueError, "'mass' must hold a row of numbers"),
+        (
+            {"mass": np.array(["2020-01-01", "2020-01-02"], "datetime64[s]")},
+            ValueError,
+            "'mass' must hold a row of num",
+        ),
         ([1.0, 2.0], TypeError, "a dict of columns or a DataFrame, got list"),
         ({}, ValueError, "no columns"),
     ],
@@ -128,6 +147,66 @@ def test_sweeps_have_derivatives():
 def test_tables_that_are_refused(table, error, message):
     with pytest.raises(error, match=message):
         jk.sweep.sweep(PENDULUM, REST, TS, table=table)
+
+
+class Anchored(jk.System):
+    """A particle at a vector (3,) from the origin of its line, on a spring."""
+
+    mass: jk.Scalar = jk.parameter(1.0)
+    x: jk.Scalar = jk.parameter(1.0)  # the spring's length, called as the coordinate
+    anchor: Float[Array, " 3"] = jk.parameter((0.0, 0.0, 0.0), shape=(3,))
+    coordinates, speeds = ("x",), ("v",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(self.mass, 0.0, O.moving(q[0] * N.x, u[0] * N.x))])
+
+    def loads(self, t, q, u, motion, inputs):
+        a, b, c = (self.anchor[i] for i in range(3))
+        return [jk.Force((a + 2.0 * b + 3.0 * c - q[0]) * motion.N.x, motion.bodies[0])]
+
+
+ANCHORED = jk.State(np.zeros(1), np.zeros(1))
+
+
+def test_one_array_may_be_a_batch_and_a_vector_that_all_share():
+    both = jnp.array([1.0, 2.0, 4.0])
+    system = Anchored(mass=both, anchor=both)
+    assert system.mass is system.anchor
+    members, shared, n = members_of(system, ANCHORED, None, None, jnp.asarray(TS))
+    assert n == 3
+    assert members[0].anchor is None
+    np.testing.assert_array_equal(members[0].mass, both)
+    np.testing.assert_array_equal(shared[0].anchor, both)
+
+
+def test_a_column_that_has_two_meanings_is_refused():
+    with pytest.raises(ValueError, match=r"'x' names more than one number \(parameter, coordinate\)"):
+        jk.sweep.sweep(Anchored(), ANCHORED, TS, table={"x": [1.0, 2.0]})
+
+
+@pytest.mark.parametrize(
+    "read",
+    [
+        lambda row: row.get("push"),
+        lambda row: (lambda push: push)(**row),
+        lambda row: {**row}["push"],
+        lambda row: dict(row.items())["push"],
+        lambda row: next(iter(row.values())),
+    ],
+)
+def test_a_row_may_be_read_as_any_mapping(read):
+    row = Row({"push": 1.0})
+    assert "push" in row
+    assert not row.read
+    assert read(row) == 1.0
+    assert row.read == {"push"}
+
+
+def test_a_row_that_is_unpacked_is_read():
+    start = lambda system, row: jk.State(jnp.stack([dict(**row)["push"], row.get("other", 0.0)]), jnp.zeros(2))  # noqa: E731
+    table = jk.sweep._table.as_table({"push": [0.1, 0.2]})
+    assert members_of(PENDULUM, start, None, table, jnp.asarray(TS))[2] == 2
 
 
 def test_grids_that_are_refused():

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import itertools
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -23,18 +24,41 @@ from ._table import Table
 Tree = Any
 
 
-class Row(dict):
+class Row(Mapping[str, Any]):
     """One member's numbers by name, for the functions that a user gives; it records which names were read."""
 
-    def __init__(self, values: dict[str, Any]):
-        super().__init__(values)
+    def __init__(self, columns: dict[str, Any]):
+        self.columns = columns
         self.read: set[str] = set()
 
     def __getitem__(self, name: str) -> Any:
-        if name not in self:
-            raise not_there(name, self, "the columns of the sweep's table")
+        if name not in self.columns:
+            raise not_there(name, self.columns, "the columns of the sweep's table")
         self.read.add(name)
-        return super().__getitem__(name)
+        return self.columns[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.columns
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.columns)
+
+    def __len__(self) -> int:
+        return len(self.columns)
+
+    def __repr__(self) -> str:
+        return f"Row({', '.join(self.columns)})"
+
+    def of(self, names: Iterable[str]) -> dict[str, Any]:
+        """The numbers that take their place by name, which no function need read."""
+        return {name: self.columns[name] for name in names if name in self.columns}
+
+
+class _Leaf:
+    """A number of a tree with an identity of its own: one array may stand in two places."""
+
+    def __init__(self, x: Any):
+        self.x = x
 
 
 def members_of(system: Any, state: Any, inputs: Inputs, table: Table | None, ts: Any) -> tuple[Tree, Tree, int]:
@@ -46,9 +70,10 @@ def members_of(system: Any, state: Any, inputs: Inputs, table: Table | None, ts:
     _refuse_twice(columns, system, inputs)
     signals = inputs if callable(inputs) else _signals(inputs, system, columns, ts)
     tree = (system, state, signals, columns)
-    is_member = _batches(tree)
-    members, shared = eqx.partition(tree, jax.tree.map(lambda x: id(x) in is_member, tree))
-    lengths = {is_member[id(x)]: x.shape[0] for x in jax.tree.leaves(members)}
+    places = jax.tree.map(_Leaf, tree)
+    batches = _batches(places)
+    members, shared = eqx.partition(tree, jax.tree.map(lambda leaf: leaf in batches, places))
+    lengths = {name: leaf.x.shape[0] for leaf, name in batches.items()}
     if table is not None and not columns:
         lengths["table"] = len(table)
     if not jax.tree.leaves(members):
@@ -65,7 +90,7 @@ def members_of(system: Any, state: Any, inputs: Inputs, table: Table | None, ts:
     if len(set(lengths.values())) > 1:
         listed = ", ".join(f"{name} ({n})" for name, n in lengths.items())
         raise ValueError(f"sweep: the batches differ in length: {listed}.")
-    _check(members, shared, ts[0])
+    _check(members, shared, ts[0], table)
     _check_description(members, shared, ts[0])
     return members, shared, next(iter(lengths.values()))
 
@@ -89,7 +114,7 @@ def _system(system: Any, row: Row) -> tuple[System, dict[str, Any]]:
     """The system of a row, and the parameters that were set by name."""
     if not isinstance(system, System):
         system = system(row)
-    given = {name: dict.__getitem__(row, name) for name, _, _ in parameters_in(system) if name in row}
+    given = row.of(name for name, _, _ in parameters_in(system))
     return with_parameters(system, given), given
 
 
@@ -97,7 +122,7 @@ def _start(system: Any, state: Any, row: Row, t: Any) -> State:
     system, parameters = _system(system, row)
     state = as_state(system, state if isinstance(state, State) else state(system, row))
     groups = (system.coordinates, system.speeds, system.states)
-    q, u, x = ({n: dict.__getitem__(row, n) for n in names if n in row} for names in groups)
+    q, u, x = map(row.of, groups)
     parts = zip((state.q, state.u, state.x), (q, u, x), groups, strict=True)
     state = State(*(_set(values, given, names) for values, given, names in parts))
     if system.dependent_coordinates and (q or parameters):  # they follow from the others
@@ -111,7 +136,7 @@ def _set(values: Any, given: dict[str, Any], names: tuple[str, ...]) -> Any:
     return values
 
 
-def _check(members: Tree, shared: Tree, t: Any) -> None:
+def _check(members: Tree, shared: Tree, t: Any, table: Table | None) -> None:
     """Make one member in the abstract, and refuse what does not fit."""
 
     def trial(own):
@@ -125,11 +150,29 @@ def _check(members: Tree, shared: Tree, t: Any) -> None:
     seen: list[Any] = []
     jax.eval_shape(trial, jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), members))
     system, signals, row = seen[0]
-    parameters = (name for name, _, _ in parameters_in(system))
-    applied = set(row) & {*parameters, *system.coordinates, *system.speeds, *system.inputs}
-    applied |= set(row) & {*system.states}
-    applied -= set(system.dependent_coordinates)
     name = type(system).__name__
+    known = {
+        "parameter": [name for name, _, _ in parameters_in(system)],
+        "coordinate": system.coordinates,
+        "speed": (*system.speeds, *system.dependent_speeds),
+        "input": system.inputs,
+        "state": system.states,
+    }
+    for column in table.columns if table is not None else ():
+        kinds = [kind for kind, names in known.items() if column in names]
+        if len(kinds) > 1:
+            raise ValueError(
+                f"sweep: {name}: {column!r} names more than one number ({', '.join(kinds)}), and which of them the "
+                "column means cannot be known. Give it another name, and read that in `state` as a function of "
+                "(system, row), or in `system` as a function of (row)."
+            )
+        if kinds and column not in row:
+            raise ValueError(
+                f"sweep: the column {column!r} is text, and {name} has a number of that name ({kinds[0]}). "
+                "Numbers that were read as text are converted by numpy.asarray(column, float); labels have other names."
+            )
+    applied = row.of(itertools.chain(*known.values())).keys()
+    applied -= {*system.dependent_coordinates, *system.dependent_speeds}
     if callable(signals) and applied & set(system.inputs):
         listed = ", ".join(sorted(applied & set(system.inputs)))
         raise ValueError(f"sweep: {listed} is a column of the table, and `inputs` is a function that gives it too.")
@@ -192,21 +235,25 @@ def _refuse_twice(columns: dict[str, Any], system: Any, inputs: Inputs) -> None:
         raise ValueError(f"sweep: given twice: {listed}. Leave one of them out.")
 
 
-def _batches(tree: Tree) -> dict[int, str]:
-    """Name of every leaf that has a leading axis of members, by its identity."""
-    system, state, signals, columns = tree
-    found = {id(column): name for name, column in columns.items()}
+def _batches(places: Tree) -> dict[_Leaf, str]:
+    """The leaves that have a leading axis of members, with their names."""
+    system, state, signals, columns = places
+    found = {column: name for name, column in columns.items()}
     if isinstance(system, System):
-        for name, value, info in parameters_in(system):
-            if np.ndim(value) == len(info.shape) + 1:
-                found[id(value)] = name
+        for name, leaf, info in parameters_in(system):
+            if isinstance(leaf, _Leaf) and np.ndim(leaf.x) == len(info.shape) + 1:
+                found[leaf] = name
     if isinstance(state, State):
-        for name, value in (("q", state.q), ("u", state.u), ("x", state.x)):
-            if value is not None and np.ndim(value) == 2:
-                found[id(value)] = f"state.{name}"
+        for name, leaf in (("q", state.q), ("u", state.u), ("x", state.x)):
+            if isinstance(leaf, _Leaf) and np.ndim(leaf.x) == 2:
+                found[leaf] = f"state.{name}"
     if isinstance(signals, dict):
         for name, signal in signals.items():
-            values = signal.values if isinstance(signal, Samples) else signal
-            if isinstance(values, jax.Array) and values.ndim == (2 if isinstance(signal, Samples) else 1):
-                found[id(values)] = name
+            leaf = signal.values if isinstance(signal, Samples) else signal
+            if (
+                isinstance(leaf, _Leaf)
+                and isinstance(leaf.x, jax.Array)
+                and leaf.x.ndim == (2 if isinstance(signal, Samples) else 1)
+            ):
+                found[leaf] = name
     return found

@@ -56,7 +56,7 @@ def sweep(
     - `inputs`: as for `simulate`; samples may be (b, n_t), and numbers that differ from member to member (b, 1).
     - `table`: what differs, by name: `grid(...)`, a dict of columns (b,) or a DataFrame. Columns that are called as
         parameters, coordinates, independent speeds or inputs of the system take their place, and coordinates that
-        depend on the others are found anew (`assemble`). Columns of text are labels.
+        depend on the others are found anew (`assemble`). Columns of text are labels, which have names of their own.
     - `state` may be a function (system, row) -> State, and `system` a function (row) -> System, for columns with
         other names: `lambda bicycle, row: assemble(bicycle, {}, {"rear_wheel_rate": -row["speed"] / bicycle.rR})`. They
         are compiled, with `system` as this member has it.

@@ -103,6 +103,8 @@ def _column(name: str, values: Any) -> np.ndarray:
         if column.dtype.kind in "OUST":
             is_text = column.ndim == 1 and all(isinstance(x, str) for x in column)
             return column.astype(str) if is_text else _refuse(name, values)
+        if column.dtype.kind not in "buif":
+            return _refuse(name, values)  # complex numbers would lose a part, dates become counts of nanoseconds
         column = column.astype(float)
     except (TypeError, ValueError):
         return _refuse(name, values)
