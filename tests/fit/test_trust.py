@@ -221,9 +221,14 @@ def test_samplers_find_the_laplace_approximation(package):
 def test_priors_are_weighed_and_told(problem, result):
     told = minimize(problem.with_priors({"mass": (1.0, 1e-4), "other": (0.0, 1.0)}), LeastSquares(), start=result.point)
     assert told.estimates["mass"] == pytest.approx(1.0, abs=5e-4)
-    assert told.standard_errors["mass"] == pytest.approx(1e-4 * told.variance**0.5, rel=0.01)
-    # By trial, a prior is a measurement of its own, of the deviation that it was given.
-    assert told.clustered_errors["mass"] == pytest.approx(1e-4, rel=0.05)
+    # A prior is a measurement of its own, of the deviation that it was given, however large residuals are.
+    assert told.variance > 4
+    for error in (
+        told.standard_errors["mass"],
+        told.clustered_errors["mass"],
+        np.std(laplace(told).sample(4000)["mass"]),
+    ):
+        assert error == pytest.approx(1e-4, rel=0.05)
     assert any("mass is known by its prior alone" in note for note in told.notes)
 
 

@@ -50,8 +50,7 @@ class Comparison:
         for name in names:
             cells = []
             for fit in self.fits.values():
-                errors = fit.clustered_errors if fit.robust else fit.standard_errors
-                cells.append(f"{fit.estimates[name]:.5g} ({errors[name]:.2g})" if name in fit.names else "")
+                cells.append(f"{fit.estimates[name]:.5g} ({fit.errors[name]:.2g})" if name in fit.names else "")
             rows.append([f"{name} [{units[name]}]" if units[name] else name, *cells])
         return rows
 

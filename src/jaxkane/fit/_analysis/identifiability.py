@@ -1,4 +1,4 @@
-"""What data determine before anything is fitted to them. Knows how to find the nuisance values."""
+"""What data will determine, before anything is fitted to them or measured. Knows how to find the nuisance values."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from .._result.identifiability import Identifiability, identifiability_at
 
 
 def identifiability(problem: Problem, *, flat: float = 0.5, at: Unknowns | None = None) -> Identifiability:
-    """Which parameters, or combinations of them, the data determine; of a `Fit`, `fit.identifiability` says it.
+    """Which parameters, or combinations of them, the data determine if their noise is as `sigma` says, whatever they
+    are: a plan with simulated measurements will do. Of a `Fit`, `fit.identifiability` says it by the residuals left.
 
         identifiability(Problem.of(system, trials, free, unknown=("roll",)))
 
@@ -29,4 +30,4 @@ def identifiability(problem: Problem, *, flat: float = 0.5, at: Unknowns | None 
     """
     refuse_other(problem, Problem, "identifiability", "identifiability(fit.problem), or fit.identifiability")
     point, linearization = solve_nuisance(problem, problem.start if at is None else at)
-    return identifiability_at(problem, point, linearization, flat)
+    return identifiability_at(problem, point, linearization, flat, given=True)

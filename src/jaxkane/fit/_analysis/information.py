@@ -16,6 +16,7 @@ from .._data.windows import Windows
 from .._problem.model import Model, Unknowns
 from .._problem.problem import Problem
 from .._problem.programs import by_next, each, jacobian_of, starts_of
+from .._result.covariance import infinite_along
 
 Goal = Callable[[Any, Model, Windows], tuple[Array, tuple[Array, Windows, Array]]]
 """Of coefficients, model and windows: the criterion, and with it the information about the scaled parameters (p, p),
@@ -100,11 +101,7 @@ def covariance_of(information: np.ndarray) -> np.ndarray:
     """Its inverse (p, p), infinite for parameters of which it says nothing."""
     s, V = np.linalg.eigh(information)
     known = s > 1e-11 * s.max()
-    covariance = (V[:, known] / s[known]) @ V[:, known].T
-    unknown = np.any(np.abs(V[:, ~known]) > 1e-5, axis=1)
-    covariance[unknown, :] = covariance[:, unknown] = np.nan
-    covariance[unknown, unknown] = np.inf
-    return covariance
+    return infinite_along((V[:, known] / s[known]) @ V[:, known].T, V[:, ~known].T)
 
 
 def _without(N: Array, n: int) -> Array:

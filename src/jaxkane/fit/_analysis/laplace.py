@@ -70,12 +70,12 @@ def laplace(fit: Fit) -> Laplace:
             f"This is no minimum ({fit.status}): a step would lower the sum of squares by {to_gain:.3g}. Go on with "
             "`minimize(fit.problem, LeastSquares(), start=fit.point)`."
         )
-    A = np.asarray(eliminated.rows[0], float)
-    _, s, V = np.linalg.svd(A, full_matrices=False)
+    s = np.linalg.svd(np.asarray(eliminated.rows[0], float), compute_uv=False)
     log_prior, message = _log_priors(fit)
     message = message or _undetermined_nuisance(fit.problem, eliminated)
     evidence = log_likelihood(fit.problem, fit.cost) + log_prior + _log_volume(fit, eliminated, s)
-    return Laplace(fit, np.asarray(fit.point.x), (V.T / s**2) @ V, math.nan if message else evidence, message)
+    covariance = fit.identifiability.covariance_of_x
+    return Laplace(fit, np.asarray(fit.point.x), covariance, math.nan if message else evidence, message)
 
 
 def log_likelihood(problem: Problem, cost: float) -> float:

@@ -19,8 +19,8 @@ class Profile:
     """The sum of squares with one parameter held at values (n,), all others found anew.
 
     `interval`: where `costs` exceed their minimum by no more than chance does at `level`, with the quantile and the
-    errors of `Fit.intervals` (where `Fit.robust`, as much more as the clustered error exceeds the formal one);
-    infinite on a side where they do not come so far. A parabola has the interval of `Fit.intervals`.
+    errors of `Fit.intervals`; infinite on a side where they do not come so far. A parabola has the interval of
+    `Fit.intervals`.
     """
 
     name: str
@@ -69,9 +69,8 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
             found[float(value)], point = (cost, there.estimates), there.point
     values = np.array(sorted(found))
     costs = np.array([found[v][0] for v in values])
-    # Where residuals are correlated, chance raises the cost by more than independent ones would.
-    inflation = (fit.clustered_errors[name] / error) ** 2 if fit.robust else 1.0
-    limit = costs.min() + inflation * fit.variance * fit.quantile(level) ** 2
+    # The cost rises by one at the error that `sigma` as it was given would leave.
+    limit = costs.min() + (fit.quantile(level) * fit.errors[name] / fit.identifiability.given_errors[i]) ** 2
     return Profile(name, values, costs, level, _crossings(values, costs, limit), tuple(found[v][1] for v in values))
 
 

@@ -96,8 +96,8 @@ def draw_residuals(fit: Fit) -> Any:
         left.hist(np.clip(flat[np.isfinite(flat)], -4, 4), bins=41, range=(-4, 4), density=True, color="C0", alpha=0.6)
         left.plot(grid, np.exp(-(grid**2) / 2) / np.sqrt(2 * np.pi), color="C1", linewidth=1)
         left.set_ylabel(channel.replace("_", "\n"))
-        lags = max(2, min(25, min(len(r) for r in every) // 3))
-        mean = np.mean([autocorrelations(r, lags) for r in every], axis=0)
+        lags = max(2, min(25, min(np.isfinite(r).sum() for r in every) // 3))
+        mean = autocorrelations(every, lags)
         right.bar(np.arange(1, lags + 1), mean, width=0.7)
         limit = 1.96 / np.sqrt(max(np.isfinite(flat).sum(), 1))
         right.axhspan(-limit, limit, color="C1", alpha=0.3, linewidth=0)
@@ -108,13 +108,13 @@ def draw_residuals(fit: Fit) -> Any:
 
 
 def draw_profiles(fit: Fit, profiles: Sequence[Profile]) -> Any:
-    """Profile likelihoods, beside what the formal error says."""
+    """Profile likelihoods, beside the parabola of the linearization."""
     figure = _figure(3.4 * min(3, len(profiles)), 2.6 * (1 + (len(profiles) - 1) // 3))
     axes = figure.subplots(1 + (len(profiles) - 1) // 3, min(3, len(profiles)), squeeze=False).ravel()
     for ax, profile in zip(axes, profiles, strict=False):
         ax.plot(profile.values, profile.costs, "o-", markersize=3)
-        error, best = fit.standard_errors[profile.name], fit.estimates[profile.name]
-        ax.plot(profile.values, fit.cost + fit.variance * ((profile.values - best) / error) ** 2, "--", color="0.6")
+        error, best = fit.identifiability.given_errors[fit.names.index(profile.name)], fit.estimates[profile.name]
+        ax.plot(profile.values, fit.cost + ((profile.values - best) / error) ** 2, "--", color="0.6")
         for end in profile.interval:
             ax.axvline(end, color="C3", linewidth=1)
         ax.set(xlabel=profile.name, ylabel=fit.problem.cost_name)

@@ -1,20 +1,72 @@
-"""Errors that hold where residuals are correlated, quantiles, and intervals that stay inside bounds. Knows numbers."""
+"""Covariances of what was found: formal, and robust to correlated residuals; quantiles; intervals inside bounds."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 from jaxtyping import Array
 from scipy import stats
 
 from ..._scalars.versions import compiled
-from .._problem.blocks import Blocks, eliminate
+from .._problem.blocks import Blocks, Eliminated, eliminate
 from .._problem.linearization import Linearization
 from .._problem.model import Unknowns
 from .._problem.parameters import Parameters
 from .._problem.problem import Problem
+
+
+def formal_covariance(inverse: np.ndarray, of_priors: np.ndarray, variance: float) -> np.ndarray:
+    """B (v D + P) B,   B = (D + P)^-1   (p, p)
+
+    of unknowns with the information D from data whose residuals have the variance v, and P from priors, which are
+    measurements with the deviations that they were given. `inverse`: B.
+    """
+    return variance * inverse + (1.0 - variance) * inverse @ of_priors @ inverse
+
+
+def clustered_covariance(
+    information: np.ndarray, scores: np.ndarray, places: np.ndarray, of_priors: np.ndarray
+) -> np.ndarray:
+    """(G - 1) / G sum_g d_g d_g^T + B P B,   d_g = (N - N_g)^-1 s_g,   B = N^-1,   N = sum_g N_g + P   (n, n)
+
+    Robust to whatever correlates inside a cluster. d_g is what leaving out the cluster g moves, linearized (the
+    jackknife; CR3 of Bell and McCaffrey 2002): a sandwich without it is too small where a cluster has much influence.
+
+    **Arguments:** of every cluster the `information` N_g (G, k, k) and the `scores` s_g (G, k) of its data about the
+    unknowns at `places` (G, k); `of_priors`: P (n, n), of no cluster.
+    """
+    N, G = of_priors.copy(), len(places)
+    rows, columns = places[:, :, None], places[:, None, :]
+    np.add.at(N, (rows, columns), information)
+    scale = np.sqrt(np.maximum(N.diagonal(), np.finfo(float).tiny))
+    B = np.linalg.pinv(N / np.outer(scale, scale), rcond=1e-13, hermitian=True)
+    values, V = np.linalg.eigh(information / (scale[rows] * scale[columns]))
+    roots = np.sqrt(np.maximum(values, 0.0))
+    S, known = V * roots[:, None, :], roots > 1e-7  # N_g = S S^T,  s_g = S c
+    c = np.einsum("gij,gi->gj", V, scores / scale[places]) * known / np.where(known, roots, 1.0)
+    # (N - S S^T)^-1 S = B S (I - S^T B S)^-1. What one cluster alone determines stays where it is without it.
+    left = np.linalg.pinv(np.eye(S.shape[2]) - S.mT @ B[rows, columns] @ S, rcond=1e-9, hermitian=True)
+    moved = np.einsum("gni,gij,gj->gn", np.moveaxis(B[:, places], 1, 0) @ S, left, c)
+    covariance = (G - 1) / G * moved.T @ moved + B @ (of_priors / np.outer(scale, scale)) @ B
+    return covariance / np.outer(scale, scale)
+
+
+def infinite_along(covariance: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """A covariance (p, p) with the variance of every parameter infinite that has a part in one of these directions
+    (k, p), which nothing determines; between it and the others NaN."""
+    there = np.any(np.abs(directions) > 1e-5, axis=0)
+    found = np.where(there[:, None] | there[None, :], np.nan, covariance)
+    found[there, there] = np.inf
+    return found
+
+
+def are_enough(clusters: int, parameters: int) -> bool:
+    """Whether so many clusters say how parameters scatter."""
+    return clusters >= parameters + 2
 
 
 def clusters_of(problem: Problem) -> tuple[str, int]:
@@ -24,99 +76,103 @@ def clusters_of(problem: Problem) -> tuple[str, int]:
     Windows of one trial have its biases in common, and whatever else differs from trial to trial: errors by window do
     not see that.
     """
-    least = len(problem.parameters.names) + 2
-    if problem.clusters >= least:
+    p = len(problem.parameters.names)
+    if are_enough(problem.clusters, p):
         return "trial", problem.clusters
     windows, nuisance = int(problem.seen.sum()), problem.model.nuisance
-    if windows >= least and windows > problem.clusters and not nuisance.chained:
+    if are_enough(windows, p) and windows > problem.clusters and not nuisance.chained:
         return "window", windows
     return "", 0
 
 
-def clustered_covariance(problem: Problem, point: Unknowns, at: Linearization) -> np.ndarray:
-    """Cluster-robust covariance (p, p) of the parameters in their units, for residuals that are correlated within a
-    trial, or within a window where there are too few trials (`clusters_of`); NaN where there are too few of both, and
-    for parameters that the data do not determine."""
+def covariance_by_cluster(problem: Problem, point: Unknowns, at: Linearization, directions: np.ndarray) -> np.ndarray:
+    """Cluster-robust covariance (k, k) along directions (p, k) of the free numbers, by `clusters_of`; NaN where there
+    are too few. What every cluster has of its own is eliminated: by trial its starts and biases, by window its start.
+    The parameters' priors, and by window those of the biases, are part of no cluster."""
     kind, _ = clusters_of(problem)
+    k = directions.shape[1]
     if not kind:
-        p = len(problem.parameters.names)
-        return np.full((p, p), np.nan)
-    slopes = np.asarray(slopes_of(problem.parameters, point.x), float)
-    of_x = (_by_trial if kind == "trial" else _by_window)(problem, point, at)
-    return slopes @ of_x @ slopes.T
+        return np.full((k, k), np.nan)
+    blocks, owner, seen = at.blocks, np.asarray(problem.windows.trial), problem.seen
+    clusters, n_own = owner, 0
+    if kind == "window":  # each a trial of its own, whose biases are shared with others
+        clusters, n_own = np.arange(len(owner), dtype=np.int32), blocks.n_b
+        blocks = Blocks(blocks.R, jnp.asarray(clusters[:, None]), blocks.n_z, 0, 0)
+    p = directions.shape[0]
+
+    def squares(rows: np.ndarray) -> np.ndarray:
+        """Of clusters, information (G, c, c) about what is shared and along the directions, bordered by the scores."""
+        rows = np.concatenate([rows[..., : -p - 1], rows[..., -p - 1 : -1] @ directions, rows[..., -1:]], axis=-1)
+        return rows.mT @ rows
+
+    data = squares(np.asarray(eliminate(blocks, 0.0).R, float))
+    of_priors = np.zeros_like(data)
+    np.add.at(of_priors, clusters, squares(prior_rows(problem, point)[0][:, -n_own - p :, -n_own - p - 1 :]))
+    n = len(problem.trials) * n_own + k
+    places = np.tile(np.arange(n - k, n), (len(data), 1))
+    if kind == "window":
+        places = np.column_stack([owner[:, None] * n_own + np.arange(n_own), places])
+    P = np.zeros((n, n))
+    np.add.at(P, (places[:, :, None], places[:, None, :]), of_priors[:, :-1, :-1])
+    kept, data = np.unique(clusters[seen]), data - of_priors
+    return clustered_covariance(data[kept, :-1, :-1], data[kept, :-1, -1], places[kept], P)[-k:, -k:]
 
 
-def _of_priors(problem: Problem, point: Unknowns) -> tuple[np.ndarray, np.ndarray]:
-    """Information (p, p) and score (p,) of the parameters' priors, by the free numbers."""
-    rows = np.asarray(slopes_of(problem.parameters, point.x), float)
-    rows = rows / np.asarray(problem.parameters.prior_deviation, float)[:, None]
-    return rows.T @ rows, rows.T @ np.asarray(problem.parameters.prior_residuals(point.x), float)
+def prior_rows(problem: Problem, point: Unknowns) -> tuple[np.ndarray, int]:
+    """The rows (W, n_z + n_b + p, n) of all priors in the columns of a window's block [z, z_next, b, x, r], zero where
+    there is none, and how many there are."""
+    parameters, windows, nuisance = problem.parameters, problem.windows, problem.model.nuisance
+    seen, owner = problem.seen, np.asarray(windows.trial)
+    z, b, x = (np.asarray(u, float) for u in (point.z, point.b[windows.trial], parameters.prior_residuals(point.x)))
+    of_trial = np.asarray(windows.first) & np.isin(owner, owner[seen])
+    counts = (of_trial if nuisance.chained else seen, of_trial, np.asarray(windows.very_first))
+    deviations = [np.asarray(d, float) for d in (nuisance.start_deviation, nuisance.trial_deviation)]
+    residuals = (z / deviations[0], b / deviations[1], np.broadcast_to(x, (len(owner), len(x))))
+    of_x = np.asarray(slopes_of(parameters, point.x), float) / np.asarray(parameters.prior_deviation, float)[:, None]
+    slopes = np.asarray(scipy.linalg.block_diag(*(np.diag(1.0 / d) for d in deviations), of_x))
+    n_z, n_next = z.shape[1], z.shape[1] if nuisance.chained else 0
+    slopes = np.insert(slopes, [n_z] * n_next, 0.0, axis=1)
+    known = np.isfinite(np.concatenate([*deviations, np.asarray(parameters.prior_deviation, float)]))
+    there = np.concatenate([np.tile(c[:, None], r.shape[1]) for c, r in zip(counts, residuals, strict=True)], axis=1)
+    there &= known
+    rows = np.concatenate(
+        [np.broadcast_to(slopes, (len(owner), *slopes.shape)), np.hstack(residuals)[..., None]], axis=2
+    )
+    return there[..., None] * rows, int(there.sum())
 
 
-def _by_trial(problem: Problem, point: Unknowns, at: Linearization) -> np.ndarray:
-    """B (T / (T - 1) sum_t (A_t^T r_t) (A_t^T r_t)^T + P) B,   B = (A^T A)^-1
+class Priors(NamedTuple):
+    """What all priors say together.
 
-    (Liang and Zeger 1986; White's sandwich with a trial as the unit.) The parameters' priors, of information P, are
-    measurements of their own with the deviations they were given, and no part of any trial.
+    - `information` (p, p): about the free numbers, starts and biases following them.
+    - `determined`: how many of the starts and biases they determine and not the data, a share where both do.
+    - `number`: of them; `squares`: the sum of their squared residuals.
     """
-    blocks, T = np.asarray(eliminate(at.blocks, 0.0).R, float), problem.clusters  # (T, p+1, p+1)
-    A, r = blocks[:, :, :-1], blocks[:, :, -1]
-    information, scores = np.einsum("tmi,tmj->ij", A, A), np.einsum("tmi,tm->ti", A, r)
-    of_prior, score = _of_priors(problem, point)
-    # The rows of the priors stand among those of the first window's trial.
-    scores[int(problem.windows.trial[0])] -= score
-    bread = np.linalg.inv(information)
-    return bread @ (T / (T - 1) * scores.T @ scores + of_prior) @ bread
+
+    information: np.ndarray
+    determined: float
+    number: int
+    squares: float
 
 
-def _by_window(problem: Problem, point: Unknowns, at: Linearization) -> np.ndarray:
-    """(W - 1) / W sum_w d_w d_w^T + B P B,   d_w = (N - N_w)^-1 g_w,   B = N^-1
-
-    d_w is what leaving out the window w moves, linearized (the jackknife; CR3 of Bell and McCaffrey 2002), N_w and g_w
-    are its information and score of the parameters and of its trial's own unknowns, and N is the sum with the priors of
-    both, of information P. Where unknowns are many, a window has much influence: a sandwich would be too small.
-    """
-    blocks, windows, p = at.blocks, problem.windows, point.x.shape[0]
-    alone = Blocks(blocks.R, jnp.arange(blocks.R.shape[0], dtype=jnp.int32)[:, None], blocks.n_z, 0, 0)
-    rows = np.asarray(eliminate(alone, 0.0).R, float)  # (W, n_b + p + 1, n_b + p + 1)
-    first, owner, n_b = np.asarray(windows.first), np.asarray(windows.trial), blocks.n_b
-    deviation, b = np.asarray(problem.model.nuisance.trial_deviation, float), np.asarray(point.b, float)
-    n = len(problem.trials) * n_b + p
-    shared, (of_prior, score_of_prior) = n - p + np.arange(p), _of_priors(problem, point)
-
-    def of_window(w: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The unknowns of a window, its information about them and its score; without the priors in its rows."""
-        own, A, r = owner[w] * n_b + np.arange(n_b), rows[w, :, :-1], rows[w, :, -1]
-        information, score = A.T @ A, A.T @ r
-        if first[w]:
-            information[:n_b, :n_b] -= np.diag(deviation**-2.0)
-            score[:n_b] -= b[owner[w]] / deviation**2
-        if w == 0:
-            information[n_b:, n_b:] -= of_prior
-            score[n_b:] -= score_of_prior
-        return np.append(own, shared), information, score
-
-    P = np.diag(np.append(np.tile(deviation**-2.0, len(problem.trials)), np.zeros(p)))
-    P[np.ix_(shared, shared)] = of_prior
-    N = P.copy()
-    for w in range(len(owner)):
-        places, information, _ = of_window(w)
-        N[np.ix_(places, places)] += information
-    scale = np.sqrt(np.maximum(N.diagonal(), np.finfo(float).tiny))
-
-    def inverse(M: np.ndarray) -> np.ndarray:
-        # One window alone may determine a trial's unknowns: without it nothing does, and they stay.
-        return np.linalg.pinv(M / np.outer(scale, scale), rcond=1e-13, hermitian=True) / np.outer(scale, scale)
-
-    def moved_without(w: int) -> np.ndarray:
-        places, information, score = of_window(w)
-        rest = N.copy()
-        rest[np.ix_(places, places)] -= information
-        return inverse(rest)[np.ix_(shared, places)] @ score
-
-    moved = np.array([moved_without(w) for w in np.flatnonzero(problem.seen).tolist()])
-    bread, W = inverse(N)[shared], len(moved)
-    return (W - 1) / W * moved.T @ moved + bread @ P @ bread.T
+def priors_of(problem: Problem, point: Unknowns, eliminated: Eliminated) -> Priors:
+    """Of a problem whose linearization at the point has been `eliminated`."""
+    (rows, number), blocks, p = prior_rows(problem, point), eliminated.blocks, point.x.shape[0]
+    of_x, others, determined = rows[:, -p:, -p - 1 : -1], rows[:, :-p], 0.0
+    information = np.einsum("wmi,wmj->ij", of_x, of_x)
+    if others.any():
+        still, *moved = (eliminated.others(x) for x in jnp.eye(p + 1, p, -1, dtype=point.x.dtype))
+        z, b = (np.array([new - old for new in news]).T for *news, old in zip(*moved, still, strict=True))  # by x
+        follow = np.concatenate([z.swapaxes(0, 1), b.swapaxes(0, 1)[np.asarray(problem.windows.trial)]], axis=1)
+        places = [*range(blocks.n_z), *range(blocks.n_z + blocks.n_next, rows.shape[2] - p - 1)]
+        J = others[:, :, places] @ follow
+        information += np.einsum("wmi,wmj->ij", J, J)
+        # d log det (N + e P) / de = tr (P N^-1), of starts and biases
+        e = float(jnp.finfo(blocks.R.dtype).eps) ** (1 / 3)
+        R = np.linalg.qr(np.concatenate([np.asarray(blocks.R), e**0.5 * others], axis=1), mode="r")
+        more = eliminate(eqx.tree_at(lambda blocks: blocks.R, blocks, jnp.asarray(R, blocks.R.dtype)), 0.0)
+        determined = float(more.log_determinant - eliminated.log_determinant) / e
+    return Priors(information, determined, number, float(np.sum(rows[:, :, -1] ** 2)))
 
 
 def intervals(parameters: Parameters, x: Array, half: np.ndarray) -> list[tuple[float, float]]:
@@ -136,7 +192,7 @@ def check_level(level: float) -> None:
         raise ValueError(f"`level` is a probability between 0 and 1, such as 0.95 or 0.05; got {level}.")
 
 
-def t_quantile(level: float, freedom: int) -> float:
+def t_quantile(level: float, freedom: float) -> float:
     """Two-sided, of Student's distribution; NaN without a degree of freedom."""
     check_level(level)
     return float(stats.t.ppf(0.5 * (1 + level), freedom)) if freedom > 0 else float("nan")

@@ -14,6 +14,7 @@ from .._problem.blocks import eliminate
 from .._problem.linearization import Linearization
 from .._problem.model import Unknowns
 from .._problem.problem import Problem
+from .covariance import formal_covariance, infinite_along, priors_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,8 +43,11 @@ class Identifiability:
         as their bounds let them.
     - `undetermined`: the directions that the data do not determine, weakest first. Where several change nothing at
         all, so does every sum of them: those are taken in which the fewest parameters move.
-    - `covariance` (p, p) of the parameters in their units, infinite for those without influence.
-    - `covariance_of_x` (p, p) of the free numbers behind them.
+    - `variance` of a residual, by which `covariance` and `deviations` count the data: of a `Fit` what is left there, by
+        `freedom`, the residuals less the unknowns that they and not priors determine; else one, as `sigma` says.
+    - `covariance` (p, p) of the parameters in their units, infinite for those that are not determined.
+    - `covariance_of_x` (p, p) of the free numbers x behind them, with `sigma` as it was given (Laplace); `directions`
+        (p, k): steps of x, of one along each row of `vectors` that the data determine.
     """
 
     names: tuple[str, ...]
@@ -55,8 +59,11 @@ class Identifiability:
     without_influence: tuple[str, ...]
     at_bound: tuple[str, ...]
     undetermined: tuple[Direction, ...]
+    variance: float
+    freedom: float
     covariance: np.ndarray
     covariance_of_x: np.ndarray
+    directions: np.ndarray
 
     @property
     def ok(self) -> bool:
@@ -85,6 +92,20 @@ class Identifiability:
         return (self.vectors.T * self.singular_values**2) @ self.vectors
 
     @property
+    def given_errors(self) -> np.ndarray:
+        """Standard errors (p,) with `sigma` as it was given, whatever is left; infinite where nothing determines."""
+        known = self.singular_values > 0
+        parts = np.where(known[:, None], self.vectors / np.where(known, self.singular_values, 1.0)[:, None], 0.0)
+        errors = self.scales * np.linalg.norm(parts, axis=0)
+        return np.sqrt(infinite_along(np.diag(errors**2), self.vectors[~known]).diagonal())
+
+    def in_units(self, covariance: np.ndarray) -> np.ndarray:
+        """The covariance (p, p) of the parameters from one (k, k) along the rows of `vectors` that are determined."""
+        known = self.singular_values > 0
+        to_units = self.scales[:, None] * self.vectors[known].T
+        return infinite_along(to_units @ covariance @ to_units.T, self.vectors[~known])
+
+    @property
     def table(self) -> str:
         """Singular values, deviations and directions."""
         lines = ["singular value   deviation   direction (scaled parameters)"]
@@ -96,17 +117,11 @@ class Identifiability:
         return "\n".join([self.table, *filter(None, [self.how_many]), *self.messages])
 
 
-def residual_variance(problem: Problem, cost: float) -> float:
-    """The sum of squares by residuals less unknowns; NaN where there are no more residuals than unknowns. One with
-    process noise, whose likelihood knows how large residuals are."""
-    if problem.model.noise is not None:
-        return 1.0
-    n_r, n_unknown = problem.size
-    return cost / (n_r - n_unknown) if n_r > n_unknown else float("nan")
-
-
-def identifiability_at(problem: Problem, point: Unknowns, at: Linearization, flat: float = 0.5) -> Identifiability:
-    """Identifiability at a point where the problem has been linearized."""
+def identifiability_at(
+    problem: Problem, point: Unknowns, at: Linearization, flat: float = 0.5, given: bool = False
+) -> Identifiability:
+    """Identifiability at a point where the problem has been linearized. `given`: the residuals' variance is one, as
+    `sigma` says, whatever is left there."""
     parameters = problem.parameters
     names, p = parameters.names, len(parameters.names)
     to_values = np.asarray(parameters.slopes(point.x))
@@ -120,16 +135,16 @@ def identifiability_at(problem: Problem, point: Unknowns, at: Linearization, fla
     eps = float(jnp.finfo(eliminated.R.dtype).eps)
     no_influence = before <= 1e4 * eps * before.max()
     s, V = _by_singular_values(A, no_influence, 1e3 * eps * before.max())
-    variance = residual_variance(problem, at.cost)
-    with np.errstate(divide="ignore"):
-        # Without a degree of freedom nothing says that `sigma` is wrong.
-        deviations = (1.0 if np.isnan(variance) else variance**0.5) / s
-        inverse = np.where(s > 0, 1 / s, 0.0)
-    scaled = variance * (V.T * inverse**2) @ V
-    covariance = scaled * np.outer(scales, scales)
-    determined = ~no_influence & np.all((np.abs(V) < 1e-6) | (s[:, None] > 0), axis=0)
-    covariance[~determined, :] = covariance[:, ~determined] = np.nan
-    covariance[~determined, ~determined] = np.inf
+    inverse = (V[s > 0].T / s[s > 0] ** 2) @ V[s > 0]
+    priors = priors_of(problem, point, eliminated)
+    of_priors = to_x.T @ priors.information @ to_x
+    freedom = problem.size[0] - priors.number - problem.size[1] + priors.determined + np.sum(inverse * of_priors)
+    variance = 1.0
+    if not given and problem.model.noise is None:  # a likelihood knows how large residuals are
+        variance = (at.cost - priors.squares) / freedom if freedom > 1e-3 else np.nan
+    # Without a degree of freedom nothing says that `sigma` is wrong.
+    along = V @ formal_covariance(inverse, of_priors, 1.0 if np.isnan(variance) else variance) @ V.T
+    covariance = formal_covariance(inverse, of_priors, variance) * np.outer(scales, scales)
     # Beside a bound nothing moves any more: that is not a parameter which the data do not see.
     alone = np.count_nonzero(to_values, axis=1) <= 1
     at_bound = alone & (scales < 1e-3 * np.asarray(parameters.scale))
@@ -140,12 +155,15 @@ def identifiability_at(problem: Problem, point: Unknowns, at: Linearization, fla
         scales=scales,
         singular_values=s,
         vectors=V,
-        deviations=deviations,
+        deviations=np.where(s > 0, np.sqrt(np.maximum(along.diagonal(), 0.0)), np.inf),
         without_influence=named(no_influence & ~at_bound),
         at_bound=named(at_bound),
         undetermined=(),
-        covariance=covariance,
-        covariance_of_x=to_x @ scaled @ to_x.T,
+        variance=float(variance),
+        freedom=float(freedom),
+        covariance=infinite_along(covariance, V[s == 0]),
+        covariance_of_x=to_x @ inverse @ to_x.T,
+        directions=to_x @ V[s > 0].T,
     )
     return dataclasses.replace(found, undetermined=_undetermined(found, np.array(parameters.learned) == "", flat))
 

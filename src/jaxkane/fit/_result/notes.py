@@ -13,6 +13,7 @@ from .._data.windows import state_names
 from .._problem.bijections import PossibleBody
 from .._problem.problem import Problem
 from .records import DEGREE, suspicious_records
+from .residuals import CORRELATED
 from .text import STATUS
 
 if TYPE_CHECKING:
@@ -133,7 +134,7 @@ def odd_trials(fit: Fit) -> list[str]:
 def coloured_residuals(fit: Fit) -> list[str]:
     """Residuals that are no noise, so that the formal errors are too small."""
     lag = fit.autocorrelation
-    if lag <= 0.3:
+    if lag <= CORRELATED:
         return []
     return [
         f"The residuals are not noise: neighbours correlate by {lag:.2f}. The formal standard errors are too "
@@ -192,7 +193,7 @@ def coarse_steps(fit: Fit) -> list[str]:
 def no_freedom(fit: Fit) -> list[str]:
     """Fits that meet every measurement because there are no more of them than unknowns."""
     n_r, n_unknown = fit.problem.size
-    if n_r > n_unknown:
+    if not np.isnan(fit.variance):
         return []
     return [
         f"There are {n_r} residuals for {n_unknown} unknowns: nothing is left that says how large errors are. The "
@@ -255,8 +256,7 @@ def trade_offs(fit: Fit) -> list[str]:
 def only_priors(fit: Fit) -> list[str]:
     """Parameters of which the data say nothing beyond what was known."""
     notes, deviations = [], np.asarray(fit.parameters.prior_deviation)
-    for i, name in enumerate(fit.names):
-        error = np.sqrt(fit.identifiability.covariance[i, i] / fit.variance)
+    for i, (name, error) in enumerate(zip(fit.names, fit.identifiability.given_errors, strict=True)):
         if not fit.parameters.learned[i] and np.isfinite(deviations[i]) and error > 0.95 * deviations[i]:
             notes.append(f"{name} is known by its prior alone: the data add nothing.")
     return notes

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable
 
 import numpy as np
 from scipy import stats
@@ -12,6 +12,9 @@ from .._problem.problem import Problem
 
 ByTrial = dict[str, dict[str, np.ndarray]]
 """By the names of trial and channel, samples (n_t,)."""
+
+CORRELATED = 0.2
+"""Neighbouring residuals that correlate by more are no independent measurements."""
 
 
 def trial_names(problem: Problem) -> tuple[str, ...]:
@@ -58,14 +61,18 @@ def variance_accounted_for(problem: Problem, fitted: ByTrial) -> dict[str, float
     return found
 
 
-def autocorrelation(residuals: Mapping[str, Mapping[str, np.ndarray]]) -> float:
-    """Of neighbouring residuals, over all channels, each weighted by its size."""
-    above = below = 0.0
-    for channels in residuals.values():
-        for r in channels.values():
-            above += float(np.nansum(r[1:] * r[:-1]))
-            below += float(np.nansum(r**2))
-    return above / below if below > 0 else 0.0
+def autocorrelations(series: Iterable[np.ndarray], n: int) -> np.ndarray:
+    """Of the lags 1 to n, over all series (n_t,) together: the mean product of residuals by their mean square. What was
+    not measured (NaN) is left out: neighbours are measurements that follow each other."""
+    measured = [r[np.isfinite(r)] for r in series]
+    square = sum(float(r @ r) for r in measured) / max(sum(r.size for r in measured), 1)
+
+    def of(lag: int) -> float:
+        pairs = sum(max(r.size - lag, 0) for r in measured)
+        products = sum(float(r[lag:] @ r[:-lag]) for r in measured)
+        return products / pairs / square if pairs and square > 0 else 0.0
+
+    return np.array([of(lag) for lag in range(1, n + 1)])
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,8 +110,9 @@ def residual_test(measured: np.ndarray, fitted: np.ndarray, residual: np.ndarray
         return ResidualTest(int(r.size), nothing, nothing, nothing, nothing, nothing, nothing)
     spread = float(np.sum((y - y.mean()) ** 2))
     accounted = 1 - float(np.sum((fitted[seen] - y) ** 2)) / spread if spread > 0 else nothing
-    lags = autocorrelations(residual, max(1, min(10, r.size // 5)))
-    box = r.size * (r.size + 2) * np.sum(lags**2 / (r.size - np.arange(1, lags.size + 1)))
+    lags = autocorrelations([r], max(1, min(10, r.size // 5)))
+    # Ljung and Box divide by the number of samples, not by that of the pairs.
+    box = (r.size + 2) / r.size * np.sum(lags**2 * (r.size - np.arange(1, lags.size + 1)))
     return ResidualTest(
         n=int(r.size),
         mean=float(r.mean()),
@@ -114,12 +122,6 @@ def residual_test(measured: np.ndarray, fitted: np.ndarray, residual: np.ndarray
         ljung_box=float(stats.chi2.sf(box, lags.size)),
         runs=_runs(r),
     )
-
-
-def autocorrelations(r: np.ndarray, n: int) -> np.ndarray:
-    """Of the lags 1 to n, pairs with a gap left out."""
-    below = np.nansum(r**2)
-    return np.array([np.nansum(r[lag:] * r[:-lag]) for lag in range(1, n + 1)]) / max(below, 1e-300)
 
 
 def _runs(r: np.ndarray) -> float:

@@ -20,7 +20,7 @@ from .._problem.problem import Problem
 from .._problem.state_file import described, write_state
 from .._problem.step_halving import STEP_TOLERANCE
 from . import covariance, notes, residuals
-from .identifiability import Identifiability, identifiability_at, residual_variance
+from .identifiability import Identifiability, identifiability_at
 from .nuisance import nuisance_by_trial
 from .residuals import ByTrial, ResidualTest, residual_test
 from .text import STATUS, summary, table, title
@@ -34,11 +34,12 @@ class Fit:
     It holds numbers: to look at it simulates nothing and fits nothing.
 
     - `system`: with the estimates in it. `estimates`, `start`: values by name. Gains and delays are among them.
-    - `standard_errors`: by name, formal: from the inverse of J^T J with the nuisance values eliminated, times the
-        residuals' variance. They hold for independent residuals of equal scaled size, and a right model.
-    - `clustered_errors`: by name, cluster-robust, for residuals that are correlated within a trial (sandwich, one
-        cluster a trial). With fewer trials than parameters plus two: within a window that starts freely (jackknife,
-        one cluster a window); NaN with too few of both. `clusters` says which.
+    - `standard_errors`: by name, formal: from the inverse of J^T J with the nuisance values eliminated, the data
+        counted by the residuals' variance and priors by their own deviations. They hold for independent residuals of
+        equal scaled size, and a right model.
+    - `clustered_errors`: by name, cluster-robust, for residuals that are correlated within a trial (jackknife, each
+        trial left out in turn, linearized). With fewer trials than parameters plus two: within a window that starts
+        freely; NaN with too few of both. `clusters` says which. `errors`: those of the two that intervals are from.
     - `intervals(level)`: by name. `correlation` (p, p) of the estimates, in the order of `names`.
     - `cost`: sum of squared residuals, with process noise minus twice the log likelihood; `history`: of the cost.
         `status`, `message`: how it ended, in a word and in words.
@@ -92,9 +93,10 @@ class Fit:
 
     @property
     def variance(self) -> float:
-        """Of a residual: the sum of squares by residuals less unknowns; one where `sigma` and the model are right, and
-        NaN where there are no more residuals than unknowns. With process noise it is taken to be one."""
-        return residual_variance(self.problem, self.cost)
+        """Of a residual: the data's sum of squares by residuals less the unknowns that they and not priors determine;
+        one where `sigma` and the model are right, NaN where nothing is left. With process noise it is taken to be one.
+        """
+        return self.identifiability.variance
 
     @property
     def innovation(self) -> float:
@@ -162,9 +164,9 @@ class Fit:
     def clustered_covariance(self) -> np.ndarray:
         """(p, p), in the parameters' units, robust to residuals that are correlated within a trial, or a window: see
         `clusters`."""
-        if not np.all(np.isfinite(self.covariance)):
-            return np.full_like(self.covariance, np.nan)
-        return covariance.clustered_covariance(self.problem, self.point, self.linearization)
+        seen = self.identifiability
+        along = covariance.covariance_by_cluster(self.problem, self.point, self.linearization, seen.directions)
+        return seen.in_units(along)
 
     @property
     def clustered_errors(self) -> dict[str, float]:
@@ -172,10 +174,13 @@ class Fit:
 
     @property
     def robust(self) -> bool:
-        """Whether `intervals` use the cluster-robust errors: the residuals are no noise, and trials or windows are
-        enough."""
-        known = np.all(np.isfinite(self.clustered_covariance.diagonal()))
-        return bool(known and abs(self.autocorrelation) > 0.2)
+        """Whether `errors` are the cluster-robust ones: residuals are no noise, and trials or windows are enough."""
+        return bool(self.clusters[1] and abs(self.autocorrelation) > residuals.CORRELATED)
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """Those of all intervals: the cluster-robust ones where `robust`, else the formal ones."""
+        return self.clustered_errors if self.robust else self.standard_errors
 
     @property
     def clusters(self) -> tuple[str, int]:
@@ -184,11 +189,10 @@ class Fit:
         return covariance.clusters_of(self.problem)
 
     @property
-    def freedom(self) -> int:
-        """Degrees of freedom of all intervals: trials (or windows) less one where `robust`, else residuals less
-        unknowns."""
-        n_r, n_unknown = self.problem.size
-        return self.clusters[1] - 1 if self.robust else n_r - n_unknown
+    def freedom(self) -> float:
+        """Degrees of freedom of all intervals: trials (or windows) less one where `robust`, else residuals less the
+        unknowns that they and not priors determine."""
+        return self.clusters[1] - 1 if self.robust else self.identifiability.freedom
 
     def quantile(self, level: float = 0.95) -> float:
         """Of Student's distribution, two-sided, with as many degrees of freedom as `freedom`."""
@@ -197,12 +201,11 @@ class Fit:
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Confidence intervals by name, inside a parameter's bounds: symmetric in the free numbers.
 
-        From the cluster-robust errors where `robust`, from the formal ones else; `freedom` says with how many degrees.
+        From `errors`; `freedom` says with how many degrees.
 
         **Raises:** `ValueError` for a level that is not between 0 and 1.
         """
-        errors = self.clustered_errors if self.robust else self.standard_errors
-        half = self.quantile(level) * np.array(list(errors.values()))
+        half = self.quantile(level) * np.array(list(self.errors.values()))
         return dict(zip(self.names, covariance.intervals(self.parameters, self.point.x, half), strict=True))
 
     @property
@@ -238,7 +241,8 @@ class Fit:
     @functools.cached_property
     def autocorrelation(self) -> float:
         """Of neighbouring residuals, over all channels, each weighted by its size."""
-        return residuals.autocorrelation(self.residuals)
+        every = (r for channels in self.residuals.values() for r in channels.values())
+        return float(residuals.autocorrelations(every, 1)[0])
 
     @property
     def trial_names(self) -> tuple[str, ...]:
