@@ -15,6 +15,7 @@ from jaxkane.fit import (
     Trial,
     cross_validate,
     fit,
+    identifiability,
     laplace,
     minimize,
     profile,
@@ -211,6 +212,17 @@ def test_intervals_and_profiles_have_the_same_freedom(case):
         assert found.intervals(0.9)[name] == pytest.approx((low, high), abs=1e-4 * half[i])
         # The cost is a parabola: so is its profile, whatever the grid.
         assert profile(found, name, n=5, level=0.9).interval == pytest.approx((low, high), abs=1e-3 * half[i])
+
+
+def test_what_a_plan_will_determine_follows_from_sigma():
+    """Simulated measurements are met exactly: what the plan determines depends on `sigma` alone."""
+    records = [C @ [1.0, 0.0, 0.1, -0.2, 0.0] for C in COLUMNS]
+    seen = identifiability(Problem.of(Track(), trials_of(records), FREE, **OPTIONS))
+    A = dense(records)[0]
+    np.testing.assert_allclose(seen.covariance, np.linalg.inv(A.T @ A)[:2, :2], rtol=TIGHT)
+    assert seen.ok
+    loud = [Trial(x.t, x.measured, x.inputs, sigma=1e4 * SIGMA[0]) for x in trials_of(records)]
+    assert not identifiability(Problem.of(Track(), loud, ("gain", "drift"), **OPTIONS)).ok
 
 
 def test_trials_left_out(case):

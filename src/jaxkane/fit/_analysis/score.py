@@ -12,11 +12,11 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import stats
 
+from .._result.covariance import are_enough, clustered_covariance, formal_covariance
+from .._result.residuals import CORRELATED
+
 UNSEEN = 1e-7
 """What part of a column has to be left where those of the others have been taken out: less is a rounding error."""
-
-CORRELATED = 0.2
-"""Neighbouring residuals that correlate by more are no independent measurements."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,9 +94,8 @@ def score(
 
     **Arguments:** `freedom`: residuals less unknowns without them; `more`: unknowns of trials that come with them.
     `correlation`: of neighbouring residuals. Where it exceeds 0.2, a residual counts as (1 - c) / (1 + c) of one, as in
-    an autoregression; the covariance is that of the trials' scores A'_t^T r_t (clustered by trial), where there are
-    enough of them. `without`: the sum of squares without all that is new, where unknowns of trials come with it, which
-    the rows have lost already.
+    an autoregression; the covariance is clustered by trial, where there are enough of them. `without`: the sum of
+    squares without all that is new, where unknowns of trials come with it, which the rows have lost already.
     """
     base, new, q = list(base), list(new), len(new)
     A, r = rows.of([*base, *new])
@@ -114,21 +113,21 @@ def score(
     )
     covariance, p = np.full((q, q), np.nan), 1.0
     if q and np.all(apart):
-        information = _inverse(rest)
-        if is_clustered(rows, q, correlation):
-            scores, T = _scores(rows, rest, after), rows.data.shape[0]
-            covariance = information @ (T / (T - 1) * scores.T @ scores) @ information
+        priors = A[rows.data[:, :, 0].size :]
+        if is_clustered(rows, A.shape[1], correlation):
+            covariance = _clustered(rows.data[:, :, [*base, *new]], after, priors)[-q:, -q:]
         elif freedom > k:
-            covariance = information * least / (freedom - k) / independent_share(correlation)
+            variance = least / (freedom - k) / independent_share(correlation)
+            covariance = formal_covariance(_inverse(A), priors.T @ priors, variance)[-q:, -q:]
     if np.all(apart):
         p = chance(drop, k, least, freedom - k, correlation)
     return Score(step, covariance, drop, least, p, seen, apart)
 
 
-def is_clustered(rows: Rows, q: int, correlation: float) -> bool:
-    """Whether errors of q numbers are taken from what differs between the trials: the residuals are no noise, and the
-    trials are enough."""
-    return correlation > CORRELATED and rows.data.shape[0] >= q + 4
+def is_clustered(rows: Rows, parameters: int, correlation: float) -> bool:
+    """Whether errors of so many parameters are taken from what differs between the trials: the residuals are no noise,
+    and the trials are enough."""
+    return abs(correlation) > CORRELATED and are_enough(rows.data.shape[0], parameters)
 
 
 def beside_zero(step: np.ndarray, covariance: np.ndarray, trials: int) -> float:
@@ -146,10 +145,11 @@ def _inverse(A: np.ndarray) -> np.ndarray:
     return np.linalg.pinv((A / size).T @ (A / size), rcond=1e-14) / np.outer(size, size)
 
 
-def _scores(rows: Rows, rest: np.ndarray, residuals: np.ndarray) -> np.ndarray:
-    """A'_t^T r_t of every trial (T, q)."""
-    T, m = rows.data.shape[:2]
-    return np.einsum("tmi,tm->ti", rest[: T * m].reshape(T, m, -1), residuals[: T * m].reshape(T, m))
+def _clustered(A: np.ndarray, residuals: np.ndarray, priors: np.ndarray) -> np.ndarray:
+    """By trial, of sensitivities (T, m, n), the residuals of all rows, and the sensitivities of priors (k, n)."""
+    T, m, n = A.shape
+    scores = np.einsum("tmi,tm->ti", A, residuals[: T * m].reshape(T, m))
+    return clustered_covariance(A.mT @ A, scores, np.tile(np.arange(n), (T, 1)), priors.T @ priors)
 
 
 def independent_share(correlation: float) -> float:

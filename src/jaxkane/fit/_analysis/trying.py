@@ -142,7 +142,7 @@ class Trying:
         p, criterion, verdict = float("nan"), "trials left out", ""
         if promise.nested:
             p, criterion = chance(was.cost - after.cost, k, after.cost, after.freedom, after.correlation), "F test"
-            if not count and is_clustered(rows, k, after.correlation):
+            if not count and is_clustered(rows, len(found.names), after.correlation):
                 p = beside_zero(np.asarray(found.point.x - start.x)[n:], now.covariance, len(rows.data))
                 criterion = "Wald test"
         elif self.folds is None:

@@ -157,11 +157,11 @@ def wrong_noise(fit: Fit) -> list[str]:
 
 def wrong_sigma(fit: Fit) -> list[str]:
     """Residuals of another size than `sigma` says, by more than four deviations of chi^2."""
-    n_r, n_unknown = fit.problem.size
-    freedom = n_r - n_unknown
-    if fit.problem.model.noise is not None or freedom <= 0 or abs(fit.variance - 1) <= 4 * (2 / freedom) ** 0.5:
+    freedom = fit.identifiability.freedom
+    if np.isnan(fit.variance) or not (fit.variance - 1) ** 2 > 16 * 2 / freedom:
         return []
-    size = f"chi^2 is {fit.cost:.4g} with {freedom} degrees of freedom: residuals are {fit.variance**0.5:.2g} times as "
+    chi = f"chi^2 is {fit.variance * freedom:.4g} with {freedom:.4g} degrees of freedom"
+    size = f"{chi}: residuals are {fit.variance**0.5:.2g} times as "
     if fit.variance < 1:
         return [f"{size}large as `sigma` says, which is too large."]
     noisy = noisy_starts(fit.problem)

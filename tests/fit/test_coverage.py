@@ -1,0 +1,129 @@
+"""How often 95 % intervals hold the truth, counted: of every kind of data those that are said to be valid for it."""
+
+import numpy as np
+import pytest
+from scipy import stats
+from systems import Track
+
+from jaxkane.fit import Free, LeastSquares, Problem, Simulation, Trial, laplace, minimize, profile
+from jaxkane.fit._result.covariance import clustered_covariance
+from jaxkane.fit._result.residuals import autocorrelations
+
+LOW, HIGH = 0.93, 0.97
+t = np.arange(0.0, 2.0, 0.1)
+SIGMA = 0.05  # [m]
+TRUTH = {"gain": 1.2, "drift": 0.3}
+
+
+def white(rng, n):
+    return rng.normal(size=n)
+
+
+def correlated(rng, n):
+    """Of neighbours by 0.9."""
+    e = rng.normal(size=n)
+    for i in range(1, n):
+        e[i] = 0.9 * e[i - 1] + (1 - 0.81) ** 0.5 * e[i]
+    return e
+
+
+def padded(rng, n):
+    """A channel that was measured at every third sample."""
+    e = np.full(n, np.nan)
+    e[::3] = correlated(rng, len(e[::3]))
+    return e
+
+
+def trial(k, noise, factor, rng):
+    """Of x'' = gain push + drift from rest, with push linear between samples."""
+    push = np.sin((1.5 + 0.3 * (k % 6)) * t + k)
+    h, rows = np.diff(t), [(0.0, 0.1)]
+    force = TRUTH["gain"] * push + TRUTH["drift"]
+    for i, dt in enumerate(h):
+        x, v = rows[-1]
+        rows.append((x + v * dt + (2 * force[i] + force[i + 1]) * dt**2 / 6, v + (force[i] + force[i + 1]) * dt / 2))
+    x = np.array(rows)[:, 0] + factor * SIGMA * noise(rng, t.size)
+    return Trial(t, {"x": x}, {"push": push}, sigma=SIGMA, initial={"x": 0.0, "x_dot": 0.0})
+
+
+KINDS = {  # noise, trials, residuals by sigma, deviations of priors; and what intervals are valid
+    "white": (white, 8, 1.0, None, ("formal", "intervals", "laplace")),
+    "correlated": (correlated, 12, 1.0, None, ("intervals",)),
+    "padded": (padded, 12, 1.0, None, ("intervals",)),
+    "priors": (white, 8, 1.0, (0.02, 0.03), ("formal", "intervals", "laplace")),
+    "priors, sigma ten times too large": (white, 8, 0.1, (0.002, 0.003), ("formal", "intervals")),
+    "few trials": (correlated, 4, 1.0, None, ("intervals",)),
+}
+
+
+def covered(kind, n, seed=0):
+    """The share of all parameters that intervals hold, by name; a trial's start is unknown in all."""
+    noise, T, factor, deviations, names = KINDS[kind]
+    rng, hits = np.random.default_rng(seed), dict.fromkeys(names, 0)
+    for i in range(n):
+        free = ("gain", "drift")
+        if deviations:  # measured elsewhere, with these errors
+            free = [
+                Free(name, prior=(TRUTH[name] + d * rng.normal(), d)) for name, d in zip(free, deviations, strict=True)
+            ]
+        trials = [trial(k, noise, factor, rng) for k in range(T)]
+        problem = Problem.of(Track(), trials, free, unknown=("x_dot",), simulation=Simulation(step=0.1))
+        found = minimize(problem, LeastSquares(damping=1e-9))
+        of_laplace = laplace(found).covariance.diagonal() ** 0.5 * np.array(problem.parameters.scale)
+        quantile = stats.t.ppf(0.975, found.identifiability.freedom)
+        intervals = found.intervals()
+        for j, (name, value) in enumerate(TRUTH.items()):
+            error, (low, high) = abs(found.estimates[name] - value), intervals[name]
+            within = {
+                "formal": error <= quantile * found.standard_errors[name],
+                "intervals": low <= value <= high,
+                "laplace": error <= stats.norm.ppf(0.975) * of_laplace[j],
+            }
+            for which in names:
+                hits[which] += within[which] / n / 2
+        if i == 0:  # The cost is a parabola: the interval by likelihood is the same one, and holds as often.
+            assert profile(found, "gain", n=3).interval == pytest.approx(intervals["gain"], rel=1e-3)
+    return hits
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_intervals_hold_the_truth_as_often_as_they_say(kind):
+    for which, share in covered(kind, 300).items():
+        assert LOW <= share <= HIGH, (which, share)
+
+
+@pytest.mark.parametrize(("T", "p"), [(8, 6), (6, 2), (20, 3)])
+def test_few_trials_scatter_more_than_a_sandwich_sees(T, p):
+    """Trials of unlike inputs, correlated residuals: intervals, and Hotelling's test of several parameters."""
+    rng, time, n = np.random.default_rng(1), np.linspace(0.0, 4.0, 20), 500
+    root = np.linalg.cholesky(0.9 ** np.abs(np.subtract.outer(np.arange(20), np.arange(20))))
+    hits, false = 0.0, 0.0
+    for _ in range(n):
+        rates = 1 + 0.7 * np.arange(p) + 0.3 * rng.normal(size=(T, 1, p))
+        A = np.sin(rates * time[:, None] + rng.uniform(0, 6, (T, 1, p)))
+        e = rng.normal(size=(T, time.size)) @ root.T
+        information, gradient = A.mT @ A, np.einsum("tmi,tm->ti", A, e)
+        x = np.linalg.solve(information.sum(axis=0), gradient.sum(axis=0))
+        scores = np.einsum("tmi,tm->ti", A, e - A @ x)
+        places = np.tile(np.arange(p), (T, 1))
+        C = clustered_covariance(information, scores, places, np.zeros((p, p)))
+        hits += np.mean(np.abs(x) <= stats.t.ppf(0.975, T - 1) * C.diagonal() ** 0.5) / n
+        q = min(p, 3)
+        squared = x[:q] @ np.linalg.solve(C[:q, :q], x[:q])
+        false += (stats.f.sf(squared * (T - q) / (q * (T - 1)), q, T - q) < 0.05) / n
+    assert LOW <= hits <= HIGH
+    assert 0.02 < false < 0.08
+
+
+def test_neighbours_are_measurements_that_follow_each_other():
+    """Padded with NaN, or beside channels of the same kind, residuals are as correlated as they are."""
+    rng = np.random.default_rng(2)
+    walk = correlated(rng, 4000)
+    every_third = np.full(3 * walk.size, np.nan)
+    every_third[::3] = walk
+    (alone,), (within,) = (autocorrelations([r], 1) for r in (walk, every_third))
+    assert alone == within == pytest.approx(0.9, abs=0.03)
+    # Pairs by pairs: pieces that are short do not lose what has no neighbour.
+    assert autocorrelations(walk.reshape(-1, 4), 2) == pytest.approx([0.9, 0.81], abs=0.03)
+    assert autocorrelations([np.full(3, np.nan), np.zeros(5)], 1) == 0.0
