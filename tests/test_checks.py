@@ -145,6 +145,18 @@ def test_a_body_that_turns_in_its_frame_must_be_symmetric():
     ):
         evaluate(Lopsided())
 
+    class Rotor(Slider):
+        across: jk.Scalar = jk.parameter(0.1)
+
+        def motion(self, t, q, u):
+            N, O = jk.inertial()
+            P = O.moving(q["x"] * N.x, u["x_dot"] * N.x)
+            return jk.Motion([jk.Body(1.0, (0.1, self.across, 0.1), P, N, u["angle_dot"] * N.z, name="rotor")])
+
+    assert np.isfinite(evaluate(Rotor())).all()
+    with pytest.raises(ValueError, match="'rotor' turns in its frame 'N'"):
+        evaluate(Rotor(across=0.15))  # of one structure with what was right
+
 
 def test_what_motion_and_loads_return():
     class NoMotion(Slider):

@@ -7,7 +7,7 @@ was given: speeds of both signs and several sizes, and other numbers in the plac
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import jax
@@ -16,17 +16,22 @@ import numpy as np
 from jax.core import Tracer
 
 from .._common.memory import Memory
+from .._description.frames import Frame
 from .._description.system import System
 from .._scalars.numbers import derivative_in_numbers, in_numbers
-from .description_facts import Found, configuration_residual, facts_of
+from .description_facts import Found, configuration_residual, facts_of, turning_of
+from .reading import Reading, frames_of, turning_bodies
 from .trial_numbers import structure_of, with_trial_numbers
 
 _CHECKED = Memory()  # structures
-_SIZES = (-1.0, 1e-2, -20.0, 1e3)  # multiples of trial speeds of order 1
+ROTATION_ERROR = 1e-3
+"""How far [R] [R]^T of frames may be from 1: measured and integrated Euler parameters are not of unit norm exactly."""
+_SIZES = (-1.0, 1e-2, -20.0, 1e3, -1e3)  # multiples of trial speeds of order 1
 
 
 def check_description(system: System, t: Any, q: Any) -> None:
-    """Refuse a description that contradicts itself, once for each class and structure.
+    """Refuse a description that contradicts itself, once for each class and structure; by numbers, where they are all
+    known, at every call.
 
     **Arguments:** the system, time [s] and coordinates (n_q,), any of whose numbers may be traced; coordinates may be
     None, where none are known.
@@ -36,16 +41,71 @@ def check_description(system: System, t: Any, q: Any) -> None:
     the motion violates, a body whose inertia is not constant in its frame, a name that stands for two forces.
     `TypeError` for methods that return something else than they should, or ask for the value of what is traced.
     """
-    structure = structure_of(system)
-    if structure in _CHECKED:
-        return
     if q is not None and not isinstance(q, Tracer) and not np.all(np.isfinite(q)):
         return
-    rng = np.random.default_rng(0)
-    numbers = with_trial_numbers((system, t, q), rng)
-    are_given = q is not None and not any(isinstance(x, Tracer) for x in jax.tree.leaves((system, t, q)))
-    if _Description(*numbers, rng=rng).check(are_given):
-        _CHECKED[structure] = None
+    structure = structure_of(system)
+    if structure not in _CHECKED:
+        rng = np.random.default_rng(0)
+        if _Description(*with_trial_numbers((system, t, q), rng), rng=rng).check():
+            _CHECKED[structure] = None
+    if q is not None and not any(isinstance(x, Tracer) for x in jax.tree.leaves((system, t, q))):
+        _check_numbers(system, t, q)
+
+
+def _check_numbers(system: System, t: Any, q: Any) -> None:
+    """Refuse what depends on the numbers: frames that no rotation turns, and bodies that turn in their frames about an
+    axis about which they are not symmetric."""
+    read = lambda u: in_numbers(turning_of, system, t, q, u.astype(q.dtype))  # noqa: E731
+    u = np.linspace(0.7, 1.3, len(system.speeds) + len(system.dependent_speeds))
+    orientations, spins, _ = read(u)
+    wrong = [i for i, R in enumerate(orientations) if _rotation_error(R) > ROTATION_ERROR]  # NaN is another check's
+    if not wrong and all(map(_is_symmetric, spins)):
+        return
+    name, motion = type(system).__name__, Reading(system).motion(t, tuple(q), tuple(u))
+    if wrong:
+        raise ValueError(f"{name}: " + _no_rotation(frames_of(motion)[wrong[0]], orientations[wrong[0]]))
+    _, spins, _ = read(_on_residuals(lambda u: read(u)[2], u))
+    for body, x in zip(turning_bodies(motion), spins, strict=True):
+        if not _is_symmetric(x):
+            raise ValueError(
+                f"{name}: the body {body.name!r} turns in its frame {body.frame.name!r}, but its inertia is not "
+                "symmetric about that axis, so it is not constant there. Give the body a frame that turns with it."
+            )
+
+
+def _no_rotation(frame: Frame, R: np.ndarray) -> str:
+    square = R @ R.T
+    stretches = np.max(np.abs(square - np.eye(3) * square[0, 0])) <= 1e-6 * square[0, 0]
+    cause = (
+        f"its Euler parameters have the norm {np.trace(square / 3) ** 0.25:.6g} instead of 1"
+        if stretches
+        else f"[R] [R]^T differs from 1 by {_rotation_error(R):.3g}"
+    )
+    return (
+        f"the frame {frame.name!r} is not turned from {frame.parent.name!r} by a rotation: {cause} at the "  # type: ignore[union-attr]
+        "coordinates (or parameters) given. Give Euler parameters of unit norm, as jaxkane.assemble does "
+        "where the constraint rotations.euler_parameter_norm is among the configuration constraints."
+    )
+
+
+def _is_symmetric(x: np.ndarray) -> bool:
+    """Whether an inertia is constant in a frame in which its body turns; also where it is not finite."""
+    s, I = x[0], x[1:]
+    turned = np.cross(s, I.T).T  # [s x] I
+    return not np.max(np.abs(turned + turned.T)) > 1e-6 * np.max(np.abs(I)) * max(1.0, np.max(np.abs(s)))
+
+
+def _on_residuals(residual: Callable[[np.ndarray], np.ndarray], u: np.ndarray) -> np.ndarray:
+    """The nearest speeds that meet the velocity residuals; NaN where there are none."""
+    c, c0 = residual(u), residual(0.0 * u)
+    if not c.size:
+        return u
+    C = np.array([residual(e) - c0 for e in np.eye(len(u))]).T  # (k,n)
+    if np.all(np.isfinite(C)) and np.all(np.isfinite(c)):
+        nearest = u - np.linalg.pinv(C, rcond=1e-9) @ c
+        if not np.max(np.abs(residual(nearest))) > 1e-7 * max(1.0, np.abs(C).max(), np.abs(c).max()):
+            return nearest
+    return np.full_like(u, np.nan)
 
 
 class _Description:
@@ -58,10 +118,8 @@ class _Description:
         self.inputs = {name: np.asarray(0.7, q.dtype) for name in (*system.inputs, *system.states)}
         self.tolerance = float(jnp.finfo(q.dtype).eps) ** 0.5
 
-    def check(self, are_given: bool) -> bool:
+    def check(self) -> bool:
         """Refuse what contradicts itself. **Returns:** whether there were finite numbers to judge by."""
-        if are_given:
-            self._check_rotations(self.read(self.q, self._trial_speeds()))
         self._check_affine(self.q)
         judged = self._check_state(self.q)
         beside = self.q + self.rng.uniform(-0.1, 0.1, self.q.shape)
@@ -115,10 +173,11 @@ class _Description:
 
     def _check_state(self, q: np.ndarray) -> bool:
         q, start = self._on_constraints(q), self._trial_speeds()
-        u = self._on_residuals(q, start)
+        residual = lambda u: np.array([x.item() for x in _of_kind(self.read(q, u), "residual").values()])  # noqa: E731
+        u = _on_residuals(residual, start)
         now = self.read(q, u)
         judged = all(np.all(np.isfinite(x)) for x in now.values())
-        if not judged or any(_rotation_error(x) > self.tolerance for x in _of_kind(now, "frame").values()):
+        if not judged or any(_rotation_error(x[:3]) > self.tolerance for x in _of_kind(now, "frame").values()):
             return False  # coordinates with a relation that no constraint states: nearby states cannot be checked
         rates = self.read_along(q, u, now)
         check = {
@@ -126,7 +185,6 @@ class _Description:
             "place": self._check_place,
             "contact": self._check_contact,
             "center": self._check_center,
-            "body": self._check_body,
             "about": self._check_about,
         }
         for key, x in now.items():
@@ -150,37 +208,6 @@ class _Description:
             q = q - (np.linalg.pinv(G, rcond=1e-6) @ h).astype(q.dtype)
             h = residual(q)
         return np.full_like(q, np.nan)
-
-    def _on_residuals(self, q: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """The nearest speeds that meet the velocity residuals; NaN where there are none."""
-        residual = lambda u: np.array([x.item() for x in _of_kind(self.read(q, u), "residual").values()])  # noqa: E731
-        c, c0 = residual(u), residual(0.0 * u)
-        if not c.size:
-            return u
-        C = np.array([residual(e) - c0 for e in np.eye(len(u))]).T  # (k,n)
-        if np.all(np.isfinite(C)) and np.all(np.isfinite(c)):
-            nearest = u - np.linalg.pinv(C, rcond=1e-9) @ c
-            if not self._differs(residual(nearest), C, c):
-                return nearest
-        return np.full_like(u, np.nan)
-
-    def _check_rotations(self, now: Found) -> None:
-        for (_, _, frame, parent), x in _of_kind(now, "frame").items():
-            error = _rotation_error(x)
-            if np.isfinite(error) and error > max(1e-6, self.tolerance):
-                square = x[:3] @ x[:3].T
-                norm = np.trace(square / 3) ** 0.25
-                stretches = np.max(np.abs(square - np.eye(3) * square[0, 0])) <= 1e-6 * square[0, 0]
-                cause = (
-                    f"its Euler parameters have the norm {norm:.6g} instead of 1"
-                    if stretches
-                    else f"[R] [R]^T differs from 1 by {error:.3g}"
-                )
-                raise ValueError(
-                    f"{self.name}: the frame {frame!r} is not turned from {parent!r} by a rotation: {cause} at the "
-                    "coordinates (or parameters) given. Give Euler parameters of unit norm, as jaxkane.assemble does "
-                    "where the constraint rotations.euler_parameter_norm is among the configuration constraints."
-                )
 
     def _check_frame(self, key: Any, now: Any, rate: Any) -> None:
         _, _, frame, parent = key
@@ -222,16 +249,6 @@ class _Description:
                     "leave out the residual that is its rate, and that is derived."
                 )
 
-    def _check_body(self, key: Any, now: Any, rate: Any) -> None:
-        _, _, body, frame = key
-        s, I = now[0], now[1:]
-        turned = np.cross(s, I.T).T  # [s x] I
-        if self._differs((turned + turned.T) / max(np.abs(I).max(), 1e-300), s):
-            raise ValueError(
-                f"{self.name}: the body {body!r} turns in its frame {frame!r}, but its inertia is not symmetric about "
-                "that axis, so it is not constant there. Give the body a frame that turns with it."
-            )
-
     def _check_about(self, key: Any, now: Any, rate: Any) -> None:
         _, _, body, frame = key
         if self._differs(now[0] - now[1], now[1]):
@@ -255,14 +272,13 @@ def _in_words(key: tuple[Any, ...]) -> str:
         "place": "the velocity of {0}",
         "contact": "the velocity of {0}",
         "center": "the velocity of {0}",
-        "body": "the angular velocity of {0!r} in its frame",
         "about": "the velocity of the point about which the inertia of {0!r} is given",
     }
     return words.get(key[1], "{0}").format(key[2])
 
 
-def _rotation_error(frame: Any) -> float:
-    return float(np.max(np.abs(frame[:3] @ frame[:3].T - np.eye(3))))
+def _rotation_error(R: np.ndarray) -> float:
+    return float(np.max(np.abs(R @ R.T - np.eye(3))))
 
 
 def _listed(words: Iterable[str]) -> str:

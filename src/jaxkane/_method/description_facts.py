@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from .._description.frames import Frame
 from .._description.loads import Force, Load
 from .._description.motion import Motion
 from .._description.points import Point
@@ -14,7 +13,7 @@ from .._scalars.components import is_exact
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, stack
 from .._scalars.types import Component
-from .reading import Reading
+from .reading import Reading, frames_of
 
 Found = dict[tuple[Any, ...], Any]  # (number, kind, names ...) -> numbers; the number keeps the order of the reading
 
@@ -35,6 +34,17 @@ def facts_of(system: System, t: Any, q: Any, u: Any, inputs: Any) -> Found:
     return {(i, *key): stack(rows).astype(like.dtype) for i, (key, rows) in enumerate(facts)}
 
 
+@fused
+def turning_of(system: System, t: Any, q: Any, u: Any) -> tuple[Any, Any, Any]:
+    """Orientations of frames in their parents (f, 3, 3); of bodies that turn in their frames, how, and their inertia
+    (b, 4, 3); and the velocity residuals (k,)."""
+    reading, like = Reading(system), q
+    q, u = tuple(q[i] for i in range(len(q))), tuple(u[i] for i in range(len(u)))
+    orientations, spins = reading.read("orientations", t, q, u)
+    as_arrays = lambda xs: [stack(x).astype(like.dtype) for x in xs]  # noqa: E731
+    return as_arrays(orientations), as_arrays(spins), as_vector(reading.residuals(t, q, u), like)
+
+
 Fact = tuple[tuple[str, ...], list[tuple[Component, ...]]]
 
 
@@ -51,9 +61,6 @@ def _of_bodies(motion: Motion) -> Iterator[Fact]:
     for body in motion.bodies:
         yield ("velocity", f"the velocity of {body.name!r}"), [body.center.velocity.components]
         yield ("velocity", f"the angular velocity of {body.name!r}"), [body.angular_velocity.components]
-        if body.angular_velocity is not body.frame.angular_velocity:
-            spin = (body.angular_velocity - body.frame.angular_velocity).components_in(body.frame)
-            yield ("body", body.name, body.frame.name), [spin, *body.inertia]
         if body.about is not None:
             r = body.about.position_from(body.center)
             carried = body.center.velocity + body.frame.angular_velocity.cross(r)
@@ -87,16 +94,7 @@ def _of_points(motion: Motion, loads: Iterable[Load]) -> Iterator[Fact]:
 
 
 def _of_frames(motion: Motion, loads: Iterable[Load]) -> Iterator[Fact]:
-    bodies, points = motion.bodies, [*motion.points.values()]
-    starts = [*(body.frame for body in bodies), *motion.frames.values()]
-    starts += [x.velocity.frame for x in (*(body.center for body in bodies), *points, *loads)]
-    seen: dict[Frame, None] = {}
-    for start in starts:
-        frame: Frame | None = start
-        while frame is not None and frame.parent is not None and frame not in seen:
-            seen[frame] = None
-            frame = frame.parent
-    for frame in seen:
+    for frame in frames_of(motion, loads):
         rows = [*frame._to_child, frame._spin]
         if not all(is_exact(x) for row in rows for x in row) or any(frame._spin):
             yield ("frame", frame.name, frame.parent.name), rows  # type: ignore[union-attr]

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import jax.numpy as jnp
 
 from .._description.bodies import Body
+from .._description.frames import Frame
 from .._description.loads import Load, flatten_loads
 from .._description.motion import Motion, flatten_residuals
 from .._description.parameters import in_batches
@@ -109,6 +110,14 @@ class Parts:
         """Masses and inertias, each in its body's frame."""
         return [(body.mass, body.inertia) for body in self.motion.bodies]
 
+    def orientations(self) -> tuple[list[Rows], list[tuple[Row, ...]]]:
+        """[R] of the frames in their parents; and of the bodies that turn in their frames, how, and their inertia."""
+        spins = [
+            ((x.angular_velocity - x.frame.angular_velocity).components_in(x.frame), *x.inertia)
+            for x in turning_bodies(self.motion)
+        ]
+        return [frame._to_child for frame in frames_of(self.motion)], spins
+
     def velocities(self) -> tuple[list, list]:
         """Velocities (v, omega) of the bodies, each in the frame where it stands, and those that the loads act on."""
         bodies = [(b.center.velocity.components, b.angular_velocity.components_in(b.frame)) for b in self.motion.bodies]
@@ -127,11 +136,30 @@ class Parts:
         return [load.vector.components_in(load.velocity.frame) for load in self.loads]
 
 
+def turning_bodies(motion: Motion) -> list[Body]:
+    """The bodies that turn in their frames."""
+    return [body for body in motion.bodies if body.angular_velocity is not body.frame.angular_velocity]
+
+
+def frames_of(motion: Motion, loads: Iterable[Load] = ()) -> list[Frame]:
+    """All frames that bodies, named points and frames, and loads stand in, but for the inertial one."""
+    starts = [*(body.frame for body in motion.bodies), *motion.frames.values()]
+    vectors = (*(body.center for body in motion.bodies), *motion.points.values(), *loads)
+    starts += [x.velocity.frame for x in vectors]
+    seen: dict[Frame, None] = {}
+    for start in starts:
+        frame: Frame | None = start
+        while frame is not None and frame.parent is not None and frame not in seen:
+            seen[frame] = None
+            frame = frame.parent
+    return list(seen)
+
+
 @recorded
 def _parts(system: System, components: Any) -> dict[str, Any]:
     inputs, t, q, u = components
     said = Parts(Reading(system, inputs), t, q, u)
-    parts = "rates configuration rolling bodies velocities momenta turning forces"
+    parts = "rates configuration rolling bodies orientations velocities momenta turning forces"
     return {part: getattr(said, part)() for part in parts.split()}
 
 
