@@ -244,6 +244,63 @@ def test_the_delay_of_what_is_held():
     assert abs(found.estimates["delay of push"] - 0.033) < 3 * error < 0.01
 
 
+def late_push(delay):
+    """Of a cart that is pushed late, by the model itself, and irregularly sampled."""
+    t = np.sort(np.concatenate([np.arange(0.0, 8.0, 0.1), np.arange(3.0, 3.05, 0.002)[1:]]))
+    push = 0.2 + np.sin(2.0 * t) + np.cos(5.0 * t)
+    inputs = {"push": jk.Samples(jnp.asarray(t + delay), jnp.asarray(push))}
+    ride = jk.simulate(TRUTH, jk.assemble(TRUTH, {"x": 0.2}), t, inputs)
+    return Trial(t, {"x": ride["x"]}, {"push": push}, sigma=1e-3), np.asarray(ride.inputs["push"])
+
+
+@pytest.mark.parametrize("options", [{"free": Delay("push")}, {"free": "mass", "input_delay": "push"}])
+@pytest.mark.parametrize("delay", [1.3, -0.7])
+def test_windows_receive_what_acted_long_before(options, delay):
+    tolerance = 1e-12
+    trial, acted = late_push(delay)
+    problem = Problem.of(TRUTH, trial, unknown=("x", "x_dot"), window=1.0, **options)
+    point, more = problem.start, jnp.asarray(delay)
+    point = (
+        jax.tree.map(lambda x: x + more, point) if "input_delay" in options else problem.at({"delay of push": delay})
+    )
+    for (_, i, n), window in zip(problem.places, _windows(problem), strict=True):
+        roles = problem.parameters.apply(TRUTH, point.x)[1]
+        push = problem.model.signals(window, point.b[0], roles)["push"]
+        np.testing.assert_allclose(jax.vmap(push)(trial.t[i : i + n]), acted[i : i + n], atol=tolerance)
+
+
+def _windows(problem):
+    return [jax.tree.map(lambda x, i=i: x[i], problem.windows) for i in range(len(problem.places))]
+
+
+def test_windows_keep_what_the_bounds_of_a_delay_ask_for():
+    trial, acted = late_push(0.4)
+    sizes = []
+    for bounds in ((-0.1, 0.5), (0.0, 4.0), None):
+        problem = Problem.of(TRUTH, trial, Delay("push", bounds=bounds, start=0.4), unknown="x", window=1.0)
+        sizes.append(problem.windows.t_input.shape[1])
+        roles = {("delay of input", "push"): 0.4}
+        last = _windows(problem)[-1]
+        push = problem.model.signals(last, problem.start.b[0], roles)["push"]
+        np.testing.assert_allclose(jax.vmap(push)(trial.t[-10:]), acted[-10:], atol=1e-12)
+    assert sizes[0] < sizes[1] < sizes[2] == len(trial.t)
+    assert problem.windows.n_acting < 50
+
+
+def test_a_delay_longer_than_a_trial_is_refused():
+    trial, _ = late_push(0.4)
+    with pytest.raises(ValueError, match=r"delay of push may be 20 s, and trial lasts 7\.9 s"):
+        Problem.of(TRUTH, trial, Delay("push", bounds=(0.0, 20.0), start=1.0), unknown="x")
+
+
+@pytest.mark.slow
+def test_a_long_delay_is_found_in_windows():
+    trial, _ = late_push(0.8)
+    free = ("mass", "stiffness", "damping", Delay("push", bounds=(0.0, 2.0), start=0.6))
+    found = minimize(Problem.of(GUESS, trial, free, unknown=("x", "x_dot"), window=2.0), LeastSquares())
+    assert [found.estimates[n] for n in found.names] == pytest.approx([1.3, 5.0, 0.4, 0.8], abs=1e-3)
+
+
 @pytest.mark.slow
 def test_tied_parameters_and_gains():
     trial = record(np.arange(0.0, 4.0, 0.05), 4)
@@ -274,7 +331,7 @@ class Pulled(jk.System):
         return (jk.Force((inputs["right"] - inputs["left"]) * motion.N.x, motion["cart"]),)
 
 
-@pytest.mark.parametrize(("options", "kinks", "anew"), [({}, 11, False), ({"input_delay": ["left"]}, 2 * 23, True)])
+@pytest.mark.parametrize(("options", "kinks", "anew"), [({}, 11, False), ({"input_delay": ["left"]}, 2 * 11, True)])
 def test_inputs_that_share_their_times_share_their_kinks(options, kinks, anew, monkeypatch):
     import jaxkane._simulation.ride as ride
 

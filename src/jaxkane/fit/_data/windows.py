@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
@@ -12,8 +13,8 @@ from jaxtyping import Array, Bool, Float, Int
 from ..._description.system import System
 from .trial import Trial
 
-LONGEST_DELAY = 0.5
-"""How far before and after a window samples of its inputs are kept where there are delays [s]."""
+Reach = tuple[float, float]
+"""By how much inputs may act late and early [s]."""
 
 Place = tuple[int, int, int]
 """Of a window: trial, first sample, number of samples."""
@@ -24,7 +25,8 @@ class Windows(eqx.Module):
 
     - `t` (W, n_t) [s]; where windows are chained, the last is the next window's first.
     - `measured`, `weight` (W, n_c, n_t): samples, and 1/sigma or zero.
-    - `t_input` (W, n_in) [s], `inputs` (W, inputs, n_in): samples of the inputs, from before and after too.
+    - `t_input` (W, n_in) [s], `inputs` (W, inputs, n_in): samples of the inputs, from before and after too where they
+      are delayed. At most `n_acting` of them act within a window.
     - `step` (W,) [s]: of the integration. `start`, `next_start` (W, n_q + n_u + n_x): the start as far as it is known
         or measured, and that of the next window.
     - `linked` (W,): one where the next window goes on from this one, else zero.
@@ -43,6 +45,19 @@ class Windows(eqx.Module):
     trial: Int[Array, " W"]
     first: Bool[Array, " W"]
     very_first: Bool[Array, " W"]
+    n_acting: int = eqx.field(static=True)
+
+    def acting(self, delay: Array | float) -> tuple[Array, Array]:
+        """Of one window: the times (n,) [s] at which samples act that are late by `delay` [s], and samples (inputs, n).
+
+        What acts long before or after the window is left out: a signal costs as much as it has samples.
+        """
+        times = self.t_input + delay
+        if self.n_acting == times.shape[0]:
+            return times, self.inputs
+        first = jnp.maximum(jnp.searchsorted(times, self.t[0] - self.step, side="right") - 1, 0)
+        chosen = lambda x: jax.lax.dynamic_slice_in_dim(x, first, self.n_acting, axis=-1)  # noqa: E731
+        return chosen(times), chosen(self.inputs)
 
     @property
     def by_trial(self) -> Array:
@@ -60,41 +75,48 @@ def cut(
     channels: Sequence[str],
     *,
     chained: bool = False,
-    delayed: bool = False,
+    reach: Reach | None = None,
+    step: float | None = None,
     guess: Mapping[str, float] | None = None,
 ) -> tuple[Windows, tuple[Place, ...]]:
     """Windows of `window` [s], or one a trial; and the place of each.
 
-    A last piece shorter than half a window is joined to the one before. `guess`: by name, where coordinates start of
-    which nothing is known, if not at zero.
+    A last piece shorter than half a window is joined to the one before. `reach`: of delays, None where there are none.
+    `step` [s]: of the integration, by default that of the samples. `guess`: by name, where coordinates start of which
+    nothing is known, if not at zero.
     """
     places = [(k, i, n) for k, trial in enumerate(trials) for i, n in _pieces(trial.t, window, chained)]
     if not chained:  # a window without one measurement would only add unknowns
         places = [place for place in places if any(np.isfinite(_take(trials, place, c)).any() for c in channels)]
     linked = [chained and place[0] == after[0] for place, after in zip(places, [*places[1:], (-1, 0, 0)], strict=True)]
     n_t = max(n + more for (_, _, n), more in zip(places, linked, strict=True))
-    lead = _lead(trials) if delayed else 0
     found: dict[str, list[np.ndarray]] = {key: [] for key in ("t", "measured", "weight", "t_input", "inputs", "step")}
+    kept: list[tuple[int, int]] = []  # the first sample of the inputs, and the one behind the last
     for (k, i, n), more in zip(places, linked, strict=True):
         trial, last = trials[k], i + n - 1 + more
         found["t"].append(trial.t[np.minimum(np.arange(i, i + n_t), last)])
-        found["step"].append(np.median(np.diff(trial.t[i : last + 1])))
+        between, lasts = np.median(np.diff(trial.t[i : last + 1])), trial.t[last] - trial.t[i]
+        found["step"].append(between if step is None else min(step, lasts))  # no longer, so that it can be halved
+        kept.append((i, last + 1) if reach is None else _reached(trial.t, i, last, reach, found["step"][-1]))
         y = np.stack([_take(trials, (k, i, n), c) for c in channels])  # (n_c, n)
         sigma = np.stack([trial.sigma.get(c, np.ones_like(trial.t))[i : i + n] for c in channels])
         seen = np.isfinite(y)
         found["measured"].append(_fill(np.where(seen, y, 0.0), n_t))
         found["weight"].append(_fill(np.where(seen, 1.0 / sigma, 0.0), n_t))
-        wanted = np.arange(i - lead, i + n_t + lead)
-        there = np.clip(wanted, 0, len(trial.t) - 1)
-        # What lies outside is never far, and takes the trial's first or last sample.
-        found["t_input"].append(trial.t[there] + found["step"][-1] * (wanted - there))
+    n_in = max(stop - begin for begin, stop in kept)
+    for (k, _, _), (begin, _), h in zip(places, kept, found["step"], strict=True):
+        trial, wanted = trials[k], np.arange(begin, begin + n_in)
+        there = np.minimum(wanted, len(trial.t) - 1)
+        found["t_input"].append(trial.t[there] + h * (wanted - there))  # what lies outside takes the last sample
         rows = [trial.inputs.get(name, np.zeros_like(trial.t))[there] for name in system.inputs]
-        found["inputs"].append(np.array(rows).reshape(len(system.inputs), len(wanted)))
+        found["inputs"].append(np.array(rows).reshape(len(system.inputs), n_in))
     names = state_names(system)
     guesses = [(guess or {}).get(name, 0.0) for name in names]
     pairs = tuple(zip(names, guesses, strict=True))
     start = np.array([[_start(trials[k], i, n, *pair) for pair in pairs] for k, i, n in places])
     owner = np.array([k for k, _, _ in places])
+    span = np.ptp(found["t"], axis=1) + 2 * np.array(found["step"])
+    longest = {k: span[owner == k].max() for k in owner.tolist()}
     array = lambda x: jnp.asarray(np.array(x), dtype=jnp.result_type(float))  # noqa: E731
     windows = Windows(
         **{key: array(value) for key, value in found.items()},
@@ -104,6 +126,7 @@ def cut(
         trial=jnp.asarray(owner, dtype=jnp.int32),
         first=jnp.asarray(np.append(True, owner[1:] != owner[:-1])),
         very_first=jnp.asarray(np.arange(len(owner)) == 0),
+        n_acting=min(n_in, max(_most_within(trials[k].t, lasts) for k, lasts in longest.items())),
     )
     return windows, tuple(places)
 
@@ -129,8 +152,17 @@ def _pieces(t: np.ndarray, window: float | None, chained: bool) -> list[tuple[in
     return [(i, n) for i, n in pieces if n > 1 or chained]
 
 
-def _lead(trials: Sequence[Trial]) -> int:
-    return max(int(np.ceil(LONGEST_DELAY / np.median(np.diff(trial.t)))) for trial in trials)
+def _reached(t: np.ndarray, i: int, last: int, reach: Reach, step: float) -> tuple[int, int]:
+    """The first of a trial's samples that may act within a window, and the one behind the last."""
+    late, early = reach
+    begin = np.searchsorted(t, t[i] - late - step, side="right") - 1
+    stop = np.searchsorted(t, t[last] + early + step) + 1
+    return max(int(begin), 0), min(int(stop), len(t))
+
+
+def _most_within(t: np.ndarray, lasts: float) -> int:
+    """How many samples act within a time [s] that may begin anywhere, with the last before it and the first after."""
+    return int(np.max(np.searchsorted(t, t + lasts * (1 + 1e-9), side="right") - np.arange(len(t)))) + 2
 
 
 def _take(trials: Sequence[Trial], place: Place, channel: str) -> np.ndarray:

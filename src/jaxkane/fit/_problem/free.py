@@ -89,8 +89,9 @@ class Offset(Shared):
 class Delay(Shared):
     """A delay [s] common to all trials, with which an input acts or a sensor reports.
 
-    - Of an input: the system receives samples(t - delay); earlier than `LONGEST_DELAY` the first one stands. Under a
-        zero-order hold the jumps move; where the steps of integration have one length, each is a ramp of two steps.
+    - Of an input: the system receives samples(t - delay); before a trial's first sample that one stands. Windows keep
+        the samples that `bounds` ask for, without bounds the whole trial's. Under a zero-order hold the jumps move;
+        where the steps of integration have one length, each is a ramp of two steps.
     - Of a sensor: simulated(t - delay) is compared with the measurement, by cubics through what is simulated at the
         samples; the motion before a window is continued as it begins, so a delay should be short beside a window.
 

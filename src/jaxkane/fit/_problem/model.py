@@ -140,26 +140,26 @@ class Model(eqx.Module):
     def signals(self, window: Windows, b: Array, roles: Roles) -> dict[str, Any]:
         """The inputs of one window by name."""
         system, signals = self.system, {}
+        # One array of times for all that have no delay: kinks that are known to be at the same times cost no more than
+        # those of one input.
+        prompt = window.acting(0.0)
         for i, name in enumerate(system.inputs):
             bias = self.nuisance.of_trial(b, "bias of input", name, 0.0) + roles.get(("offset of input", name), 0.0)
             if name in self.driven:
                 gain = roles.get(("gain of input", name), 1.0) * self.nuisance.of_trial(b, "gain of input", name, 1.0)
-                times, values = self._times_of(name, window, b, roles), gain * window.inputs[i] + bias
-                if name in self.held and times is not window.t_input and self.settings.step is not None:
+                delayed = ("delay of input", name) in roles or ("delay of input", name) in self.nuisance.trial
+                delay = roles.get(("delay of input", name), 0.0) + self.nuisance.of_trial(
+                    b, "delay of input", name, 0.0
+                )
+                times, samples = window.acting(delay) if delayed else prompt
+                values = gain * samples[i] + bias
+                if name in self.held and delayed and self.settings.step is not None:
                     signals[name] = Ramps(times, values, 2.0 * window.step)
                 else:
                     signals[name] = Samples(times, values, hold=name in self.held)
             elif ("bias of input", name) in self.nuisance.trial or ("offset of input", name) in roles:
                 signals[name] = bias
         return signals
-
-    def _times_of(self, name: str, window: Windows, b: Array, roles: Roles) -> Array:
-        """When an input's samples act (n_in,) [s]: the same array for all that have no delay, since kinks that are
-        known to be at the same times cost no more than those of one input."""
-        if ("delay of input", name) not in roles and ("delay of input", name) not in self.nuisance.trial:
-            return window.t_input
-        delay = roles.get(("delay of input", name), 0.0) + self.nuisance.of_trial(b, "delay of input", name, 0.0)
-        return window.t_input + delay
 
     def simulated(self, ride: Trajectory, b: Array, roles: Roles) -> Array:
         """What the sensors would have measured (n_c, n_t)."""

@@ -14,11 +14,10 @@ from ..._method.drift import has_configuration_constraints
 from ..._method.free_coordinates import found_of
 from ..._method.outputs import output_names
 from .._data.trial import Trial
-from .._data.windows import state_names
+from .._data.windows import Reach, state_names
 from .arguments import Specification
-from .entries import where_of
-from .free import Delay
 from .model import Nuisance
+from .parameters import Parameters
 
 Names = Sequence[str] | Mapping[str, float | None]
 """Names, or names with the standard deviation of a Gaussian prior around the initial guess (None: no prior)."""
@@ -116,10 +115,25 @@ def nuisance_of(asked: Specification, channels: Sequence[str], driven: Sequence[
     )
 
 
-def held_and_delayed(
-    system: System, hold: Any, free: Sequence[Any], nuisance: Nuisance
-) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Inputs under a zero-order hold, and those that act with a delay which is to be found."""
-    delayed = [name for kind, name in nuisance.trial if kind == "delay of input"]
-    delayed += [item.what for item in free if isinstance(item, Delay) and where_of(system, item) == "input"]
-    return tuple(checked_names(system, "hold", hold, system.inputs)), tuple(delayed)
+def reach_of(trials: Sequence[Trial], parameters: Parameters, nuisance: Nuisance) -> Reach | None:
+    """By how much inputs may act late and early [s], as the bounds of their delays say; None where none is delayed.
+
+    **Raises:** `ValueError` for a delay that may be longer than a trial.
+    """
+    if any(kind == "delay of input" for kind, _ in nuisance.trial):
+        return np.inf, np.inf
+    shortest = min(trials, key=lambda trial: np.ptp(trial.t))
+    reaches = [(0.0, 0.0)]
+    for entry, start, owner in zip(parameters.entries, parameters.start, parameters.owners, strict=True):
+        if entry.role is None or entry.role[0] != "delay of input":
+            continue
+        lower, upper = (float(getattr(parameters.bijections[owner], end)) for end in ("lower", "upper"))
+        for delay in (lower, upper, float(start)):
+            if np.isfinite(delay) and abs(delay) > np.ptp(shortest.t):
+                raise ValueError(
+                    f"{entry.name} may be {delay:g} s, and {shortest.name} lasts {np.ptp(shortest.t):.6g} s: what "
+                    "would act in it is not recorded. Give narrower `bounds`, or leave short trials out."
+                )
+        reaches.append((upper, -lower))
+    late, early = map(max, zip(*reaches, strict=True))
+    return (late, early) if len(reaches) > 1 else None

@@ -49,6 +49,11 @@ class Parameters(eqx.Module):
         return tuple(e.name for e in self.entries)
 
     @property
+    def owners(self) -> list[int]:
+        """Of every value the number of its bijection."""
+        return np.repeat(np.arange(len(self.sizes)), self.sizes).tolist()
+
+    @property
     def units(self) -> tuple[str, ...]:
         return tuple(e.unit for e in self.entries)
 

@@ -22,7 +22,7 @@ from .arguments import Specification
 from .entries import parameters_of
 from .free import Prior
 from .model import Model, Unknowns
-from .names import checked_trials, held_and_delayed, nuisance_of, starts_found
+from .names import checked_names, checked_trials, nuisance_of, reach_of, starts_found
 from .noise import noise_of
 from .parallel import check_same
 from .parameters import Parameters
@@ -67,11 +67,19 @@ class Problem:
         nuisance = nuisance_of(asked, channels, driven)
         deviations = jnp.concatenate([nuisance.start_deviation, nuisance.trial_deviation])
         of_noise = noise_of(system, asked.noise, deviations, window, asked.continuity)
-        held, delayed = held_and_delayed(system, asked.hold, asked.free, nuisance)
+        held = tuple(checked_names(system, "hold", asked.hold, system.inputs))
         assembled, guess = starts_found(system, trials, nuisance.start)
         parameters = parameters_of(system, asked.free, asked.noise, channels).with_priors(asked.priors or {})
-        options = {"chained": nuisance.chained, "delayed": bool(delayed), "guess": guess}
-        windows, places = cut(system, trials, window, channels, **options)
+        windows, places = cut(
+            system,
+            trials,
+            window,
+            channels,
+            chained=nuisance.chained,
+            reach=reach_of(trials, parameters, nuisance),
+            step=simulation.step,
+            guess=guess,
+        )
         check_system(system, windows.t[0, 0], jnp.nan_to_num(windows.start[0, : len(system.coordinates)]))
         varying = any(np.ptp(x) > 0 for t in trials for x in t.inputs.values())
         model = Model(
@@ -85,9 +93,6 @@ class Problem:
             assembled=assembled,
             noise=of_noise,
         )
-        if simulation.step is not None:  # one step in all windows; none is longer than they, so that it can be halved
-            step = jnp.minimum(simulation.step, windows.t[:, -1] - windows.t[:, 0])
-            windows = eqx.tree_at(lambda w: w.step, windows, step)
         if asked.processes:
             check_same(model, windows)
         problem = cls(model, windows, windows.by_trial, trials, places, asked)
