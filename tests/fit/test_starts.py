@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane.fit import Problem, Simulation, Trial
+from jaxkane.fit import LeastSquares, Problem, Simulation, Trial, minimize
 
 t = np.linspace(0.0, 1.0, 3)
 
@@ -97,3 +97,101 @@ def test_euler_parameters_that_nobody_names_are_no_rotation(follows):
     axis = {"e1": 0.6, "e2": 0.0, "e3": 0.0}
     turned = Trial(t, {"w1": np.zeros(3)}, sigma=0.1, initial=axis)
     np.testing.assert_allclose(starts(posed(Spun(follows=follows), "inertia", turned)), [[0.6, 0, 0, 0.8]], atol=1e-9)
+
+
+E = ("e1", "e2", "e3", "e4")
+
+
+class Sliding(Spun):
+    """It also slides along x, of which nothing is known."""
+
+    coordinates, speeds = ("x", *E), ("x_dot", "w1", "w2", "w3")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        place = O.moving(q["x"] * N.x, u["x_dot"] * N.x)
+        return jk.Motion(
+            [jk.Body(1.0, (self.inertia, 0.2, 0.2), place, N.rotate_euler(q["e1":"e4"], u["w1":"w3"], "B"))]
+        )
+
+    def q_dot(self, t, q, u):
+        return u["x_dot"], *jk.rotations.euler_parameter_rates(q["e1":"e4"], u["w1":"w3"])
+
+    def configuration_constraints(self, t, q):
+        return [jk.rotations.euler_parameter_norm(q["e1":"e4"])]
+
+
+@pytest.mark.parametrize("system", [Spun(), Spun(follows=("e4",)), Sliding()], ids=["all", "dependent", "sliding"])
+def test_four_measured_euler_parameters_are_brought_to_unit_norm(system):
+    raw = np.array([0.1, -0.5, 0.7, 1e-3])
+    measured = Trial(t, {name: np.full(3, x) for name, x in zip(E, raw, strict=True)}, sigma=0.1)
+    for unknown in ((), E, E[:3]):
+        problem = posed(system, "inertia", measured, unknown=unknown)
+        window = jax.tree.map(lambda x: x[0], problem.windows)
+        first = problem.model.consistent(window, problem.start.z[0], problem.start.x)
+        found = np.asarray(first)[: len(system.coordinates)][-4:]
+        np.testing.assert_allclose(found, raw / np.linalg.norm(raw), atol=1e-12)
+
+
+def turning(sigma=0.01):
+    """A body that tumbles, and noise in what is measured of its orientation."""
+    t, rng = np.linspace(0.0, 2.0, 41), np.random.default_rng(0)
+    start = jk.assemble(Spun(inertia=0.3), {"e1": 0.2, "e2": -0.4, "e3": 0.1}, {"w1": 1.0, "w2": 2.0, "w3": -0.5})
+    ride = jk.simulate(Spun(inertia=0.3), start, t)
+    measured = {name: np.asarray(ride[name]) + rng.normal(0.0, sigma, t.size) for name in E}
+    return Trial(t, measured, sigma=sigma, initial={"w1": 1.0, "w2": 2.0, "w3": -0.5})
+
+
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    ("system", "window"),
+    [
+        pytest.param(Spun(), None, marks=SLOW),
+        pytest.param(Spun(), 1.0, marks=SLOW),
+        (Spun(follows=("e4",)), 1.0),
+        pytest.param(Sliding(), None, marks=SLOW),
+        pytest.param(Sliding(), 1.0, marks=SLOW),
+    ],
+)
+def test_four_unknown_euler_parameters_are_three_degrees_of_freedom(system, window):
+    problem = Problem.of(
+        eqx.tree_at(lambda s: s.inertia, system, np.array(0.25)),
+        turning(),
+        "inertia",
+        unknown=(*E, "w1", "w2", "w3"),
+        window=window,
+        simulation=Simulation(step=0.05),
+    )
+    found = minimize(problem, LeastSquares())
+    assert found.status == "converged"
+    assert abs(found.estimates["inertia"] - 0.3) < 3 * found.standard_errors["inertia"]
+    begun = np.array([found.nuisance["trial"][f"start of {name}"] for name in E])
+    np.testing.assert_allclose(np.sum(begun**2, axis=0), 1.0, atol=1e-5)
+    # Of the unknowns of a window the norm alone is not measured, and is counted among what is given.
+    windows = len(problem.places)
+    assert problem.size == (4 * 41 + windows, 1 + 7 * windows)
+
+
+@SLOW
+def test_the_recorded_tosses_begin_where_they_were_measured():
+    """Their quaternions have the norm 1 but for 1e-4."""
+    cube = {"mass": 0.37, "inertia": (0.0006167,) * 3}
+    other = jk.joints.Link("other", parent="cube", joints=jk.joints.hinge("hinge", (0, 1, 0)), **cube)
+    elbow = jk.joints.mechanism([jk.joints.Link("cube", joints=jk.joints.free("cube"), **cube), other])
+    names = {name: f"cube_{name}" for name in ("x", "y", "z", *E)} | {"hinge": "hinge", "hinge_rate": "hinge_rate"}
+    names |= {f"{kind}{i + 1}": f"cube_{to[i]}" for kind, to in TURNS.items() for i in range(3)}
+    renamed = lambda group: {names[name]: x for name, x in group.items()}  # noqa: E731
+    tosses = [
+        Trial(x.t, renamed(x.measured), sigma=renamed(x.sigma), initial=renamed(x.initial))
+        for x in jk.data.tossed_elbow().trials
+    ]
+    problem = Problem.of(elbow, tosses, "mass.cube", simulation=Simulation(step=0.02))
+    places = [elbow.coordinates.index(f"cube_{name}") for name in E]
+    found, raw = starts(problem)[:, places], np.asarray(problem.windows.start)[:, places]
+    np.testing.assert_allclose(np.sum(found**2, axis=1), 1.0, atol=1e-12)
+    np.testing.assert_allclose(found, raw, atol=1e-4)
+
+
+TURNS = {"omega": ("w1", "w2", "w3"), "v": ("vx", "vy", "vz")}

@@ -20,6 +20,10 @@ from .newton import Found, newton, newton_in_numbers
 from .values import as_array
 
 
+class NoConfiguration(ValueError):
+    """The configuration constraints cannot be met, or not from there."""
+
+
 def assemble(
     system: System,
     q: Any,
@@ -99,7 +103,7 @@ def _solve_configuration(system: System, q0, t, plan: Plan):
     in_python = concrete and is_in_numbers(configuration_residual, system, t, q0)
     found = (newton_in_numbers if in_python else newton)(system, q0, t, places, plan.lenient)
     if concrete and not bool(found.good):
-        raise ValueError(_why_not(system, q0, plan, found))
+        raise NoConfiguration(_why_not(system, q0, plan, found))
     return found.q
 
 

@@ -32,7 +32,7 @@ class Plan(NamedTuple):
 def plan_of(system: System, q: Any, free: Sequence[str] | None) -> Plan:
     names = system.coordinates
     named = tuple(q) if isinstance(q, Mapping) else tuple(names)
-    quaternions = _euler_parameters(system) if isinstance(q, Mapping) else []
+    quaternions = euler_parameters(system) if isinstance(q, Mapping) else []
     guess = {names[four[3]]: 1.0 for four in quaternions if names[four[3]] not in named}
     if free is not None:
         free = as_names(free)
@@ -57,7 +57,7 @@ def found_of(system: System, named: Iterable[str]) -> tuple[tuple[str, ...], dic
 _EULER_PARAMETERS = Memory()  # places of Euler parameters by structure
 
 
-def _euler_parameters(system: System) -> list[tuple[int, ...]]:
+def euler_parameters(system: System) -> list[tuple[int, ...]]:
     """Places of every four coordinates, one after the other, of which a constraint says that their norm is one."""
     structure = structure_of(system)
     found = _EULER_PARAMETERS.get(structure)

@@ -98,14 +98,21 @@ class Model(eqx.Module):
     driven: tuple[str, ...] = eqx.field(static=True)  # inputs of which there are samples
     held: tuple[str, ...] = eqx.field(static=True)
     assembled: tuple[str, ...] | None = eqx.field(static=True)  # coordinates that `assemble` moves, if not its own
+    quaternions: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())  # places of Euler parameters
     noise: Noise | None = None
 
     @property
+    def norms(self) -> tuple[tuple[int, ...], ...]:
+        """Those Euler parameters of which all four are unknown: three degrees of freedom, and their norm."""
+        return tuple(four for four in self.quaternions if {*four} <= {*self.unknown_places})
+
+    @property
     def moved(self) -> tuple[int, ...]:
-        """The places of the coordinates that `assemble` moves."""
+        """The places of the coordinates that follow from constraints."""
         names = self.system.coordinates
         chosen = self.system.dependent_coordinates or names if self.assembled is None else self.assembled
-        return tuple(i for i, name in enumerate(names) if name in chosen)
+        places = {i for four in self.quaternions for i in four}
+        return tuple(i for i, name in enumerate(names) if name in chosen or i in places)
 
     @property
     def unknown_places(self) -> np.ndarray:
@@ -114,11 +121,15 @@ class Model(eqx.Module):
         return np.array([names.index(name) for name in self.nuisance.start], dtype=int)
 
     def consistent(self, window: Windows, z: Array, x: Array) -> Array:
-        """The start (n_q + n_u + n_x,) of one window, its dependent coordinates found by `assemble`."""
+        """The start (n_q + n_u + n_x,) of one window, its dependent coordinates found by `assemble`. Euler
+        parameters that were measured, or are unknown, are brought to unit norm."""
         system, roles = self.parameters.apply(self.system, x)
         if self.noise is not None:  # a start with a deviation is no unknown of a filter, but what it begins with
             z = jnp.where(jnp.isfinite(self.nuisance.start_deviation), 0.0, z)
         start = self.known(window.start, roles).at[self.unknown_places].add(z)
+        for four in self.quaternions:
+            e = start[np.array(four)]
+            start = start.at[np.array(four)].set(e / jnp.linalg.norm(e))
         state = unpacked(system, start)
         return packed(assemble(system, state.q, state.u, state.x, t=window.t[0], free=self.assembled))
 
@@ -194,4 +205,7 @@ class Model(eqx.Module):
         of_start = jnp.where(window.first, z / n.start_deviation, 0.0) if n.chained else z / n.start_deviation
         of_trial = jnp.where(window.first, b / n.trial_deviation, 0.0)
         of_all = jnp.where(window.very_first, self.parameters.prior_residuals(x), 0.0)
-        return jnp.concatenate([of_start, of_trial, of_all])
+        # What no measurement can tell, since starts are brought to unit norm: that it is one. It costs nothing.
+        raw = window.start.at[self.unknown_places].add(z)
+        of_norms = jnp.array([(raw[np.array(four)] @ raw[np.array(four)] - 1) / 2 for four in self.norms], z.dtype)
+        return jnp.concatenate([of_start, of_trial, of_all, of_norms])

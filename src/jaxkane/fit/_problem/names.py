@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from ..._common.lookup import as_names, hint, refuse_unknown
 from ..._description.system import System
 from ..._method.drift import has_configuration_constraints
-from ..._method.free_coordinates import found_of
+from ..._method.free_coordinates import euler_parameters, found_of
 from ..._method.outputs import output_names
 from .._data.trial import Trial
 from .._data.windows import Reach, state_names
@@ -61,21 +61,34 @@ def checked_names(system: System, what: str, given: Any, known: Sequence[str]) -
     return {name: float("inf") if deviation is None else float(deviation) for name, deviation in given.items()}
 
 
-def starts_found(
-    system: System, trials: Sequence[Trial], unknown: Sequence[str]
-) -> tuple[tuple[str, ...] | None, dict[str, float]]:
+class Starts(NamedTuple):
     """How the windows' starts are made to satisfy the constraints: as `assemble` does with a dict that names what is
-    known, measured or unknown. The coordinates that it moves, None for those that it moves of an array; and where some
-    of which nothing is known start, the others starting at zero.
+    known, measured or unknown.
+
+    - `moved`: the coordinates that it moves, None for those that it moves of an array.
+    - `quaternions`: places of every four Euler parameters that are named, which are brought to unit norm before.
+    - `guess`: where coordinates start of which nothing is known, if not at zero.
+    """
+
+    moved: tuple[str, ...] | None
+    quaternions: tuple[tuple[int, ...], ...]
+    guess: dict[str, float]
+
+
+def starts_found(system: System, trials: Sequence[Trial], unknown: Sequence[str]) -> Starts:
+    """What a trial does not say of coordinates, and how that is found.
 
     **Raises:** `ValueError` for a trial that says nothing of a coordinate which is held in the others.
     """
     by_trial = [{*trial.initial, *trial.measured, *unknown} for trial in trials]
     named = [c for c in system.coordinates if any(c in names for names in by_trial)]
-    moved, guess = found_of(system, named)
+    fours = [(four, {system.coordinates[i] for i in four}) for four in euler_parameters(system)]
+    quaternions = tuple(four for four, names in fours if all(names <= said for said in by_trial))
+    moved = found_of(system, named)[0]
+    guess = found_of(system, [c for c in named if c not in unknown])[1]
     q = jnp.zeros(len(system.coordinates))
     if system.dependent_coordinates or not has_configuration_constraints(system, jnp.zeros(()), q):
-        return None, guess
+        return Starts(None, quaternions, guess)
     for trial, names in zip(trials, by_trial, strict=True):
         missing = [c for c in named if c not in names]
         if missing:
@@ -83,7 +96,7 @@ def starts_found(
                 f"{trial.name} says nothing of {', '.join(missing)}, which is held where other trials start: name it "
                 f"in `initial`, or give {type(system).__name__} its `dependent_coordinates`."
             )
-    return (None if len(named) == len(system.coordinates) else moved), guess
+    return Starts(None if len(named) == len(system.coordinates) else moved, quaternions, guess)
 
 
 def nuisance_of(asked: Specification, channels: Sequence[str], driven: Sequence[str]) -> Nuisance:
@@ -101,7 +114,8 @@ def nuisance_of(asked: Specification, channels: Sequence[str], driven: Sequence[
         where, kind = argument.split("_")
         for name, deviation in checked_names(system, argument, getattr(asked, argument), names).items():
             trial[f"{kind} of {where}", name] = deviation
-    independent = tuple(c for c in system.coordinates if c not in system.dependent_coordinates)
+    turned = {system.coordinates[i] for four in euler_parameters(system) for i in four}
+    independent = tuple(c for c in system.coordinates if c not in system.dependent_coordinates or c in turned)
     start = checked_names(system, "unknown", asked.unknown, (*independent, *system.speeds, *system.states))
     jump = checked_names(system, "continuity", asked.continuity or {}, tuple(start))
     array = lambda numbers: jnp.asarray(np.array(list(numbers), float), jnp.result_type(float))  # noqa: E731

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
@@ -13,7 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..._description.system import System
-from ..._method.checks import check_system
+from ..._method.assembly import NoConfiguration
 from ..._simulation.trajectory import Trajectory
 from .._data.trial import Trial
 from .._data.windows import Place, Windows, cut
@@ -68,7 +69,7 @@ class Problem:
         deviations = jnp.concatenate([nuisance.start_deviation, nuisance.trial_deviation])
         of_noise = noise_of(system, asked.noise, deviations, window, asked.continuity)
         held = tuple(checked_names(system, "hold", asked.hold, system.inputs))
-        assembled, guess = starts_found(system, trials, nuisance.start)
+        starts = starts_found(system, trials, nuisance.start)
         parameters = parameters_of(system, asked.free, asked.noise, channels).with_priors(asked.priors or {})
         windows, places = cut(
             system,
@@ -78,9 +79,8 @@ class Problem:
             chained=nuisance.chained,
             reach=reach_of(trials, parameters, nuisance),
             step=simulation.step,
-            guess=guess,
+            guess=starts.guess,
         )
-        check_system(system, windows.t[0, 0], jnp.nan_to_num(windows.start[0, : len(system.coordinates)]))
         varying = any(np.ptp(x) > 0 for t in trials for x in t.inputs.values())
         model = Model(
             system=system,
@@ -90,12 +90,16 @@ class Problem:
             channels=channels,
             driven=driven,
             held=held,
-            assembled=assembled,
+            assembled=starts.moved,
+            quaternions=starts.quaternions,
             noise=of_noise,
         )
         if asked.processes:
             check_same(model, windows)
         problem = cls(model, windows, windows.by_trial, trials, places, asked)
+        with contextlib.suppress(NoConfiguration):  # a fit says of which windows
+            first = jax.tree.map(lambda x: x[0], windows)
+            model.consistent(first, problem.start.z[0], problem.start.x)  # which checks the system there
         return problem.finer(problem.start) if problem.chooses_steps else problem
 
     @property
@@ -194,6 +198,7 @@ class Problem:
         residuals = int(jnp.sum(self.windows.weight > 0)) + finite(self.parameters.prior_deviation)
         residuals += (T if n.chained else int(seen.sum())) * finite(n.start_deviation) + T * finite(n.trial_deviation)
         residuals += int(np.asarray(self.windows.linked)[seen].sum()) * finite(n.jump)
+        residuals += int(seen.sum()) * len(self.model.norms)
         unknowns = len(self.parameters.entries) + T * len(n.trial) + int(seen.sum()) * len(n.start)
         return residuals, unknowns
 
