@@ -97,7 +97,7 @@ def cut(
         found["t"].append(trial.t[np.minimum(np.arange(i, i + n_t), last)])
         between, lasts = np.median(np.diff(trial.t[i : last + 1])), trial.t[last] - trial.t[i]
         found["step"].append(between if step is None else min(step, lasts))  # no longer, so that it can be halved
-        kept.append((i, last + 1) if reach is None else _reached(trial.t, i, last, reach, found["step"][-1]))
+        kept.append((i, last + 1) if reach is None else _reached(trial.t, i, last, reach, float(found["step"][-1])))
         y = np.stack([_take(trials, (k, i, n), c) for c in channels])  # (n_c, n)
         sigma = np.stack([trial.sigma.get(c, np.ones_like(trial.t))[i : i + n] for c in channels])
         seen = np.isfinite(y)
