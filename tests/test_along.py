@@ -1,6 +1,8 @@
 """Places, velocities, orientations and rates of speeds by name, along trajectories, batches and early ends."""
 
 import dataclasses
+import importlib
+import inspect
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +11,8 @@ import pytest
 from slopes import slopes
 
 import jaxkane as jk
+from jaxkane import fit
+from jaxkane._simulation.one_motion import refuse_other_system
 from jaxkane.catalog import DoublePendulum
 
 TS = jnp.linspace(0.0, 2.0, 5)
@@ -140,3 +144,59 @@ def test_where_the_force_of_a_residual_is_read():
     forces = jk.constraint_forces(Coupled(), 0.0, {"y": 1.0}, {})  # 6 N move 3 kg: 2 kg of them by 4 N
     for name, force in {"A": -4.0, "B": 4.0, "twice": 0.0}.items():
         np.testing.assert_allclose(forces[name], [force, 0.0, 0.0], atol=1e-14)
+
+
+ALONG = (
+    "constraint_forces constraint_multipliers orientations outputs positions speed_rates state_rates velocities".split()
+)
+OF_A_TRAJECTORY = {
+    **{f"jaxkane.{name}": lambda system, ride, name=name: getattr(jk, name)(system, ride) for name in ALONG},
+    "jaxkane.audit": jk.audit,
+    "jaxkane.animate": jk.animate,
+    "jaxkane.fit.instants_of": fit.instants_of,
+    "jaxkane.fit.base_parameters": fit.base_parameters,
+    "jaxkane.fit.first_guess": lambda system, ride: fit.first_guess(system, ride, "push"),
+}
+OTHERS = {
+    "coordinates": {"coordinates": ("x", "angle")},
+    "speeds": {"speeds": ("angle_rate",)},
+    "dependent speeds": {"dependent_speeds": ("forward_speed",)},
+    "states": {"states": ("wear",)},
+    "inputs": {"inputs": ("torque",)},
+}
+
+
+@pytest.mark.parametrize("kind", OTHERS)
+def test_the_motion_of_another_system_has_other_names(ride, kind):
+    other = type("Other", (Disc,), OTHERS[kind])()
+    with pytest.raises(ValueError, match=f"f: the trajectory has the {kind}: .*: it is the motion of another system"):
+        refuse_other_system("f", other, ride)
+
+
+def test_motions_of_the_same_names_are_taken(ride):
+    refuse_other_system("f", Disc(radius=0.1), ride)
+
+
+@pytest.mark.parametrize("name", OF_A_TRAJECTORY)
+def test_every_public_function_refuses_the_motion_of_another_system(ride, name):
+    f, other = OF_A_TRAJECTORY[name], type("Other", (Disc,), OTHERS["inputs"])()
+    with pytest.raises(ValueError, match="it is the motion of another system"):
+        f(other, ride)
+
+
+def test_no_public_function_of_a_trajectory_is_left_out():
+    rooms = [jk, *(importlib.import_module(f"jaxkane.{room}") for room in jk._ROOMS if room != "catalog")]
+    functions = {
+        f"{room.__name__}.{name}": f
+        for room in rooms
+        for name, f in vars(room).items()
+        if inspect.isfunction(f) and not name.startswith("_")
+    }
+    functions["jaxkane.animate"] = jk.animate
+    taking = {
+        name
+        for name, f in functions.items()
+        if "system" in inspect.signature(f).parameters
+        and ("return along(" in inspect.getsource(f) or {"trajectory", "motions"} & {*inspect.signature(f).parameters})
+    }
+    assert taking == {*OF_A_TRAJECTORY}

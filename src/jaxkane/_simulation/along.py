@@ -25,6 +25,7 @@ from .._scalars.fuse import fused
 from .._scalars.linear import as_vector
 from .._scalars.nan import nan_where
 from .._scalars.versions import compiled
+from .one_motion import refuse_other_system
 from .trajectory import Trajectory
 
 
@@ -33,11 +34,14 @@ def along(f: Callable[..., Any], system: System, t: Any, q: Any, u: Any, inputs:
 
     NaN, with its derivatives, where a trajectory has ended. There `f` never sees the NaN of the trajectory, which would
     spoil the derivatives of all other times.
+
+    **Raises:** `ValueError` for the trajectory of another system; `TypeError` for one beside `q`, `u` or `inputs`.
     """
     if not isinstance(t, Trajectory):
         return f(*_arrays(system, t, q, u, inputs))
     if not (q is None and u is None and inputs is None):
         raise TypeError("A Trajectory holds coordinates, speeds and inputs already: give the system and it alone.")
+    refuse_other_system(type(system).__name__, system, t)
 
     def at(system: System, now: Any, start: Any) -> Any:
         reached = jnp.all(jnp.isfinite(jnp.concatenate([now[1], now[2]])))
@@ -141,7 +145,8 @@ def constraint_forces(
 
     **Returns:** a dict: components in N, (3,) at one time and (n_t, 3) along a trajectory.
 
-    **Raises:** `ValueError` as `accelerations`; `TypeError` for a trajectory together with `q`, `u` or `inputs`.
+    **Raises:** `ValueError` as `accelerations`, and for the trajectory of another system; `TypeError` for a trajectory
+    together with `q`, `u` or `inputs`.
     """
     return along(forces_now, system, t, q, u, inputs)
 

@@ -1,4 +1,4 @@
-"""One motion of a system, checked before it is judged or drawn. Knows trajectories; knows no mechanism."""
+"""Whether a trajectory is a motion of a system, and one motion. Knows trajectories; knows no mechanism."""
 
 from __future__ import annotations
 
@@ -6,8 +6,23 @@ from typing import Any
 
 import numpy as np
 
-from .._description.system import System
+from .._description.system import System, names_of
 from .trajectory import Trajectory
+
+
+def refuse_other_system(label: str, system: System, trajectory: Trajectory) -> None:
+    """Every function of a system and a trajectory asks this first; `label` is the one that was called, for the message.
+
+    **Raises:** `ValueError` where the names differ, by which a motion is read.
+    """
+    kinds = ("coordinates", "speeds", "dependent speeds", "states")
+    groups = zip(kinds, trajectory.names, names_of(system), strict=True)
+    for kind, of_trajectory, own in (*groups, ("inputs", sorted(trajectory.inputs), sorted(system.inputs))):
+        if tuple(of_trajectory) != tuple(own):
+            raise ValueError(
+                f"{label}: the trajectory has the {kind}: {', '.join(of_trajectory) or 'none'}, the system has: "
+                f"{', '.join(own) or 'none'}: it is the motion of another system."
+            )
 
 
 def reached_times(function: str, system: System, trajectory: Any) -> np.ndarray:
@@ -24,11 +39,7 @@ def reached_times(function: str, system: System, trajectory: Any) -> np.ndarray:
             f"{label}: takes one motion; of a batch of shape {trajectory.t.shape[:-1]} give one member: "
             "jax.tree.map(lambda x: x[0], rides)."
         )
-    if trajectory.names[0] != tuple(system.coordinates):
-        raise ValueError(
-            f"{label}: the trajectory has the coordinates {', '.join(trajectory.names[0])}, the system has "
-            f"{', '.join(system.coordinates)}: it is the motion of another system."
-        )
+    refuse_other_system(label, system, trajectory)
     reached = np.all(np.isfinite(np.asarray(trajectory.q)), axis=1)
     if reached.sum() < 2:
         raise ValueError(f"{label}: the simulation reached only {reached.sum()} of its times: {trajectory.reason}.")

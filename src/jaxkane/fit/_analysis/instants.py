@@ -12,6 +12,7 @@ from scipy.interpolate import make_interp_spline
 
 from ..._common.lookup import refuse_unknown
 from ..._description.system import System
+from ..._simulation.one_motion import refuse_other_system
 from ..._simulation.trajectory import Trajectory
 from .._data.trial import Trial
 from .splines import DEGREE, covered, max_spacing, speeds_and_rates, spline
@@ -135,6 +136,7 @@ def _of_one(system: System, motion: Any, spacing: float | None) -> Instants:
 
 def _of_trajectory(system: System, ride: Trajectory) -> Instants:
     """Accelerations by a spline through the speeds: those of the system would be what is to be found."""
+    refuse_other_system("Instants", system, ride)
     if np.ndim(ride.status) > 0:
         raise ValueError("A batch of trajectories: give them one by one, or as Instants.")
     t, q, u = (np.asarray(x) for x in (ride.t, ride.q, ride.u))
