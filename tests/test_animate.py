@@ -1,12 +1,14 @@
 """Animations: everything is where the description says, and the page shows it, in a browser and without one."""
 
 import base64
+import gc
 import json
 import re
 import shutil
 import subprocess
 import tempfile
 import time
+import weakref
 from pathlib import Path
 
 import browser
@@ -30,16 +32,17 @@ def moved(system, ts, q, u, u_dep=None):
     """A trajectory of given coordinates and speeds, without solving anything."""
     n = len(ts)
     dep = np.zeros((n, len(system.dependent_speeds))) if u_dep is None else u_dep
+    x = np.zeros((n, len(system.states)))
     inputs = {name: jnp.zeros(n) for name in system.inputs}
     stats = {name: jnp.asarray(n) for name in ("steps", "accepted", "rejected")}
     return jk.Trajectory(
-        **{name: jnp.asarray(x) for name, x in dict(t=ts, q=q, u=u, u_dep=dep, x=np.zeros((n, 0))).items()},
+        **{name: jnp.asarray(array) for name, array in dict(t=ts, q=q, u=u, u_dep=dep, x=x).items()},
         inputs=inputs,
         outputs={},
         status=jnp.asarray(0),
         t_end=jnp.asarray(ts[-1]),
         stats=stats,
-        names=(system.coordinates, system.speeds, system.dependent_speeds, ()),
+        names=(system.coordinates, system.speeds, system.dependent_speeds, system.states),
         events=(),
         adjoint="none",
     )
@@ -220,6 +223,21 @@ def test_the_page_needs_nothing_from_elsewhere(weaving):
     frame = weaving._repr_html_()
     assert frame.startswith("<iframe srcdoc=")
     assert '"' not in frame.split('srcdoc="')[1].split('" title=')[0]
+
+
+def test_a_figure_lives_no_longer_than_its_user_wants(swing):
+    system, trajectory, _ = swing
+    size = np.ones(1000)
+
+    def figure(system, motion, sketch):
+        body = motion.bodies[0]
+        sketch.line("gold", body, body.center.position + float(size[0]) * motion.N.x)
+
+    jk.animate(system, trajectory, figure)
+    alive = weakref.ref(figure)
+    del figure
+    gc.collect()
+    assert alive() is None
 
 
 def test_what_cannot_be_animated_is_refused(ride, swing, tmp_path):

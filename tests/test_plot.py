@@ -1,5 +1,7 @@
 """Pictures: drawn on a dark and on a light page, with what was asked for in them."""
 
+import dataclasses
+import io
 import re
 import types
 
@@ -95,6 +97,32 @@ def test_trajectories_have_names_units_and_an_end(style):
     assert again is not axes
     assert all(a is b for a, b in zip(again, axes))
     assert axes[2].get_legend().get_texts()[-1].get_text() == "the other"
+
+
+ODD = ("a$_{b$", "$c")
+
+
+def test_names_are_no_mathematics():
+    """Dollars in names are written as they stand."""
+    ride = dataclasses.replace(
+        trajectory(status=10, t_end=1.01),
+        names=(ODD, ("$u",), (), ()),
+        events=("x$^{$",),
+        units=(("a$_{b$", "m$^{$"),),
+    )
+    fit = fitted(2)
+    fit.trial_names = ("$^$", "$_{$")
+    fit.fitted, fit.residuals = (dict(zip(fit.trial_names, x.values())) for x in (fit.fitted, fit.residuals))
+    drawn = [
+        jk.plot.trajectories(ride, ["a$_{b$", ODD]),
+        jk.plot.fits(fit),
+        jk.plot.mode_shapes(np.array([-1.0, 2.0]), np.eye(2), ODD, modes=["m$_{$", "$_$"]),
+        jk.plot.eigenvalues([0.0, 1.0], np.array([[-1.0, 2.0j], [1.0, 3.0j]]), modes=["m$_{$", "$_$"]),
+    ]
+    for axes in drawn:
+        np.ravel(axes)[0].figure.savefig(io.BytesIO(), format="svg")
+    assert drawn[0][0].get_ylabel() == r"a\$ {b\$" + "\n" + r"[m\$^{\$]"
+    plt.close("all")
 
 
 def test_units_may_be_said():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import weakref
 from typing import Any
 
 import equinox as eqx
@@ -14,6 +15,7 @@ from .._description.loads import Force, flatten_loads
 from .._description.system import System
 from .._scalars.fuse import fused
 from .._scalars.linear import stack
+from .._scalars.reads import Reads
 from .._scalars.versions import version_of
 from .._simulation.one_motion import reached_times
 from .._simulation.trajectory import Trajectory
@@ -54,27 +56,32 @@ def record(system: System, trajectory: Trajectory, figure: Figure | None) -> Rec
     name = type(system).__name__
     reached = reached_times("animate", system, trajectory)
     numbers, rest = eqx.partition(system, eqx.is_array)
+    drawing = None if figure is None else _Drawing(weakref.ref(figure), Reads(figure).version)
     t, q, u, u_dep = (np.asarray(x)[reached] for x in (trajectory.t, trajectory.q, trajectory.u, trajectory.u_dep))
     u = np.concatenate([u, u_dep], axis=1)
-    found = jax.tree.map(np.asarray, _along(numbers, rest, figure, version_of(system, figure), t, q, u))
+    found = jax.tree.map(np.asarray, _along(numbers, rest, drawing, version_of(system), t, q, u))
     if not found.bodies:
         raise ValueError(f"animate({name}): no body has a position. Give points their places, see jaxkane.Point.at.")
     return eqx.tree_at(lambda r: (r.mass, r.inertia), found, (found.mass[0], found.inertia[0]))
 
 
+class _Drawing(eqx.Module):
+    """A figure, by a weak reference: no program keeps alive what it holds; and a digest of all that its code reads."""
+
+    figure: Any = eqx.field(static=True)
+    version: bytes = eqx.field(static=True)
+
+
 @functools.partial(jax.jit, static_argnums=(1, 2, 3))
-def _along(numbers, rest, figure, version, t, q, u):
+def _along(numbers, rest, drawing, version, t, q, u):
     # A picture's program runs once or twice: it should compile quickly, which one function for one instant does.
     system = eqx.combine(numbers, rest)
-    return jax.lax.map(lambda now: _instants(figure, version)(system, *now), (t, q, u))
+    return jax.lax.map(lambda now: _instant(system, drawing, *now), (t, q, u))
 
 
-@functools.lru_cache(maxsize=64)
-def _instants(figure: Figure | None, version: Any) -> Any:
-    return fused(lambda system, *now: _instant(system, figure, *now))
-
-
-def _instant(system: System, figure: Figure | None, t, q, u) -> Any:
+@fused
+def _instant(system: System, drawing: _Drawing | None, t, q, u) -> Any:
+    figure = None if drawing is None else drawing.figure()
     motion = system.motion(t, q, u)
     N, dtype = motion.N, q.dtype
     placed = [i for i, body in enumerate(motion.bodies) if body.center.has_position]

@@ -30,6 +30,11 @@ def as_names(given: str | Iterable[str]) -> tuple[str, ...]:
     return (given,) if isinstance(given, str) else tuple(given)
 
 
+def label_of(name: str) -> str:
+    """A name as matplotlib is to write it, for which what stands between two dollars is mathematics."""
+    return name.replace("$", r"\$")
+
+
 def refuse_unknown(given: Iterable[str], known: Iterable[str], message: str, have: str = "there are") -> None:
     """`ValueError` for names that are not known; `message` stands before them: "Bicycle: q has no"."""
     known = tuple(known)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._common.lookup import hint, refuse_unknown
+from .._common.lookup import hint, label_of, refuse_unknown
 from .._description.units import in_degrees, refuse_no_angle, unit_of, units_of
 from ._axes import SOFT, finish, panels
 
@@ -57,7 +57,7 @@ def fits(
     fitted, all_residuals = fit.fitted, fit.residuals
     for column, k in zip(axes.T, chosen, strict=True):
         trial = fit.problem.trials[k]
-        column[0].set_title(names[k], fontsize="medium")
+        column[0].set_title(label_of(names[k]), fontsize="medium")
         column[-1].set_xlabel("time [s]")
         for ax, below, channel in zip(column[::each], column[each - 1 :: each], channels, strict=True):
             if channel not in trial.measured:
@@ -74,7 +74,8 @@ def fits(
                 below.plot(trial.t, all_residuals[names[k]][channel], ".", color="C0", markersize=2)
                 finish(below, legend=False)
             if column is axes.T[0] or k == chosen[0]:
-                ax.set_ylabel(f"{channel.replace('_', ' ')}\n[{unit}]" if unit else channel.replace("_", " "))
+                words = label_of(channel).replace("_", " ")
+                ax.set_ylabel(f"{words}\n[{label_of(unit)}]" if unit else words)
                 if residuals:
                     below.set_ylabel("residual\n[σ]", fontsize="small")
     axes[0, 0].legend(frameon=False, fontsize="small", markerscale=2)

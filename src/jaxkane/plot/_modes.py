@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._common.lookup import refuse_unknown
+from .._common.lookup import label_of, refuse_unknown
 from ._axes import SOFT
 
 
@@ -65,8 +65,8 @@ def mode_shapes(
         for i, (row, z) in enumerate(zip(rows, phasors, strict=True)):
             arrow = {"arrowstyle": "-|>", "color": f"C{i}", "linewidth": 2.0, "shrinkA": 0, "shrinkB": 0}
             ax.annotate("", (np.angle(z), abs(z)), (0.0, 0.0), arrowprops=arrow)
-            ax.plot([], [], color=f"C{i}", linewidth=2.0, label=labels[row].replace("_", " "))
-        name = f"{names[k]}: " if names[k] else ""
+            ax.plot([], [], color=f"C{i}", linewidth=2.0, label=label_of(labels[row]).replace("_", " "))
+        name = f"{label_of(names[k])}: " if names[k] else ""
         ax.set_title(f"{name}{_in_words(lam[k])}{where}", fontsize="medium")
         ax.set(rlim=(0.0, 1.05), yticks=[0.5, 1.0], yticklabels=[])
         ax.set_xticks(np.deg2rad([0, 90, 180, 270]))

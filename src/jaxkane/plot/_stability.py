@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from .._common.lookup import label_of
 from ._axes import SOFT, STABLE, finish, one
 
 
@@ -43,10 +44,10 @@ def eigenvalues(
     ax.axhline(0.0, color=SOFT, linewidth=0.8)
     colors = {name: f"C{i}" for i, name in enumerate(dict.fromkeys(names))}
     for column, name in zip(lam.T, names, strict=True):
-        ax.plot(x, column.real, color=colors[name], label=name or "real part")
+        ax.plot(x, column.real, color=colors[name], label=label_of(name) or "real part")
         swings = np.where(np.abs(column.imag) > 1e-9, column.imag, np.nan)
         if np.isfinite(swings).any() and np.nanmax(swings) > 0:
-            label = f"{name}, imaginary" if name else "imaginary part"
+            label = f"{label_of(name)}, imaginary" if name else "imaginary part"
             ax.plot(x, np.where(swings > 0, swings, np.nan), ":", color=colors[name], linewidth=1.2, label=label)
     for border in borders:
         ax.annotate(f"{border:.3g}", (border, low), xytext=(2, 3), textcoords="offset points", fontsize="small")

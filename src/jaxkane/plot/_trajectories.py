@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._common.lookup import as_names
+from .._common.lookup import as_names, label_of
 from .._description.units import in_degrees, refuse_no_angle, unit_of
 from .._simulation.trajectory import Status, Trajectory
 from ._axes import SOFT, finish, panels
@@ -59,7 +59,7 @@ def trajectories(
         shown = []
         for name in group:
             y, unit = _in_unit(values[name], known[name], degrees)
-            parts = [part for part in (name if len(group) > 1 else "", label) if part]
+            parts = [part for part in (label_of(name) if len(group) > 1 else "", label) if part]
             y = y.reshape(n, -1)
             line = ax.plot(t[0], y[0], label=", ".join(parts) or None, **members | style)[0]
             ax.plot(t[1:].T, y[1:].T, **members | style | {"color": line.get_color()})
@@ -79,8 +79,8 @@ def _in_unit(y: np.ndarray, unit: str, degrees: bool) -> tuple[np.ndarray, str]:
 
 def _axis_label(shown: Sequence[tuple[str, str]]) -> str:
     units = {unit for _, unit in shown}
-    name = shown[0][0].replace("_", " ") if len(shown) == 1 else ""
-    unit = f"[{units.pop()}]" if len(units) == 1 and units != {""} else ""
+    name = label_of(shown[0][0]).replace("_", " ") if len(shown) == 1 else ""
+    unit = f"[{label_of(units.pop())}]" if len(units) == 1 and units != {""} else ""
     return f"{name}\n{unit}".strip()
 
 
@@ -98,4 +98,6 @@ def _mark_ends(ax: Any, trajectory: Trajectory, t: np.ndarray, y: np.ndarray, co
 def _tell_the_end(axes: np.ndarray, trajectory: Trajectory) -> None:
     for ax in axes:
         ax.axvline(float(trajectory.t_end), color=SOFT, linestyle=":", linewidth=1.0)
-    axes[0].set_title(f"{trajectory.reason} at {float(trajectory.t_end):.3g} s", loc="right", fontsize="small")
+    axes[0].set_title(
+        f"{label_of(trajectory.reason)} at {float(trajectory.t_end):.3g} s", loc="right", fontsize="small"
+    )

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..._common.lookup import label_of
 from .._analysis.profile import Profile
 from .._result.residuals import autocorrelations
 from .._result.result import Fit
@@ -30,7 +31,9 @@ def draw_estimates(fit: Fit) -> Any:
             ax.plot([low, high], [i, i], color="C0", linewidth=3, solid_capstyle="butt")
         ax.plot(0, i, "o", color="C0", label="estimate, 95 % interval" if i == 0 else None)
         ax.plot(start, i, "x", color="C3", label="start" if i == 0 else None)
-    ax.set(yticks=range(len(fit.names)), yticklabels=fit.names, xlabel="difference from the estimate [%]")
+    ax.set(
+        yticks=range(len(fit.names)), yticklabels=[*map(label_of, fit.names)], xlabel="difference from the estimate [%]"
+    )
     ax.set_ylim(len(fit.names) - 0.4, -0.6)
     ax.grid(alpha=0.3, axis="x")
     figure.legend(frameon=False, fontsize="small", loc="outside upper right", ncols=2)
@@ -43,8 +46,9 @@ def draw_correlation(fit: Fit) -> Any:
     figure = _figure(3.4 + 0.55 * p, 1.8 + 0.5 * p)
     ax = figure.subplots()
     shown = ax.imshow(fit.correlation, vmin=-1, vmax=1, cmap="RdBu_r")
-    ax.set_xticks(range(p), fit.names, rotation=45, ha="right")
-    ax.set_yticks(range(p), fit.names)
+    names = [*map(label_of, fit.names)]
+    ax.set_xticks(range(p), names, rotation=45, ha="right")
+    ax.set_yticks(range(p), names)
     for i in range(p):
         for j in range(p):
             c = fit.correlation[i, j]
@@ -95,7 +99,7 @@ def draw_residuals(fit: Fit) -> Any:
         flat = np.concatenate(every)
         left.hist(np.clip(flat[np.isfinite(flat)], -4, 4), bins=41, range=(-4, 4), density=True, color="C0", alpha=0.6)
         left.plot(grid, np.exp(-(grid**2) / 2) / np.sqrt(2 * np.pi), color="C1", linewidth=1)
-        left.set_ylabel(channel.replace("_", "\n"))
+        left.set_ylabel(label_of(channel).replace("_", "\n"))
         lags = max(2, min(25, min(np.isfinite(r).sum() for r in every) // 3))
         mean = autocorrelations(every, lags)
         right.bar(np.arange(1, lags + 1), mean, width=0.7)
@@ -117,7 +121,7 @@ def draw_profiles(fit: Fit, profiles: Sequence[Profile]) -> Any:
         ax.plot(profile.values, fit.cost + ((profile.values - best) / error) ** 2, "--", color="0.6")
         for end in profile.interval:
             ax.axvline(end, color="C3", linewidth=1)
-        ax.set(xlabel=profile.name, ylabel=fit.problem.cost_name)
+        ax.set(xlabel=label_of(profile.name), ylabel=fit.problem.cost_name)
     for ax in axes[len(profiles) :]:
         ax.remove()
     return figure
