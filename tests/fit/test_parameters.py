@@ -7,7 +7,8 @@ import pytest
 from systems import POSED, TRIAL, Track
 
 import jaxkane as jk
-from jaxkane.fit import Free, Gain, LeastSquares, Problem, fit
+from jaxkane.fit import Free, Gain, Intensity, LeastSquares, Problem, Sigma, fit
+from jaxkane.fit._analysis.plausible import plausible_of
 from jaxkane.fit._problem.bijections import Interval, log_gaussian_mass
 from jaxkane.fit._problem.entries import parameters_of
 
@@ -106,6 +107,13 @@ def test_a_start_on_a_given_bound_is_searched_from_inside(bounds, begins):
     parameters = parameters_of(SYSTEM, Free("offset", bounds=bounds, scale=0.5))
     assert float(parameters.start[0]) == 0.0
     assert float(parameters.values(jnp.zeros(1))[0]) == pytest.approx(begins)
+
+
+def test_the_size_of_noise_has_no_plausible_range_of_its_own():
+    free = ("gain", Intensity("x_dot"), Sigma("x", bounds=(0.1, 10.0)), Intensity("push", prior=(1.0, 0.1)))
+    parameters = parameters_of(Track(), free, {"x_dot": 0.2, "push": 1.0}, ("x",))
+    assert {*plausible_of(parameters, {}).ranges} == {"gain", "sigma of x", "intensity of push"}
+    assert plausible_of(parameters, {"intensity of x_dot": (0.1, 0.3)}).ranges["intensity of x_dot"] == (0.1, 0.3)
 
 
 def test_friction_that_starts_at_its_bound_is_found():

@@ -277,6 +277,14 @@ def test_fits_beside_each_other(rubbing, found):
     for words in ("with friction", "dry", f"{found.fit.cost:.6g}", "swing 5", "neighbours' correlation", "Held back"):
         assert words in text
     assert f"{found.fit.cost:.6g}" in table._repr_html_()
+    assert "status" in text
+    # An objection is a row: a cell of all of them would make every column as wide.
+    assert [row for heading, rows in table.tables if heading == "Not plausible" for row in rows] == [
+        ["fit", "objection"],
+        ["viscous", "damping = 0.5362 is above 0.45"],
+    ]
+    with pytest.raises(ValueError, match="`plausible` names dampign; did you mean 'damping'"):
+        compare([rubbing], plausible={"dampign": 0.5})
     with pytest.raises(ValueError, match="There is no fit"):
         compare({})
     with pytest.raises(TypeError, match="got one Fit"):

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..._common.lookup import refuse_unknown
 from .._data.trial import Trial
 from .._problem.arguments import refuse_other
 from .._result.result import Fit
@@ -36,6 +37,9 @@ class Comparison:
     def tables(self) -> list[Table]:
         """A heading and rows, of which the first is the head, for each."""
         found = [("Parameters, with the errors of their intervals", self._parameters()), ("All", self._sums())]
+        if any(self.objections.values()):
+            rows = [[name, objection] for name, objections in self.objections.items() for objection in objections]
+            found.append(("Not plausible", [["fit", "objection"], *rows]))
         found.append(("Sum of squares and variance accounted for, by channel", self._channels(self.fits)))
         found.append(("Sum of squares, by trial", self._trials(self.fits)))
         if self.held_out:
@@ -56,14 +60,15 @@ class Comparison:
 
     def _sums(self) -> list[list[str]]:
         fits, columns = list(self.fits.values()), list(self.fits)
-        rows = [["", *columns], ["sum of squares", *(f"{fit.cost:.6g}" for fit in fits)]]
+        rows = [["", *columns], ["status", *(fit.status for fit in fits)]]
+        for cost in dict.fromkeys(fit.problem.cost_name for fit in fits):
+            rows.append([cost, *(f"{fit.cost:.6g}" if fit.problem.cost_name == cost else "" for fit in fits)])
         if self.held_out:
             rows.append(["held back", *(_held_cost(self.held_out[name]) for name in columns)])
         rows.append(["residuals", *(str(fit.problem.size[0]) for fit in fits)])
         rows.append(["unknowns", *(str(fit.problem.size[1]) for fit in fits)])
         rows.append(["variance of a residual", *(f"{fit.variance:.3g}" for fit in fits)])
         rows.append(["neighbours' correlation", *(f"{fit.autocorrelation:.2f}" for fit in fits)])
-        rows.append(["not plausible", *("; ".join(self.objections[name]) or "nothing" for name in columns)])
         return rows
 
     def _channels(self, fits: Mapping[str, Fit]) -> list[list[str]]:
@@ -138,6 +143,7 @@ def compare(
     for fit in named.values():
         refuse_other(fit, Fit, "compare", "compare({'first': fit(...), 'second': fit(...)})")
     said = plausible or {}
+    refuse_unknown(said, [name for fit in named.values() for name in fit.names], "`plausible` names")
     return Comparison(
         fits=named,
         held_out={} if held_out is None else {name: applied_to(fit, held_out) for name, fit in named.items()},

@@ -51,7 +51,7 @@ def plausible_of(parameters: Parameters, said: Mapping[str, Any]) -> Plausible:
             elif isinstance(bijection, Interval) and all(bijection.bounded):
                 low, high = float(bijection.lower), float(bijection.upper)
                 ranges[name] = low + 1e-3 * (high - low), high - 1e-3 * (high - low)
-            elif start:
+            elif start and parameters.entries[i].start_means_something:
                 ranges[name] = min(f * start for f in FAR), max(f * start for f in FAR)
         first += size
     return Plausible(ranges)

@@ -28,6 +28,11 @@ class Entry:
     role: tuple[str, str] | None = None  # such as ("gain of input", name), ("intensity", disturbed), ("sigma", channel)
     part: str = ""  # the learned function that it belongs to
 
+    @property
+    def start_means_something(self) -> bool:
+        """Whether its initial guess says of what size it is: not of a learned number, nor of the size of noise."""
+        return not self.part and (self.role is None or self.role[0] not in ("intensity", "sigma"))
+
 
 class Parameters(eqx.Module):
     """The free parameters of a fit: x (p,), zero where the search begins and about one where much has changed, to

@@ -265,12 +265,10 @@ def only_priors(fit: Fit) -> list[str]:
 def far_from_start(fit: Fit) -> list[str]:
     """Estimates that left what the user thought plausible by far, and are still called precise."""
     notes = []
-    means_nothing = {  # the size of noise is not known beforehand
-        e.name for e in fit.parameters.entries if e.part or (e.role and e.role[0] in ("intensity", "sigma"))
-    }
+    worthless = {entry.name for entry in fit.parameters.entries if not entry.start_means_something}
     for name, value in fit.estimates.items():
         start, error = fit.start[name], fit.standard_errors[name]
-        if name in means_nothing:
+        if name in worthless:
             continue
         if start != 0 and not 0.4 <= value / start <= 2.5 and error < 0.2 * abs(value):
             notes.append(
