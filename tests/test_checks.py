@@ -3,6 +3,7 @@
 import dataclasses
 import warnings
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -156,6 +157,53 @@ def test_a_body_that_turns_in_its_frame_must_be_symmetric():
     assert np.isfinite(evaluate(Rotor())).all()
     with pytest.raises(ValueError, match="'rotor' turns in its frame 'N'"):
         evaluate(Rotor(across=0.15))  # of one structure with what was right
+
+
+class TwoHingesOnOneAxis(jk.System):
+    """Two links turn about one axis, the first without mass: only the sum of their speeds moves anything.
+
+    With many, there are other bodies beside it, so that LAPACK solves for the accelerations.
+    """
+
+    inertia: jk.Scalar = jk.parameter(0.0)  # [kg m^2] of the first link about the axis
+    scale: jk.Scalar = jk.parameter(1.0)
+    many: bool = eqx.field(static=True, default=False)
+
+    @property
+    def coordinates(self):
+        return ("a", "b", "c", *(f"x{i}" for i in range(12 * self.many)))
+
+    @property
+    def speeds(self):
+        return tuple(f"{name}_rate" for name in self.coordinates)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, q["a"], u["a_rate"])
+        B = A.rotate(A.vector(0.3, 0.5, 0.81), q["b"], u["b_rate"])
+        C = B.rotate(B.vector(0.3, 0.5, 0.81), q["c"], u["c_rate"])
+        upper, lower = O.fixed(A.vector(0.3, 0.1, 0.7)), O.fixed(C.vector(0.1, 0.2, 0.3))
+        moments = [[self.scale * x for x in I] for I in ((0.07, 0.1, 0.13), (0.3, 0.2, 0.17))]
+        bodies = [jk.Body(0.3 * self.scale, moments[0], upper, A), jk.Body(0.2 * self.scale, moments[1], lower, C)]
+        rotor = jk.Body(0.0, (self.inertia, 0.0, 0.0), O, N, u["b_rate"] * N.x, name="rotor")
+        beside = [O.moving(q[i] * N.x, u[i] * N.x) for i in range(3, len(q))]
+        return jk.Motion([*bodies, rotor, *(jk.Body(1.0, 0.0, P) for P in beside)])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Torque(self.scale * (0.1 * motion.N.x + 0.4 * motion.N.z), motion.bodies[1].frame)
+
+
+@pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_mass_matrix_that_is_singular_but_for_rounding(many):
+    system = TwoHingesOnOneAxis(many=many)
+    rng = np.random.default_rng(0)
+    for q, u in rng.normal(size=(4, 2, len(system.coordinates))):
+        with pytest.raises(ValueError, match="the mass matrix is singular: a combination of b_rate, c_rate moves no"):
+            evaluate(system, q, u)
+    assert np.isnan(jax.jit(lambda u: evaluate(system, q, u))(u)).any()
+    # Small masses are no fault, nor is a link of little inertia.
+    for light in (dict(inertia=1e-9), dict(inertia=1e-21, scale=1e-12)):
+        assert np.isfinite(evaluate(TwoHingesOnOneAxis(many=many, **light), q, u)).all()
 
 
 def test_what_motion_and_loads_return():

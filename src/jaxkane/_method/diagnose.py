@@ -9,6 +9,7 @@ import numpy as np
 
 from .._description.loads import Force
 from .._description.system import System
+from .._scalars.linear import rounding_of_pivots
 from .._scalars.versions import compiled
 from .drift import constraint_rows, dependent_speeds_from
 from .kane import Instant
@@ -43,9 +44,9 @@ def diagnosis(system: System, t: Any, q: Any, u: Any, inputs: Any = None) -> str
                 f"{name}: the constraints cannot be solved for {_listed(system.dependent_speeds)} at {place} "
                 f"({cause}): {found.advice()}"
             )
-    q_dot, M, f = (np.asarray(x, dtype=float) for x in _equations(system, t, q, u, inputs or {}))
+    q_dot, M, f = (np.asarray(x) for x in _equations(system, t, q, u, inputs or {}))
     if np.all(np.isfinite(M)):
-        massless = _massless(M, system.speeds)
+        massless = _massless(M.astype(float), system.speeds, rounding_of_pivots(M.dtype))
         if massless:
             return (
                 f"{name}: {massless}, so Kane's equations have no solution. Give the bodies that it moves mass and "
@@ -81,16 +82,16 @@ def _loads_not_finite(system: System, t: Any, q: Any, u: Any, inputs: Any) -> st
     return f"{_listed(places)} {'is' if len(places) == 1 else 'are'} not finite{hint}"
 
 
-def _massless(M: np.ndarray, speeds: tuple[str, ...]) -> str:
+def _massless(M: np.ndarray, speeds: tuple[str, ...], rounding: float) -> str:
     """The null directions of a mass matrix, by the names of their speeds."""
     # Units apart: a speed is compared with the largest entry of its own row.
     rows = np.abs(M).max(axis=1)
-    alone = [speed for speed, size in zip(speeds, rows, strict=True) if size <= ROUNDING * rows.max()]
+    alone = [speed for speed, size in zip(speeds, rows, strict=True) if size <= rounding * rows.max()]
     if alone:
         return f"no mass moves with the speed{'s' * (len(alone) > 1)} {_listed(alone)}"
     scale = 1 / np.sqrt(np.maximum(np.diag(M), 1e-300))
     values, vectors = np.linalg.eigh(M * scale[:, None] * scale)
-    if values[0] > ROUNDING * len(M):
+    if values[0] > rounding:
         return ""
     vector = np.abs(vectors[:, 0])
     together = [speed for speed, x in zip(speeds, vector, strict=True) if x > 1e-6 * vector.max()]

@@ -144,12 +144,22 @@ def is_written_out(n: int) -> bool:
 
 
 def solve_positive_array(M, b):
-    """The solution x (n,) of M x = b for a symmetric positive definite array M (n, n), by LAPACK."""
-    return jsl.cho_solve(jsl.cho_factor(M), b)
+    """The solution x (n,) of M x = b for a symmetric positive definite array M (n, n), by LAPACK; NaN where M is
+    singular but for rounding."""
+    factor = jsl.cho_factor(M)
+    is_regular = jnp.all(jnp.diag(factor[0]) ** 2 > rounding_of_pivots(M.dtype) * jnp.diag(M))
+    return jnp.where(is_regular, jsl.cho_solve(factor, b), jnp.nan)
+
+
+def rounding_of_pivots(dtype: Any) -> float:
+    """Pivots of L D L^T that are less than this, beside their diagonal entries of M, are zero but for rounding. Their
+    units do not matter, nor whether masses are small."""
+    return 100 * float(jnp.finfo(dtype).eps)
 
 
 def solve_positive(M: Rows, b: Sequence[Component]) -> tuple[Component, ...]:
-    """The solution x of M x = b for a symmetric positive definite M, of which the upper triangle is read."""
+    """The solution x of M x = b for a symmetric positive definite M, of which the upper triangle is read; NaN where M
+    is singular but for rounding."""
     n = len(M)
     # M = L D L^T, column by column; d holds the pivots, L the rows below the diagonal.
     L: list[list[Component]] = [[0.0] * n for _ in range(n)]
@@ -158,6 +168,8 @@ def solve_positive(M: Rows, b: Sequence[Component]) -> tuple[Component, ...]:
         pivot = M[j][j]
         for k in range(j):
             pivot = sub(pivot, mul(mul(L[j][k], L[j][k]), d[k]))
+        if pivot is not M[j][j]:
+            pivot = _regular(pivot, M[j][j])
         d.append(pivot)
         for i in range(j + 1, n):
             entry = M[j][i]
@@ -173,6 +185,14 @@ def solve_positive(M: Rows, b: Sequence[Component]) -> tuple[Component, ...]:
         for k in range(i + 1, n):
             x[i] = sub(x[i], mul(L[k][i], x[k]))
     return tuple(x)
+
+
+def _regular(pivot: Component, diagonal: Component) -> Component:
+    """The pivot, or NaN where it is no more than what rounding has left of the diagonal entry."""
+    if is_exact(pivot) and is_exact(diagonal):
+        return pivot if pivot > rounding_of_pivots(float) * diagonal else math.nan
+    least = rounding_of_pivots(jnp.result_type(pivot, diagonal)) * diagonal
+    return jnp.where(pivot > least, pivot, math.nan)
 
 
 def _quotient(a: Component, b: Component) -> Component:
