@@ -4,6 +4,7 @@ import ctypes
 import functools
 import importlib.util
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -19,6 +20,28 @@ import jaxkane as jk
 from jaxkane._method.formulas import JACOBIANS, Formulas
 from jaxkane._scalars.graph import Graph, unrolled
 from jaxkane._scalars.written import as_source
+from jaxkane.bicycles import (
+    Arms,
+    Bicycle,
+    Drag,
+    HeadTwist,
+    LaneChange,
+    LateralSlip,
+    LeaningRider,
+    LeanSteerGains,
+    LongitudinalSlip,
+    PathFollower,
+    RigidRider,
+    Road,
+    Slope,
+    SteeringFriction,
+    SteeringMotor,
+    Trailer,
+    Tyre,
+    browser_jason,
+    schwalbe_energizer,
+    separate_rider,
+)
 from jaxkane.catalog import CATALOG
 from jaxkane.export._c_language import HELPERS, C
 from jaxkane.export._names import identifiers
@@ -215,6 +238,34 @@ def test_the_header_is_read_by_cpp_too(tmp_path):
     assert "void double__rates(" in header
 
 
+def test_two_parameters_keep_two_names(tmp_path):
+    """ "extra[0].mass" and a field "extra_0_mass" would be one identifier."""
+
+    class Cart(jk.System):
+        extra: tuple[Part, ...] = (Part(mass=2.0), Part(mass=3.0))
+        extra_0_mass: jk.Scalar = jk.parameter(5.0)
+        extra_0__mass: jk.Scalar = jk.parameter(7.0)
+        coordinates, speeds = ("x",), ("v",)
+
+        def motion(self, t, q, u):
+            N, O = jk.inertial()
+            mass = self.extra[0].mass + 10.0 * self.extra[1].mass
+            return jk.Motion([jk.Body(mass, 0.0, O.moving(q[0] * N.x, u[0] * N.x))])
+
+        def loads(self, t, q, u, motion, inputs):
+            return jk.Force((100.0 * self.extra_0_mass + 1000.0 * self.extra_0__mass) * motion.N.x, motion.bodies[0])
+
+    header = jk.export.c(Cart(), tmp_path / "cart.c", ("equations",)).header.read_text()
+    members = re.findall(r"double (\w+);(?: /\* (\S+))?", header)
+    names = ["extra[0].mass", "extra[1].mass", "extra_0_mass", "extra_0__mass"]
+    assert list(jk.export.parameters(Cart())) == names
+    assert len(members) == len({member for member, _ in members}) == 4
+    assert [own or member for member, own in members] == names
+    module = {}
+    exec(jk.export.numpy(Cart(), functions=("equations",)), module)
+    assert [float(x.squeeze()) for x in module["equations"](0.0, [0.0], [0.0])] == [32.0, 7500.0]
+
+
 def test_names_of_other_languages():
     names = ["θ̈", "φ", "ϕ", "a.b", "a[b]", "int", "int_", "2x", "Δ", "é", "_", "车"]
     found = identifiers(names, {"int"})
@@ -371,6 +422,90 @@ def test_no_number_and_signed_zeros_in_source(language, tmp_path):
     if language is in_c:
         signed = ~np.isnan(expected)
         np.testing.assert_array_equal(np.signbit(found[signed]), np.signbit(expected[signed]))
+
+
+# Bicycles from parts
+
+
+def steered():
+    """Tyres that slip, one of them measured, a head that gives way, a rider, a path, a motor, drag, a grade."""
+    rider = LeaningRider(
+        mass=40.0, x=0.25, z=-1.0, Ixx=1.8, Iyy=1.8, Izz=0.9, Ixz=0.1, hinge_x=0.2, hinge_z=-0.8, stiffness=120.0
+    )  # fmt: skip
+    simple = LateralSlip(9e3, 9e2, relaxation_length=0.1, pneumatic_trail=0.02)
+    gains = LeanSteerGains(-50.0, 35.0, -13.0, 3.5, command="steer_command")
+    return separate_rider(Bicycle.benchmark(), rider).with_parts(
+        rear_tyre=Tyre(crown=0.02, lateral=simple, rolling_resistance=0.005, load_lag=0.05),
+        front_tyre=Tyre(lateral=schwalbe_energizer(relaxation_length=0.1), longitudinal=LongitudinalSlip(1e4)),
+        head=HeadTwist(5e3, 10.0, 0.4),
+        control=(PathFollower(LaneChange()), gains),
+        steering=(SteeringFriction(0.2), SteeringMotor(lag=0.02, delay=0.03, limit=20.0, rotor_inertia=1e-4)),
+        drive=Drag(),
+        road=Slope(0.05, 0.3),
+    )
+
+
+def carrying():
+    """A rider's arms, and a trailer."""
+    rider = RigidRider(mass=42.0, x=0.2, z=-1.25, Ixx=1.7, Iyy=1.5, Izz=0.9, Ixz=0.0, shoulder=[0.33, 0.2, -1.47])
+    trailer = Trailer(
+        hitch_x=-0.1, hitch_z=-0.5, length=1.2, wheel_radius=0.25, mass=20.0, center=0.1, height=0.2, Ixx=1.0, Iyy=1.0,
+        Izz=1.2,
+    )  # fmt: skip
+    return browser_jason().with_parts(
+        rider=rider, extra=[Arms.of_person(83.5, 1.83, grip=[0.55, 0.28, -1.05]), trailer]
+    )
+
+
+def over_a_bump():
+    bump = Road(lambda x, y: 0.05 * jnp.exp(-(((x - 2.0) / 0.5) ** 2)) + 0.01 * y)
+    return Bicycle.benchmark().with_parts(road=bump, rear_tyre=Tyre(crown=0.02))
+
+
+@pytest.mark.slow
+@needs_compiler
+@pytest.mark.parametrize("made", [steered, carrying, over_a_bump], ids=lambda made: made.__name__)
+def test_every_export_of_a_bicycle_from_parts_gives_the_numbers_of_the_library(made, tmp_path):
+    """At a state where nothing is zero, and with other parameters than those that were exported."""
+    rtol = 1e-12
+    bicycle, t, rng = made(), 0.7, np.random.default_rng(0)
+    of = lambda names, size: {name: float(size * rng.normal()) for name in names}  # noqa: E731
+    moving = of(bicycle.speeds, 0.1) | {"rear_wheel_rate": -15.0}
+    held = [name for name in bicycle.coordinates if name not in bicycle.dependent_coordinates]
+    start = jk.assemble(bicycle, of(held, 0.05), moving)
+    q, u = np.asarray(start.q), np.asarray(start.u)
+    values = of(bicycle.inputs, 0.3) | of(bicycle.states, 0.01)
+
+    names = [name for name in jk.export.parameters(bicycle) if name.endswith((".mass", ".stiffness", "w", "mH"))]
+    exported, bicycle = bicycle, bicycle.with_parts(
+        **{name: 1.01 * jk.export.parameters(bicycle)[name] for name in names}
+    )  # fmt: skip
+    parameters = jk.export.parameters(bicycle)
+    expected = {
+        "rates": [jk.coordinate_rates(bicycle, t, q, u), jk.accelerations(bicycle, t, q, u, values)],
+        "equations": jk.equations_of_motion(bicycle, t, q, u, values),
+        "dependent_speeds": [jk.dependent_speeds(bicycle, t, q, u)],
+    }
+    if bicycle.states:
+        rates = jk.state_rates(bicycle, t, q, u, values)
+        expected["state_rates"] = [[rates[name] for name in bicycle.states]]
+    expected = {function: [np.asarray(x) for x in numbers] for function, numbers in expected.items()}
+    functions, w = tuple(expected), np.array([*values.values()])
+
+    files = jk.export.c(exported, tmp_path / "bicycle.c", functions)
+    library, module = library_of(files, tmp_path), {}
+    exec(jk.export.numpy(exported, functions=functions), module)
+    column = np.concatenate([x.ravel() for x in parameters.values()])
+    for function, numbers in expected.items():
+        in_c = call(library, f"bicycle_{function}", t, [q, u, w, column], [x.shape for x in numbers])
+        in_numpy = module[function](t, q, u, w, parameters)
+        assert_close(in_c, numbers, rtol, f"C, {function}")
+        assert_close(in_numpy if isinstance(in_numpy, tuple) else [in_numpy], numbers, rtol, f"NumPy, {function}")
+    rates = jk.export.stablehlo(exported).call(*(np.array([x]) for x in (t, q, u, w)), parameters)
+    assert_close([x[0] for x in rates], expected["rates"], rtol, "StableHLO")
+    pytest.importorskip("casadi")
+    rates = jk.export.casadi(exported)(t, q, u, w, column)
+    assert_close([np.array(x)[:, 0] for x in rates], expected["rates"], rtol, "CasADi")
 
 
 # CasADi

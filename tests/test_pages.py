@@ -7,10 +7,13 @@ import matplotlib
 
 matplotlib.use("Agg")
 
+import jax.numpy as jnp
 import matplotlib.pyplot as plt
+import numpy as np
 import pytest
 
 import jaxkane as jk
+from jaxkane.bicycles import PathFollower
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = sorted(path for path in DOCS.glob("*.md") if path.name != "describing.md")  # see test_documentation.py
@@ -24,10 +27,52 @@ def test_a_page_runs(page, tmp_path, monkeypatch):
     if page.stem == "symbolic":
         pytest.importorskip("sympy")
     monkeypatch.chdir(tmp_path)
-    names = {}
+    names, systems = {}, {}
     for block in blocks:
         exec(compile(block, page.name, "exec"), names)
+        systems |= {id(x): x for x in names.values() if isinstance(x, jk.System)}
+        for name, ride in names.items():
+            assert not isinstance(ride, jk.Trajectory) or np.all(ride.ok), f"{page.name}: {name}: {ride}"
     plt.close("all")
+    if page.stem in SIMULATED:
+        kinds = {x for x in names.values() if isinstance(x, type) and issubclass(x, jk.System)} - {jk.System}
+        made = [
+            getattr(kind, "benchmark", kind)() for kind in kinds if not any(type(x) is kind for x in systems.values())
+        ]
+        for system in (*systems.values(), *made):
+            assert_moves(system)
+
+
+SIMULATED = ("bicycles", "bicycles_riders", "bicycles_tyres", "bicycles_control", "elements", "sensors")
+
+
+def assert_moves(system):
+    """Whatever a page puts together moves for half a second, keeps its energy, and is like its mirror image."""
+    if not isinstance(system, jk.catalog.WhippleBicycle):
+        ride_of(system, dict.fromkeys(system.coordinates, 0.1), {})
+        return
+    rolling = {} if "rear_wheel_rate" in system.dependent_speeds else {"rear_wheel_rate": -5.0 / float(system.rR)}
+    right = ride_of(system, {"roll": 0.02, "steer": 0.01}, rolling)
+    control = getattr(system, "control", None)
+    if any(isinstance(part, PathFollower) for part in (control if isinstance(control, tuple) else ())):
+        return  # a path leads to one side
+    left = ride_of(system, {"roll": -0.02, "steer": -0.01}, rolling)
+    sides = {"left": "right", "right": "left"}
+    aside = {*system.lateral, "yaw", "y", "yaw_rate", "front_y", "front_y_rate"}
+    for name in (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.states):
+        side, _, rest = name.partition("_")
+        twin = f"{sides[side]}_{rest}" if side in sides else name
+        sign = -1.0 if name in aside else 1.0
+        np.testing.assert_allclose(left[name], sign * right[twin], rtol=0, atol=1e-9, err_msg=name)
+
+
+def ride_of(system, q, u):
+    ride = jk.simulate(system, jk.assemble(system, q, u), jnp.linspace(0.0, 0.5, 101))
+    assert ride.ok, f"{system}: {ride}"
+    audit = jk.audit(system, ride)
+    assert audit.ok, audit
+    assert audit.energy_balance < 1e-6
+    return ride
 
 
 def test_links_and_pictures_are_there():
