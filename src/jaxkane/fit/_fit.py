@@ -52,7 +52,8 @@ def fit(
     - `system`: with initial guesses of its parameters. `trials`: one `Trial` or several.
     - `free`: what to find: names, paths, functions to leaves, `Free`, `Gain`, `Delay` and `Inertia`.
     - `unknown`: coordinates, independent speeds and states of the first order whose value at the start of every window
-        is to be found too; dependent ones follow from them (`assemble`).
+        is to be found too; dependent ones follow from them (`assemble`). What is measured and not among them starts at
+        its first sample, with the error of that.
     - `sensor_bias`, `sensor_gain`: channels with an unknown constant offset and factor in every trial. `input_bias`,
         `input_gain`, `input_delay` [s]: inputs with an offset, a factor and a delay of every trial's own.
     - These are names, or a dict from names to the standard deviation of a Gaussian prior around the initial guess
