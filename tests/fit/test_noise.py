@@ -27,6 +27,7 @@ from jaxkane.fit import (
     Sigma,
     Simulation,
     Trial,
+    compare,
     find_continuity,
     fit,
     load,
@@ -176,6 +177,8 @@ def test_the_fit_is_the_maximum(case, found):
     assert "normalized innovations" in report(found)
     assert found.innovation == pytest.approx(1.0, abs=0.3)
     assert found.variance == 1.0
+    # How large noise is nobody knows beforehand: nothing is implausible.
+    assert compare({"one": found}).objections["one"] == ()
     n = sum(np.isfinite(v).sum() for v in y.values())
     assert sum(np.isfinite(r).sum() for r in found.residuals["trial"].values()) == n
     assert found.nuisance == {"trial": {}}

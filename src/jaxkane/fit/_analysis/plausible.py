@@ -1,4 +1,4 @@
-"""Whether a value can be believed: what was said of it, its prior, its bounds, how far it went. Knows numbers."""
+"""Whether a value can be believed: what was said of it, its prior, its bounds. Knows numbers."""
 
 from __future__ import annotations
 
@@ -11,9 +11,6 @@ from .._problem.bijections import Interval
 from .._problem.parameters import Parameters
 
 Range = tuple[float, float]
-
-FAR = 0.4, 2.5
-"""Shares of its start beyond which a value of which nothing is said is not believed (as in `Fit.notes`)."""
 
 DEVIATIONS = 3.0
 """Of its prior, by which a value may be off."""
@@ -38,7 +35,7 @@ class Plausible:
 
 def plausible_of(parameters: Parameters, said: Mapping[str, Any]) -> Plausible:
     """For every parameter what was said of it, (lower, upper) or a share of its start; else three deviations of its
-    prior; else its bounds, of which it must stay away, or a factor of 2.5 from a start that is not zero."""
+    prior; else its bounds, of which it must stay away. Where a search starts says nothing."""
     ranges, first = {}, 0
     for bijection, size in zip(parameters.bijections, parameters.sizes, strict=True):
         for i in range(first, first + size):
@@ -51,8 +48,6 @@ def plausible_of(parameters: Parameters, said: Mapping[str, Any]) -> Plausible:
             elif isinstance(bijection, Interval) and all(bijection.bounded):
                 low, high = float(bijection.lower), float(bijection.upper)
                 ranges[name] = low + 1e-3 * (high - low), high - 1e-3 * (high - low)
-            elif start and parameters.entries[i].start_means_something:
-                ranges[name] = min(f * start for f in FAR), max(f * start for f in FAR)
         first += size
     return Plausible(ranges)
 
