@@ -177,7 +177,7 @@ def test_a_load_beyond_a_measured_tyre_is_told_with_the_tyre(ask):
         ),
         (
             {"rider": RIDER, "extra": [RIDER]},
-            r"extra\[0\], a RigidRider: .* point of the name 'left_shoulder'.*a class of your own",
+            r"extra\[0\], a RigidRider: .* point of the name 'left_shoulder'.*a Part of your own",
         ),
         ({"extra": [TRAILER, TRAILER]}, r"'trailer_angle' stands twice in `coordinates`: of extra\[0\], a Trailer"),
         (
@@ -311,6 +311,8 @@ def test_units_of_files(suffix, tmp_path):
         Bicycle.from_file(written(tmp_path, suffix, lam=18.0))
     with pytest.raises(ValueError, match=r"rR = 300 m .* In millimetres\?"):
         Bicycle.from_file(written(tmp_path, suffix, rR=300.0))
+    with pytest.raises(ValueError, match=rf"bicycle{suffix}: Bicycle.zB = 0\.9 m must lie between -20 and 0 m"):
+        Bicycle.from_file(written(tmp_path, suffix, zB=0.9))
     damaged = tmp_path / f"damaged{suffix}"
     damaged.write_bytes(b"\x00\xff\xfe\x81")
     with pytest.raises(ValueError, match=f"damaged{suffix} is no text file"):

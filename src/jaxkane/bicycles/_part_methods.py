@@ -70,7 +70,7 @@ def _refuse_names_twice(bicycle: Bicycle) -> None:
                     )
 
 
-_APART = "Values are read by name: a second part of a kind is a class of your own, with names of its own."
+_APART = "Values are read by name: for a second part of a kind write a Part of your own, with other names."
 
 
 def place_of(bicycle: Bicycle, part: Part) -> str:
