@@ -7,7 +7,7 @@ import pytest
 from test_events import TOP, Bead
 
 import jaxkane as jk
-from jaxkane._simulation.balance import _cumulative_integral
+from jaxkane._simulation.balance import Pieces, _cumulative_integral
 from jaxkane.catalog import CATALOG
 
 RTOL = 1e-8
@@ -90,6 +90,57 @@ def test_quadrature_is_exact_for_polynomials_at_uneven_times():
     integral = _cumulative_integral(t, 8 * t**7 - 1.0, 8)
     np.testing.assert_allclose(integral, t**8 - t - (t[0] ** 8 - t[0]), rtol=0, atol=1e-10)
     np.testing.assert_allclose(_cumulative_integral(t[:2], t[:2], 8)[1], 0.5 * (t[1] ** 2 - t[0] ** 2))
+
+
+KNOTS = np.linspace(0.0, 2.0, 21)
+TORQUE = jk.Samples(KNOTS, np.random.default_rng(5).normal(size=21), hold=True)
+
+
+@pytest.mark.parametrize(
+    "torque",
+    [
+        TORQUE,
+        pytest.param(jk.Samples(KNOTS, TORQUE.values), marks=pytest.mark.slow),
+        pytest.param(jk.Samples(KNOTS + 0.0334, TORQUE.values, hold=True), marks=pytest.mark.slow),
+        pytest.param(lambda t, s: TORQUE(t - 0.05) - 0.3 * s["theta1_dot"], marks=pytest.mark.slow),
+    ],
+    ids=["held", "linear", "between the times", "in a function"],
+)
+def test_the_work_of_inputs_with_kinks_and_jumps(torque):
+    rtol = 2e-7
+    audit = jk.audit(*run("DoublePendulum", 2.0, 201, {"shoulder_torque": torque}, rtol=1e-11, atol=1e-11))
+    assert audit.ok
+    assert np.abs(audit.work).max() > 0.1
+    assert audit.energy_balance < rtol
+    assert audit.work_error < 10 * rtol * np.abs(audit.work).max()
+
+
+@pytest.mark.slow
+def test_jumps_between_the_times_are_not_blamed_on_the_motion():
+    torque = {"shoulder_torque": jk.Samples(KNOTS, TORQUE.values, hold=True)}
+    audit = jk.audit(*run("DoublePendulum", 2.0, 6, torque, rtol=1e-11, atol=1e-11))
+    assert audit.ok
+    assert "save more times" in str(audit)
+
+
+def test_quadrature_of_pieces_is_exact_for_cubics():
+    """Between jumps, some at the times, some beside them: cubics of random coefficients, continued by zero."""
+    rtol, rng = 1e-11, np.random.default_rng(3)
+    t, jumps = np.linspace(0.0, 2.0, 21), np.array([0.3, 0.55, 0.8, 0.9, 1.42, 2.0])
+    cubics = rng.normal(size=(7, 4))
+    pieces = Pieces(t, jumps, 1e-14)
+    at, number = pieces.t, pieces.piece
+    values = np.array([np.polyval(cubics[i], x) for i, x in zip(number, at)])
+    rates = np.array([np.polyval(np.polyder(cubics[i]), x) for i, x in zip(number, at)])
+    ends = np.concatenate([[0.0], jumps[:-1], [2.0]])
+    exact = np.zeros_like(t)
+    for cubic, start, stop in zip(cubics, ends, ends[1:]):
+        integral = np.polyint(cubic)
+        exact += np.polyval(integral, np.clip(t, start, stop)) - np.polyval(integral, start)
+    np.testing.assert_allclose(pieces.integral(t, values, rates, 0), exact, rtol=rtol, atol=rtol)
+    seven = [np.polyval(np.polyder(c), x) for c, x in zip(cubics[number], at)]
+    known = np.bincount(number)[number] > 3
+    np.testing.assert_allclose(pieces.rate(values)[known], np.array(seven)[known], rtol=1e-8, atol=1e-8)
 
 
 def test_a_batch_is_refused():

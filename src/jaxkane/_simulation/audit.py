@@ -10,7 +10,7 @@ import numpy as np
 
 from .._description.system import System
 from .._method.drift import relative_condition
-from .balance import condition_of_masses, measured_along, work_of
+from .balance import Pieces, condition_of_masses, measured_along, powers_along, work_of
 from .one_motion import reached_times
 from .trajectory import Trajectory
 
@@ -151,7 +151,7 @@ def audit(system: System, trajectory: Trajectory) -> Audit:
     inputs = {key: x[reached] for key, x in trajectory.values.items()}
     now = jax.tree.map(lambda x: np.asarray(x, dtype=float), measured_along(system, t, q, u, inputs))
     ts = np.asarray(t, dtype=float)
-    work, work_error = work_of(ts, now)
+    work, work_error = work_of(ts, now, _pieces(system, trajectory, reached))
     return Audit(
         t=ts,
         kinetic_energy=now["T"],
@@ -168,6 +168,26 @@ def audit(system: System, trajectory: Trajectory) -> Audit:
         name=name,
         reason=trajectory.reason,
     )
+
+
+def _pieces(system: System, trajectory: Trajectory, reached: np.ndarray) -> Pieces | None:
+    """The motion between kinks and jumps of its inputs, where it has any."""
+    sides = trajectory.sides
+    if sides is None:
+        return None
+    t, q, u = (np.asarray(x)[reached] for x in (trajectory.t, trajectory.q, trajectory.u))
+    near = 64 * np.finfo(t.dtype).eps * np.abs(t).max()
+    pieces = Pieces(np.asarray(t, float), np.asarray(sides.times, float), near)
+    if not pieces.inner.size:
+        return None
+    values = {name: np.asarray(x)[reached][pieces.places] for name, x in trajectory.values.items()}
+    if sides.inputs:
+        before, after = ({name: np.asarray(x)[reached] for name, x in inputs.items()} for inputs in sides.inputs)
+        values |= {name: pieces.of(before[name], after[name]) for name in before}
+    input_rates = {name: pieces.rate(values[name]) for name in trajectory.inputs}
+    powers = powers_along(system, *(x[pieces.places] for x in (t, q, u)), values, input_rates)
+    pieces.powers = tuple(np.asarray(x, float) for x in powers)
+    return pieces
 
 
 def _largest(x: np.ndarray) -> float:

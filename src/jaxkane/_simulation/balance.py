@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -15,6 +16,7 @@ from .._description.vectors import Vector
 from .._method.description_facts import configuration_residual
 from .._method.rates import accelerations_and_mass_matrix
 from .._method.reactions import Reactions
+from .._method.right_hand_side import rates
 from .._scalars.components import ZERO3, add3, cross, dot, matvec
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, stack
@@ -55,6 +57,24 @@ def _measured(system, t, q, u, inputs, u_dot):
     }
 
 
+@compiled
+def powers_along(system, t, q, u, values, input_rates):
+    """Powers of the loads and of prescribed motions (n_t, l + 1), and their time derivatives along the motion, whose
+    inputs have these rates by name."""
+
+    def powers(t, q, u, values):
+        u_dot, _ = accelerations_and_mass_matrix(system, t, q, u, values)
+        measured = _measured(system, t, q, u, values, u_dot)
+        return jnp.concatenate([measured["power"], measured["prescribed"][None]])
+
+    def both(t, q, u, values, input_rates):
+        dot = rates(system, t, q, u, values)
+        of_states = dict(zip(system.states, () if dot.x is None else dot.x, strict=True))
+        return jax.jvp(powers, (t, q, u, values), (jnp.ones_like(t), dot.q, dot.u, {**input_rates, **of_states}))
+
+    return jax.vmap(both)(t, q, u, values, input_rates)
+
+
 def _in_N(vector: Vector) -> Triple:
     """Components in N, by those of N's unit vectors, which remember every frame that they were resolved in.
 
@@ -92,17 +112,96 @@ def _momenta(motion: Motion, places: _Places) -> tuple[Triple, Triple]:
     return p, H
 
 
-def work_of(t: np.ndarray, now: dict[str, Any]) -> tuple[np.ndarray, float]:
+def work_of(t: np.ndarray, now: dict[str, Any], pieces: Pieces | None) -> tuple[np.ndarray, float]:
     """Work (n_t,) of all loads and prescribed motions, and an estimate of its error."""
-    work = np.zeros_like(t)
-    power = now["prescribed"].copy()
+    work, counted = np.zeros_like(t), np.ones(len(now["force"]) + 1)
     for i, (F, r) in enumerate(zip(now["force"], now["place"], strict=True)):
         if F is not None and np.ptp(F, axis=0).max() <= 1e-14 * np.abs(F).max():
             work += (r - r[0]) @ F[0]
-        else:
-            power += now["power"][:, i]
-    fine, coarse = (_cumulative_integral(t, power, order) for order in ORDERS)
+            counted[i] = 0.0
+    if pieces is not None:
+        power, rate = (x @ counted for x in pieces.powers)
+        fine, coarse = (pieces.integral(t, power, rate, spared) for spared in (0, 1))
+    else:
+        power = np.column_stack([now["power"], now["prescribed"]]) @ counted
+        fine, coarse = (_cumulative_integral(t, power, order) for order in ORDERS)
     return work + fine, float(np.abs(fine - coarse).max())
+
+
+class Pieces:
+    """The pieces of a motion between kinks and jumps of its inputs. A time (n_t,) at which one stands belongs to two
+    pieces, with the inputs on its two sides: arrays of the pieces are (n,), in their order.
+
+    `powers`: those of `powers_along` at the times of the pieces.
+    """
+
+    def __init__(self, t: np.ndarray, kinks: np.ndarray, near: float):
+        """`near`: how far from a kink a time may be by rounding errors [s]."""
+        self.inner = kinks = np.unique(kinks[(kinks > t[0] + near) & (kinks < t[-1] - near)])
+        before, after = np.searchsorted(kinks, t - near), np.searchsorted(kinks, t + near)
+        self.places = np.repeat(np.arange(len(t)), 1 + (before < after))
+        again = np.append(False, self.places[1:] == self.places[:-1])
+        self.is_after = again | (before == after)[self.places]
+        self.is_after[-1] = False  # a jump at the last time is none of the motion
+        self.t, self.piece = t[self.places], np.where(self.is_after, after[self.places], before[self.places])
+        self.powers: Any = None
+
+    def of(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """Values (n_t,) on both sides of the times as those (n,) of the pieces."""
+        return np.where(self.is_after, after[self.places], before[self.places])
+
+    def rate(self, x: np.ndarray) -> np.ndarray:
+        """Time derivatives (n,) of values (n,), by polynomials through eight times of a piece."""
+        rate = np.zeros_like(x)
+        for some, nearest in self._nearest(self.t, self.piece, 8):
+            apart = self.t[nearest] - self.t[some, None]
+            scale = np.abs(apart).max(axis=1)
+            if nearest.shape[1] > 1:
+                weights = _weights(apart / scale[:, None], np.eye(nearest.shape[1])[1])
+                rate[some] = np.sum(weights * x[nearest], axis=1) / scale
+        return rate
+
+    def integral(self, t: np.ndarray, x: np.ndarray, rate: np.ndarray, spared: int) -> np.ndarray:
+        """The integral (n_t,) from t[0] of values and rates (n,), by polynomials that meet both at four times of their
+        piece, where it has so many; at the farthest `spared` of them the values alone."""
+        ends = np.unique(np.concatenate([t, self.inner]))
+        middle, half = 0.5 * (ends[1:] + ends[:-1]), 0.5 * np.diff(ends)
+        # In a piece without any of the times nothing is known, but what stands beside it: it may be off by all of that.
+        gained = 2 * half * (np.interp(middle, self.t, x) + spared * np.ptp(x))
+        for some, nearest in self._nearest(middle, np.searchsorted(self.inner, middle), 4):
+            apart, m = self.t[nearest] - middle[some, None], nearest.shape[1]
+            scale = np.maximum(np.abs(apart).max(axis=1), half[some])
+            weights = _weights(apart / scale[:, None], _moments(2 * m - spared, half[some] / scale), m - spared)
+            values = np.concatenate([x[nearest], scale[:, None] * rate[nearest[:, : m - spared]]], axis=1)
+            gained[some] = scale * np.sum(weights * values, axis=1)
+        return np.append(0.0, np.cumsum(gained))[np.searchsorted(ends, t)]
+
+    def _nearest(self, t: np.ndarray, piece: np.ndarray, most: int) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """For times in these pieces, the nearest of the piece's own, `most` of them at most: which of the times (k,)
+        have the same number m of these, and their places (k, m), the nearest first."""
+        first, last = np.searchsorted(self.piece, piece), np.searchsorted(self.piece, piece, side="right")
+        count = np.minimum(last - first, most)
+        start = np.clip(np.searchsorted(self.t, t) - count // 2, first, last - count)
+        for m in range(1, most + 1):
+            some = np.flatnonzero(count == m)
+            places = start[some, None] + np.arange(m)
+            order = np.argsort(np.abs(self.t[places] - t[some, None]), axis=1, kind="stable")
+            yield some, np.take_along_axis(places, order, axis=1)
+
+
+def _weights(s: np.ndarray, moments: np.ndarray, rates: int = 0) -> np.ndarray:
+    """Weights (k, m + rates) of values at the places s (k, m), and of rates at the first of them, whose sums are these
+    moments (..., m + rates) of all powers of s."""
+    j = np.arange(s.shape[1] + rates)[:, None]
+    powers = [s[:, None, :] ** j, j * s[:, None, :rates] ** np.maximum(j - 1, 0)]  # (k, m + rates, m), (.., rates)
+    moments = np.broadcast_to(moments, (len(s), len(j)))
+    return np.linalg.solve(np.concatenate(powers, axis=2), moments[..., None])[..., 0]
+
+
+def _moments(n: int, x: Any) -> np.ndarray:
+    """The integrals (..., n) of the powers of s from -x to x."""
+    j = np.arange(n)
+    return np.where(j % 2 == 0, 2 * np.asarray(x)[..., None] ** (j + 1) / (j + 1), 0.0)
 
 
 def _cumulative_integral(t: np.ndarray, x: np.ndarray, points: int) -> np.ndarray:
@@ -112,10 +211,7 @@ def _cumulative_integral(t: np.ndarray, x: np.ndarray, points: int) -> np.ndarra
     first = np.clip(np.arange(n - 1) - (m - 2) // 2, 0, n - m)
     places = first[:, None] + np.arange(m)  # (n-1, m)
     middle, half = 0.5 * (t[1:] + t[:-1]), 0.5 * np.diff(t)
-    s = (t[places] - middle[:, None]) / half[:, None]  # the interval is -1 .. 1
-    powers = s[:, None, :] ** np.arange(m)[:, None]  # (n-1, m, m)
-    moments = np.array([2 / (j + 1) if j % 2 == 0 else 0.0 for j in range(m)])
-    weights = np.linalg.solve(powers, np.broadcast_to(moments[:, None], (n - 1, m, 1)))[..., 0]
+    weights = _weights((t[places] - middle[:, None]) / half[:, None], _moments(m, 1.0))
     return np.concatenate([[0.0], np.cumsum(half * np.sum(weights * x[places], axis=1))])
 
 

@@ -30,7 +30,7 @@ from .settings import Settings, refuse_held
 from .signals import Kinks, evaluate, for_fixed_steps, kinks_of, samples_of, with_own_times, without_nonsense
 from .stages import WrittenOut
 from .steps import Times, controller_of, times_of
-from .trajectory import Status, Trajectory
+from .trajectory import Sides, Status, Trajectory
 from .valid import is_rising, is_valid, safe, sound
 
 
@@ -244,7 +244,11 @@ def _trajectory(asked: _Asked, found: _Found, origin: Array) -> Trajectory:
     system, ts, motion = asked.system, asked.ts, found.motion
     along = unpacked(system, motion)
     u_dep = jax.vmap(lambda t, y: _dependent_speeds_of(system, t, y))(ts, motion)
-    inputs = jax.vmap(lambda t, y: inputs_at(system, asked.signals, t, y, all_of_them=True))(ts, along)
+    all_inputs = jax.vmap(lambda t, y: inputs_at(system, asked.signals, t, y, all_of_them=True))
+    inputs, sides = all_inputs(ts, along), None
+    if asked.kinks is not None:
+        near = (-asked.times.here, asked.times.here) if asked.kinks.jumps else ()
+        sides = Sides(asked.kinks.times, tuple(all_inputs(ts + x, along) for x in near))
     outputs = jax.vmap(lambda t, y, w: outputs_at(system, t, y.q, y.u, values_of(system, y.x, w)))(ts, along, inputs)
     motion, u_dep, inputs, outputs = nan_where(~found.reached, (motion, u_dep, inputs, outputs), origin)
     t_end, end = nan_derivative_where(~found.smooth, (found.t_end, found.end), origin)
@@ -265,6 +269,7 @@ def _trajectory(asked: _Asked, found: _Found, origin: Array) -> Trajectory:
         adjoint=type(asked.settings.adjoint).__name__,
         units=tuple(units_of(system).items()),
         end=end,
+        sides=sides,
     )
 
 

@@ -36,6 +36,14 @@ class Status(enum.IntEnum):
     EVENT = 10
 
 
+class Sides(eqx.Module):
+    """Where inputs that are samples have kinks and jumps: at `times` (n,) [s]. Where there are jumps, `inputs` (n_t,)
+    by name just before and just after each time of the trajectory."""
+
+    times: Float[Array, "*batch n"]
+    inputs: tuple[dict[str, Float[Array, "*batch n_t"]], ...]
+
+
 class Trajectory(eqx.Module):
     """Motion over time, by name: `ride["roll"]`, `ride["yaw_rate"]`, `ride["steer_torque"]`, `ride["imu.ay"]`.
 
@@ -51,6 +59,7 @@ class Trajectory(eqx.Module):
         last time or by an event, whose time moves with what it follows from; otherwise their derivatives are NaN.
     - `stats`: numbers of steps taken, accepted and rejected. `adjoint`: how it is differentiated.
     - `units`: pairs of a name and its unit, as the system declares them.
+    - `sides`: where inputs have kinks and jumps, and their values on both sides, for `audit`; else None.
     """
 
     t: Float[Array, "*batch n_t"]
@@ -68,6 +77,7 @@ class Trajectory(eqx.Module):
     adjoint: str = eqx.field(static=True)
     units: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
     end: State | None = None
+    sides: Sides | None = None
 
     def __getitem__(self, name: str) -> Float[Array, "*batch n_t"]:
         groups = zip(self.names, (self.q, self.u, self.u_dep, self.x), strict=True)
