@@ -11,10 +11,14 @@ import jaxkane as jk
 from jaxkane.catalog import WhippleBicycle
 from jaxkane.fit import (
     GradientDescent,
+    Intensity,
     LeastSquares,
     Problem,
+    Sigma,
+    Simulation,
     Trial,
     bicycle_priors,
+    bicycle_problem,
     fit_bicycle,
     frame_inertia,
     minimize,
@@ -83,6 +87,9 @@ def test_priors_of_a_file(tmp_path):
     path = tmp_path / "Bicycle.txt"
     path.write_text("mB = 85.0+/-0.5\nzB = -0.9+/-0.0\n")
     assert bicycle_priors(path) == {"mB": (85.0, 0.5)}
+    path.write_text("mB = 8_5.0+/-0.5\n")
+    with pytest.raises(ValueError, match=r"line 1: 'mB = 8_5.*is not of the form"):
+        bicycle_priors(path)
 
 
 @pytest.fixture(scope="module")
@@ -107,6 +114,17 @@ def test_steer_damping_of_a_measured_bicycle_by_descent(measured):
     assert result.cost < 3920
     assert result.estimates["steer_damping"] == pytest.approx(0.545, abs=0.01)
     assert any("not noise" in note for note in result.notes)
+
+
+def test_what_noise_asks_for_is_taken_of_bicycles_too():
+    t = np.linspace(0.0, 1.0, 11)
+    ride = Trial(t, {"roll": 0.1 * t, "steer": 0.1 * t}, sigma=1.0, initial={"speed": 5.0})
+    free = ("c", Intensity("roll_rate"), Sigma("steer", start=0.02))
+    options = {"noise": {"roll_rate": 0.1}, "simulation": Simulation(step=0.1)}
+    problem = bicycle_problem(ride, WhippleBicycle.benchmark(), free, **options)
+    assert problem.parameters.names == ("c", "intensity of roll_rate", "sigma of steer")
+    with pytest.raises(ValueError, match="is estimated by its likelihood"):
+        bicycle_problem(ride, WhippleBicycle.benchmark(), free)
 
 
 def test_a_ride_needs_its_speed():

@@ -50,7 +50,17 @@ def test_a_stretch():
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("t,angle\n0,1\n0.1,x\n", r"line 3, column angle: 'x' is not a number"),
+        ("t,angle\n0,1\n0.1,x\n", r"line 3, column angle: 'x' is not a finite"),
+        ("t,angle\n0,1_000\n", r"line 2, column angle: '1_000' is not a finite decimal number"),
+        ('t,angle\n0,"1,5"\n', "line 2, column angle: '1,5' is not"),
+        ("t,angle\n0,0x10\n", "line 2, column angle: '0x10' is not"),
+        ("t,angle\n0,infinity\n", "line 2, column angle: 'infinity' is not"),
+        ("t,angle\n0,-Inf\n", "line 2, column angle: '-Inf' is not"),
+        ("t,angle\n0,1e999\n", "line 2, column angle: '1e999' is not"),
+        ("t,angle\n0,\uff11\n", "line 2, column angle: '\uff11' is not"),
+        ("t,angle\n0,True\n", "line 2, column angle: 'True' is not"),
+        ("t,angle\n0,1+2j\n", r"line 2, column angle: '1\+2j' is not"),
+        ("t,angle\n0,n/a\n", "line 2, column angle: 'n/a' is not"),
         ("t,corner\n0,1\n", "no column angle; there are t, corner"),
         ("t,angle\n0,1\n0.1\n", "line 3: 1 cells, the header has 2"),
         ("t,angle\n", "there is no line of data"),
@@ -60,9 +70,16 @@ def test_a_stretch():
 )
 def test_a_bad_file_is_named_with_its_line(tmp_path, text, message):
     path = tmp_path / "swings.csv"
-    path.write_text(text)
+    path.write_text(text, encoding="utf-8")
     with pytest.raises(ValueError, match=message):
         read_trials(path, {"theta1": "angle"}, sigma=0.1)
+
+
+def test_every_way_to_write_a_decimal_number(tmp_path):
+    path = tmp_path / "swings.csv"
+    path.write_text("t,angle\n0,1.\n1, +.5 \n2,-1E-2\n3,2e+3\n4,-nan\n5,NaN\n6,\n7,007\n")
+    (found,) = read_trials(path, {"theta1": "angle"}, sigma=0.1)
+    np.testing.assert_array_equal(found.measured["theta1"], [1.0, 0.5, -0.01, 2000.0, np.nan, np.nan, np.nan, 7.0])
 
 
 def test_reading_trials_with_gaps(tmp_path):
@@ -113,6 +130,26 @@ def test_parameters_by_name_path_and_leaf():
     system, gains = parameters.apply(pendulum, jnp.array([1.0, 0.0, 0.0]))
     assert float(system.mass) == pytest.approx(np.e)
     assert not gains
+
+
+GAP = np.concatenate([np.arange(0.0, 1.0, 0.1), [3.1], np.arange(5.0, 6.0, 0.1)])
+
+
+@pytest.mark.parametrize("times", [t, np.append(-1.0, t), GAP, t**2], ids=["even", "first alone", "gap", "uneven"])
+@pytest.mark.parametrize("window", [0.1, 0.12, 0.25, 0.95, 3.0])
+def test_no_window_loses_a_sample(times, window):
+    places = Problem.of(pendulum, trial(t=times, measured={"theta1": np.sin(times)}), "mass", window=window).places
+    assert [i for _, first, n in places for i in range(first, first + n)] == [*range(len(times))]
+    assert all(n > 1 for *_, n in places)
+
+
+@pytest.mark.parametrize("window", [0.05, 0.0999])
+def test_a_window_shorter_than_the_samples_is_refused(window):
+    with pytest.raises(
+        ValueError, match=r"swing 3: its times are 0\.1 s apart, so a `window` of 0\.0.* holds one sample"
+    ):
+        Problem.of(pendulum, trial(), "mass", window=window)
+    assert len(Problem.of(pendulum, trial(), "mass", unknown="theta1", window=window, continuity={}).places) == 10
 
 
 def test_windows_cover_every_sample_once():

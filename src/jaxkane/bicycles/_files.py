@@ -17,6 +17,7 @@ import math
 import os
 from collections.abc import Mapping
 
+from .._common.decimal_numbers import decimal_number
 from .._common.lookup import hint
 from ..catalog._bicycle_file import lines_of
 
@@ -53,7 +54,7 @@ def read_yaml(path: str | os.PathLike[str]) -> tuple[str, Values]:
         if not indented:
             section = ""
         try:
-            value = float(entry)
+            value = decimal_number(entry)
         except ValueError:
             value = math.nan
         if not (colon and name and math.isfinite(value)):

@@ -7,6 +7,8 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
+from .._common.decimal_numbers import decimal_number
+
 
 def lines_of(path: str | os.PathLike[str]) -> list[str]:
     """The lines of a text file; the mark at its beginning that some editors write is none of its text.
@@ -39,10 +41,10 @@ def read_bicycle_file(
         name, equals, entry = (part.strip() for part in line.partition("="))
         value, _, deviation = entry.partition("+/-")
         try:
-            pair = float(value), float(deviation or 0.0)
+            pair = decimal_number(value.strip()), decimal_number(deviation.strip() or "0")
         except ValueError:
             pair = (math.nan, math.nan)
-        if not equals or not name or not all(map(math.isfinite, pair)) or pair[1] < 0:
+        if not equals or not name or not pair[1] >= 0:
             faults.append(f"line {number}: {line!r} is not of the form NAME = value+/-deviation")
         elif name in lines:
             faults.append(f"line {number}: {name} was given before, on line {lines[name]}")

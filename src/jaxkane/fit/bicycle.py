@@ -83,7 +83,8 @@ def bicycle_problem(
     **Raises:** `ValueError` for a ride without a speed, and what `fit` raises.
     """
     rides = (rides,) if isinstance(rides, Trial) else tuple(rides)
-    names = parameters_of(bicycle, free).names
+    channels = tuple(dict.fromkeys(name for ride in rides for name in ride.measured))
+    names = parameters_of(bicycle, free, options.get("noise"), channels).names
     if isinstance(priors, (str, os.PathLike)):
         priors = bicycle_priors(priors)
     if "rR" in names and any("speed" in ride.initial for ride in rides):

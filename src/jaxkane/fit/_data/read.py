@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ..._common.decimal_numbers import decimal_number
 from ..._common.lookup import refuse_unknown
 from .trial import Trial
 
@@ -95,7 +96,9 @@ def _tables(path: Path, columns: list[str], by: str | None) -> dict[str, dict[st
 
 def _number(cell: str, path: Path, line: int, column: str) -> float:
     cell = cell.strip()
+    if cell.lower().lstrip("+-") in ("", "nan"):
+        return float("nan")
     try:
-        return float(cell) if cell else float("nan")
+        return decimal_number(cell)
     except ValueError:
-        raise ValueError(f"{path}, line {line}, column {column}: {cell!r} is not a number.") from None
+        raise ValueError(f"{path}, line {line}, column {column}: {cell!r} is not a finite decimal number.") from None

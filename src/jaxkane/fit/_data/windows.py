@@ -81,11 +81,11 @@ def cut(
 ) -> tuple[Windows, tuple[Place, ...]]:
     """Windows of `window` [s], or one a trial; and the place of each.
 
-    A last piece shorter than half a window is joined to the one before. `reach`: of delays, None where there are none.
-    `step` [s]: of the integration, by default that of the samples. `guess`: by name, where coordinates start of which
-    nothing is known, if not at zero.
+    A last piece shorter than half a window is joined to the one before, a lone sample to what follows. `reach`: of
+    delays, None where there are none. `step` [s]: of the integration, by default that of the samples. `guess`: by name,
+    where coordinates start of which nothing is known, if not at zero.
     """
-    places = [(k, i, n) for k, trial in enumerate(trials) for i, n in _pieces(trial.t, window, chained)]
+    places = [(k, i, n) for k, trial in enumerate(trials) for i, n in _pieces(trial, window, chained)]
     if not chained:  # a window without one measurement would only add unknowns
         places = [place for place in places if any(np.isfinite(_take(trials, place, c)).any() for c in channels)]
     linked = [chained and place[0] == after[0] for place, after in zip(places, [*places[1:], (-1, 0, 0)], strict=True)]
@@ -136,20 +136,34 @@ def state_names(system: System) -> tuple[str, ...]:
     return (*system.coordinates, *system.speeds, *system.states)
 
 
-def _pieces(t: np.ndarray, window: float | None, chained: bool) -> list[tuple[int, int]]:
+def _pieces(trial: Trial, window: float | None, chained: bool) -> list[tuple[int, int]]:
     """First sample and number of samples of every window of a trial."""
+    t = trial.t
     if window is None:
         return [(0, len(t))]
     # A sample at the end of a window belongs to the next; a little slack lets 0.1 + 0.2 be 0.3.
     number = np.floor((t - t[0]) / window + 1e-9).astype(int)
     starts = np.flatnonzero(np.append(True, np.diff(number) > 0))
-    sizes = np.diff(np.append(starts, len(t)))
-    pieces = [(int(i), int(n)) for i, n in zip(starts, sizes, strict=True)]
-    if len(pieces) > 1 and (t[-1] - t[pieces[-1][0]] < 0.5 * window or pieces[-1][1] < 2):
-        (i, n), (_, m) = pieces[-2:]
-        pieces[-2:] = [(i, n + m)]
-    # One sample says nothing about motion, unless the next window goes on from it.
-    return [(i, n) for i, n in pieces if n > 1 or chained]
+    if len(starts) > 1 and (t[-1] - t[starts[-1]] < 0.5 * window or starts[-1] == len(t) - 1):
+        starts = starts[:-1]
+    if not chained:  # one sample says nothing about motion, unless the next window goes on from it
+        between = np.median(np.diff(t))
+        if window < between * (1 - 1e-9):
+            raise ValueError(
+                f"{trial.name}: its times are {between:.6g} s apart, so a `window` of {window:.6g} s holds one sample, "
+                "from which no motion follows. Give a longer one, or bind the windows together by `continuity`."
+            )
+        starts = np.array(_without_lone(starts.tolist(), len(t)))
+    return [(int(i), int(n)) for i, n in zip(starts, np.diff(np.append(starts, len(t))), strict=True)]
+
+
+def _without_lone(starts: list[int], n: int) -> list[int]:
+    """Where windows begin, of which each has two samples at least: one alone is joined to what follows."""
+    kept = [0]
+    for start in starts[1:]:
+        if start - kept[-1] > 1 and start < n - 1:
+            kept.append(start)
+    return kept
 
 
 def _reached(t: np.ndarray, i: int, last: int, reach: Reach, step: float) -> tuple[int, int]:
