@@ -140,3 +140,58 @@ def test_a_description_that_is_mixed_in_reads_by_name():
     mixed, written = (jk.accelerations(kind(), 0.0, [0.3, 0.1], [0.0, 0.0]) for kind in (Mixed, Written))
     np.testing.assert_array_equal(mixed, written)
     assert not np.allclose(mixed, jk.accelerations(PENDULUM, 0.0, [0.3, 0.1], [0.0, 0.0]))
+
+
+T = np.linspace(0.0, 1.0, 5)
+TRIAL = jk.fit.Trial(T, {"theta1": 0.1 * T}, {"shoulder_torque": T}, sigma=0.1)
+
+
+def _model():
+    at_rest = jk.State(np.zeros(2), np.zeros(2))
+    return jk.stability.linearize(PENDULUM, at_rest)
+
+
+def _posed(**options):
+    return jk.fit.Problem.of(PENDULUM, TRIAL, "mass", simulation=jk.fit.Simulation(step=0.1), **options)
+
+
+ONE_NAME = {
+    "steady_turn, hold": lambda one, ride: jk.stability.steady_turn(PENDULUM, hold=one),
+    "steady_turn, find": lambda one, ride: jk.stability.steady_turn(PENDULUM, find=one),
+    "equilibrium, hold": lambda one, ride: jk.stability.equilibrium(PENDULUM, hold=one),
+    "linearize, states": lambda one, ride: jk.stability.linearize(PENDULUM, ride.state(), states=one, steady=False),
+    "linearize, outputs": lambda one, ride: jk.stability.linearize(PENDULUM, ride.state(), outputs=one, steady=False),
+    "linearize, dependent": lambda one, ride: jk.stability.linearize(PENDULUM, ride.state(), dependent=one),
+    "lqr, inputs": lambda one, ride: jk.stability.lqr(_model(), np.eye(4), 1.0, inputs=one),
+    "with_speeds": lambda one, ride: jk.stability.with_speeds(PENDULUM, one),
+    "assemble, free": lambda one, ride: jk.assemble(PENDULUM, ride.state().q, free=one),
+    "trajectories, names": lambda one, ride: jk.plot.trajectories(ride, one),
+    "mode_shapes, only": lambda one, ride: jk.plot.mode_shapes([-1.0], [[1.0]], ["roll"], only=one),
+    "symbolic linearize, states": lambda one, ride: jk.symbolic.linearize(PENDULUM, states=one),
+    "symbolic linearize, dependent": lambda one, ride: jk.symbolic.linearize(PENDULUM, dependent=one),
+    "robot_bicycle, channels": lambda one, ride: jk.data.robot_bicycle(one),
+    "Inertia, fixed": lambda one, ride: jk.fit.Problem.of(
+        jk.catalog.RigidBody(), TRIAL_OF_A_BODY, jk.fit.Inertia(("I11", "I22", "I33"), mass="mass", fixed=one)
+    ),
+} | {
+    f"fit, {argument}": lambda one, ride, argument=argument: _posed(**{argument: one})
+    for argument in ("hold", "unknown", "sensor_bias", "sensor_gain", "input_bias", "input_gain", "input_delay")
+}
+TRIAL_OF_A_BODY = jk.fit.Trial(T, {"omega1": 0.1 * T}, sigma=0.1)
+
+
+@pytest.mark.parametrize("ask", ONE_NAME.values(), ids=ONE_NAME)
+def test_one_name_alone_is_a_name_and_not_its_letters(ask, ride):
+    with pytest.raises((ValueError, KeyError), match="wobble"):
+        ask("wobble", ride)
+
+
+def test_one_name_alone_says_the_same_as_a_list_of_it():
+    assert (
+        _posed(hold="shoulder_torque").model.held == _posed(hold=["shoulder_torque"]).model.held == ("shoulder_torque",)
+    )
+    models = [
+        jk.stability.linearize(PENDULUM, jk.State(np.zeros(2), np.zeros(2)), outputs=o) for o in ("theta2", ["theta2"])
+    ]
+    np.testing.assert_array_equal(models[0].C, models[1].C)
+    assert models[0].outputs == ("theta2",)

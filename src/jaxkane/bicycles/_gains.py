@@ -171,7 +171,7 @@ def lqr(
     """
     if "desired_roll" in bicycle.inputs:
         raise ValueError(f"lqr: the {type(bicycle).__name__} has a balance already: bicycle.with_parts(control=None).")
-    names = bicycle.lateral if states is None else tuple(states)
+    names = bicycle.lateral if states is None else as_names(states)
     gains, follow = [], []
     for v in np.asarray(speeds, dtype=float):
         model = linearize(bicycle, straight_ahead(bicycle, v), states=names)

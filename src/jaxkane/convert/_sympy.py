@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from .._common.lookup import hint
+from .._common.lookup import as_names, hint
 from .._description.system import System
 from ._sympy_functions import imported
 from ._sympy_model import words_of
@@ -55,7 +55,7 @@ def from_sympy(
     time in the motion that is neither coordinate nor speed, and a Lagrangian that is not quadratic in the rates.
     """
     sympy = imported()
-    words = words_of(sympy, model, tuple(dependent), name)
+    words = words_of(sympy, model, as_names(dependent), name)
     if origin is not None and not words.bodies:
         raise ValueError(
             f"{name}: positions from {origin} cannot be had, since this Lagrangian has no bodies. Leave `origin` out; "

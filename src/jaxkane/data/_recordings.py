@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .._common.lookup import refuse_unknown
+from .._common.lookup import as_names, refuse_unknown
 from ..fit import Trial, read_trials
 
 File = str | os.PathLike[str] | None
@@ -138,6 +138,7 @@ def robot_bicycle(channels: Sequence[str] = ("steer", "roll_rate"), *, file: Fil
         **{name: (name, 0.03) for name in ("gyro_y", "gyro_z")},
         **{name: (name, 0.5) for name in ("acc_x", "acc_y", "acc_z")},
     }
+    channels = as_names(channels)
     refuse_unknown(channels, list(every), "robot_bicycle: no channel")
     return _recording(
         "robot_bicycle",

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._common.lookup import hint, label_of, refuse_unknown
+from .._common.lookup import as_names, hint, label_of, refuse_unknown
 from .._description.units import in_degrees, refuse_no_angle, unit_of, units_of
 from ._axes import SOFT, finish, panels
 
@@ -42,9 +42,12 @@ def fits(
     **Raises:** `ValueError` for a trial or a channel that the fit does not have.
     """
     names = list(fit.trial_names)
-    chosen = [_number(names, trial) for trial in trials] if trials is not None else _spread(len(names))
+    if trials is None:
+        chosen = _spread(len(names))
+    else:
+        chosen = [_number(names, trial) for trial in ([trials] if isinstance(trials, (str, int)) else trials)]
     all_channels = list(fit.problem.channels)
-    channels = all_channels if channels is None else list(channels)
+    channels = all_channels if channels is None else list(as_names(channels))
     refuse_unknown(channels, all_channels, "fits: there is no channel")
     if not channels:
         raise ValueError(f"fits: `channels` is empty; {hint([], all_channels)}")

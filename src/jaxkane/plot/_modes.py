@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._common.lookup import label_of, refuse_unknown
+from .._common.lookup import as_names, label_of, refuse_unknown
 from ._axes import SOFT
 
 
@@ -43,8 +43,9 @@ def mode_shapes(
     import matplotlib.pyplot as plt
 
     lam, X, labels, names, where = _one_point(eigenvalues, vectors, states, at, modes)
-    refuse_unknown(labels if only is None else only, labels, "mode_shapes: there is no state")
-    rows = [i for i, state in enumerate(labels) if only is None or state in only]
+    only = labels if only is None else as_names(only)
+    refuse_unknown(only, labels, "mode_shapes: there is no state")
+    rows = [i for i, state in enumerate(labels) if state in only]
     drawn = [k for k in range(len(lam)) if lam[k].imag >= -1e-9 * abs(lam[k])]
     if not np.all(np.isfinite(lam)):
         raise ValueError("mode_shapes: the eigenvalues are not finite here: there is no steady motion, and no mode.")
@@ -95,8 +96,8 @@ def _one_point(found: Any, vectors: Any, states: Any, at: float | None, modes: A
     lam, X = np.asarray(found, dtype=complex), np.asarray(vectors, dtype=complex)
     if X.ndim != 2 or lam.shape != X.shape[1:]:
         raise ValueError(f"mode_shapes: vectors (n_states, n) for eigenvalues (n,), got {X.shape} for {lam.shape}.")
-    states = [f"state {i + 1}" for i in range(X.shape[0])] if states is None else list(states)
-    names = [""] * len(lam) if modes is None else list(modes)
+    states = [f"state {i + 1}" for i in range(X.shape[0])] if states is None else list(as_names(states))
+    names = [""] * len(lam) if modes is None else list(as_names(modes))
     if len(states) != X.shape[0] or len(names) != len(lam):
         raise ValueError(f"mode_shapes: {len(states)} states and {len(names)} names for vectors of shape {X.shape}.")
     return lam, X, states, names, where

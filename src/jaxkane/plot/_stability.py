@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._common.lookup import label_of
+from .._common.lookup import as_names, label_of
 from ._axes import SOFT, STABLE, finish, one
 
 
@@ -124,7 +124,7 @@ def _table(values: Any, eigenvalues: Any, modes: Sequence[str] | None) -> tuple[
         )
     if not np.any(np.isfinite(lam)):
         raise ValueError("None of the eigenvalues is finite: there is no steady motion at these values.")
-    names = [""] * lam.shape[1] if modes is None else list(modes)
+    names = [""] * lam.shape[1] if modes is None else list(as_names(modes))
     if len(names) != lam.shape[1]:
         raise ValueError(f"There are {lam.shape[1]} modes, and {len(names)} names: {', '.join(names)}.")
     return x, lam, names

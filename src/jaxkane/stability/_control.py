@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .._common.lookup import hint
+from .._common.lookup import as_names, hint
 from ._linearize import LinearModel
 
 if TYPE_CHECKING:
@@ -57,7 +57,7 @@ def lqr(
     """
     from scipy.linalg import solve_continuous_are
 
-    names = model.inputs if inputs is None else tuple(inputs)
+    names = model.inputs if inputs is None else as_names(inputs)
     A, B = np.asarray(model.A), np.asarray(model.B)[:, [_place(model.inputs, k, "input") for k in names]]
     Q, R = _weights(Q, len(A), "Q", "states"), _weights(R, B.shape[1], "R", "inputs")
     size = max(np.abs(A).max(), np.abs(B).max())

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float
 from scipy.optimize import linear_sum_assignment
 
-from .._common.lookup import not_there
+from .._common.lookup import as_names, not_there
 from .._description.system import State, System
 from .._method.checks import is_concrete
 from .._scalars.nan import nan_where
@@ -107,11 +107,12 @@ def eigenvalues(
     found, kept, clear = _along(system, values, at, states, groups)
     if motion is None and is_concrete(found.values) and not np.isfinite(np.asarray(found.values)).any():
         matrix(system, values[0], at, states)  # which says why
+    modes = None if modes is None else as_names(modes)
     if modes is None:
         modes, found = _named(found, kept, groups, clear, (system, values))
     if len(modes) != len(kept):
         raise ValueError(f"eigenvalues: {len(kept)} modes, but {len(modes)} names: {', '.join(modes)}.")
-    return Eigenvalues(values, found.values, found.vectors, found.condition, tuple(modes), kept)
+    return Eigenvalues(values, found.values, found.vectors, found.condition, modes, kept)
 
 
 def _named(found: Eig, states: tuple[str, ...], groups: Groups | None, clear: Any, origin: Any):
@@ -147,7 +148,7 @@ def family_of(system: System, values: Any, motion: MotionAt, states: Sequence[st
         raise ValueError("Give the values of the parameter, e.g. speeds jnp.linspace(0.0, 10.0, 201).")
     values = jnp.atleast_1d(jnp.asarray(values, dtype=float))
     groups = _Groups(getattr(system, "mode_groups", {})) if is_straight else None
-    return values, motion, None if states is None else tuple(states), groups
+    return values, motion, None if states is None else as_names(states), groups
 
 
 class _Groups(dict):

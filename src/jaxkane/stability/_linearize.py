@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._common.lookup import hint, refuse_unknown
+from .._common.lookup import as_names, hint, refuse_unknown
 from .._description.system import State, System
 from .._description.values import Values
 from .._method.checks import check_system, is_concrete
@@ -120,10 +120,10 @@ def linearize(
     check_system(system, t, q)
     origin = (system, t, q, u, x, w)
     n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q).shape[0]
-    dependent = tuple(system.dependent_coordinates if dependent is None else dependent)
+    dependent = system.dependent_coordinates if dependent is None else as_names(dependent)
     check_dependent(system, dependent, n_h)
     kept = _states(system, states, dependent)
-    rows = tuple(kept) if outputs is None else tuple(outputs)
+    rows = tuple(kept) if outputs is None else as_names(outputs)
     functions = dict(outputs) if isinstance(outputs, Mapping) else {}
     own = output_names(system) if outputs is not None else ()
     known = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.states, *own)
@@ -163,13 +163,14 @@ def _states(system: System, states: Sequence[str] | None, dependent: tuple[str, 
         cyclic = cyclic_coordinates(system)
         return (*(c for c in free if c not in cyclic), *system.speeds, *system.states)
     known = (*free, *system.speeds, *system.states)
+    states = as_names(states)
     unknown = [k for k in states if k not in known]
     if unknown:
         raise ValueError(
             f"{type(system).__name__}: {', '.join(unknown)} cannot be a state; "
             f"{hint(unknown, known, 'independent coordinates, speeds and states of the first order are')}"
         )
-    return tuple(states)
+    return states
 
 
 class _Choice(eqx.Module):

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from .._common.lookup import as_names
 from .._description.system import System
 from .._description.values import Values
 
@@ -52,7 +53,7 @@ def with_speeds(system: System, speeds: Sequence[str]) -> System:
     **Raises:** `ValueError` for other names, or another number of them.
     """
     everything = (*system.speeds, *system.dependent_speeds)
-    speeds = tuple(speeds)
+    speeds = as_names(speeds)
     if len(set(speeds)) != len(system.speeds) or not set(speeds) <= set(everything) or len(speeds) != len(set(speeds)):
         raise ValueError(
             f"{type(system).__name__}: name {len(system.speeds)} different ones of {', '.join(everything)}; got "

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._common.lookup import by_name, hint
+from .._common.lookup import as_names, by_name, hint
 from .._description.system import State, System, names_of
 from .._method.checks import check_system, is_concrete
 from .._method.description_facts import configuration_residual
@@ -69,7 +69,7 @@ def equilibrium(
 
     **Raises:** `ValueError` as `steady_turn`.
     """
-    held = hold if isinstance(hold, Mapping) else dict.fromkeys(hold)
+    held = hold if isinstance(hold, Mapping) else dict.fromkeys(as_names(hold))
     at_rest = dict.fromkeys(system.speeds, 0.0)
     return steady_turn(system, q, None, inputs, hold={**at_rest, **held}, find=find, t=t)
 
@@ -108,10 +108,11 @@ def steady_turn(
     Under a trace the motion is NaN instead.
     """
     name = type(system).__name__
-    values = dict(hold) if isinstance(hold, Mapping) else dict.fromkeys(hold)
+    values = dict(hold) if isinstance(hold, Mapping) else dict.fromkeys(as_names(hold))
     q = as_array({} if q is None else q, system.coordinates, f"{name}: q")
     u = as_array({} if u is None else u, system.speeds, f"{name}: u").astype(q.dtype)
     known = {k: jnp.asarray(x, q.dtype) for k, x in checked_values(system, inputs).items()}
+    find = as_names(find)
     unknown = sorted(set(find) - set(system.inputs))
     if unknown:
         raise ValueError(f"{name} has no input {', '.join(unknown)} to find; {hint(unknown, system.inputs, 'it has')}")

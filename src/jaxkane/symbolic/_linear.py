@@ -6,7 +6,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from .._common.lookup import refuse_unknown
+from .._common.lookup import as_names, refuse_unknown
 from .._description.system import System
 from .._method.formulas import Formulas
 from ..stability._cyclic import cyclic_coordinates
@@ -106,11 +106,11 @@ def linearize(
         )
     model = AtMotion(formulas, dict(at or {}))
     names = (*system.coordinates, *system.speeds)
-    dependent = tuple(system.dependent_coordinates if dependent is None else dependent)
+    dependent = system.dependent_coordinates if dependent is None else as_names(dependent)
     refuse_unknown(dependent, system.coordinates, f"{formulas.name}: `dependent` names", "the coordinates are")
     free = [x for x in names if x not in dependent]
     cyclic = cyclic_coordinates(system) if states is None or steady else ()
-    kept = tuple(x for x in free if x not in cyclic) if states is None else tuple(states)
+    kept = tuple(x for x in free if x not in cyclic) if states is None else as_names(states)
     refuse_unknown(kept, free, f"{formulas.name}: no state can be", "independent coordinates and speeds are")
     if steady:
         model.check(cyclic)

@@ -15,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 from tqdm import tqdm
 
-from ..._common.lookup import refuse_unknown
+from ..._common.lookup import as_names, refuse_unknown
 from ..._description.system import System
 from .._data.trial import Trial
 from .._data.windows import Windows, state_names
@@ -118,7 +118,8 @@ def design(
     """
     t = jnp.asarray(t, jnp.result_type(float))
     names = parameters_of(system, free).names
-    refuse_unknown(about or (), names, "`about` names", "free are")
+    about = as_names(about or ())
+    refuse_unknown(about, names, "`about` names", "free are")
     if criterion not in ("D", "A"):
         raise ValueError(f"`criterion` is 'D' or 'A', got {criterion!r}.")
     places = np.array([names.index(name) for name in about or names])

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..._common.lookup import hint
+from ..._common.lookup import as_names, hint
 from ..._description.parameters import declared, leaf_name, learned_part
 from ..._description.system import System
 from ..._description.units import unit_of, units_of
@@ -236,10 +236,11 @@ def _of_body(system: System, item: Inertia):
     leaves = jax.tree.leaves(system)
     values = [0.0 if s is None else float(np.ravel(leaves[s[0]])[s[1][0]]) for s in spots]
     values[0] = values[0] if spots[0] is not None else 1.0
-    unknown = sorted(set(item.fixed) - {name for name in names[:4] if name})
+    fixed = as_names(item.fixed)
+    unknown = sorted(set(fixed) - {name for name in names[:4] if name})
     if unknown:
         raise ValueError(f"Inertia: `fixed` may name the mass and the place of its centre, not {', '.join(unknown)}.")
-    still = {i for i in range(4) if names[i] is None or names[i] in item.fixed} | ({4 + wheel[1]} if wheel else set())
+    still = {i for i in range(4) if names[i] is None or names[i] in fixed} | ({4 + wheel[1]} if wheel else set())
     moves = tuple(i for i in range(10) if spots[i] is not None and i not in still)
     try:
         body = PossibleBody.of(values, moves, wheel)
