@@ -13,7 +13,8 @@ from types import SimpleNamespace
 import pytest
 
 from jaxkane._scalars import native
-from jaxkane._scalars.configure import _split_cpu, _store_programs
+from jaxkane._scalars.configure import _made_folder, _split_cpu
+from jaxkane._scalars.native.available import switched_on
 
 KERNELS = f"no native kernels ({native.why_not()})" if native.why_not() else "native kernels"
 CLEAN = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "EQX_", "XLA_"))}
@@ -188,6 +189,62 @@ def test_the_environment_may_switch_native_kernels_off():
     assert b"switched off" in subprocess.check_output(code, env=CLEAN | {"JAXKANE_NATIVE": "0"})
 
 
+@pytest.mark.parametrize(
+    ("word", "is_on"),
+    [
+        ("0", False),
+        ("false", False),
+        ("No", False),
+        ("OFF", False),
+        ("", True),
+        ("1", True),
+        ("True", True),
+        ("on", True),
+    ],
+)
+def test_words_for_on_and_off_in_the_environment(word, is_on):
+    assert switched_on(word) is is_on
+
+
+def test_an_unknown_word_in_the_environment_is_refused():
+    with pytest.raises(ValueError, match="JAXKANE_NATIVE='maybe' in the environment: it is one of 1, true"):
+        switched_on("maybe")
+
+
+@pytest.mark.parametrize("why", ["read only", "no home"])
+def test_without_a_place_for_the_cache_it_warns_once_and_goes_on(python, why):
+    """As with a home that is read only, in a container or on a cluster."""
+    refused = {
+        "read only": "from pathlib import Path\ndef refuse(*_, **__): raise PermissionError(13, 'Permission denied')\n"
+        "Path.mkdir = refuse\n",
+        "no home": "import os\nfrom pathlib import Path\ndef refuse(*_): raise RuntimeError('no home')\n"
+        "os.environ.pop('XDG_CACHE_HOME', None)\nPath.expanduser = refuse\n",
+    }
+    code = (
+        refused[why] + "import warnings\nwith warnings.catch_warnings(record=True) as told:\n"
+        "    warnings.simplefilter('default')\n    for _ in 'ab': done = jk.configure(native=False, verbose=False)\n"
+        "print(done.cache, jax.config.jax_compilation_cache_dir, 'EQX_ON_ERROR' in os.environ)\n"
+        "print(*[w.message for w in told], sep='\\n')"
+    )
+    state, *told = python("import os\n" + code).stdout.splitlines()
+    assert state == "None None False"
+    assert len(told) == 1
+    assert told[0].startswith("jaxkane.configure: there can be no folder of compiled programs")
+
+
+def test_without_a_cache_after_one_all_is_as_before(cache, python):
+    code = (
+        "import os, equinox._errors as checks\n"
+        "starts = 'jax_compilation_cache', 'jax_enable_compilation', 'jax_persistent'\n"
+        "names = [n for n in dir(jax.config) if n.startswith(starts)]\n"
+        "now = lambda: ({n: getattr(jax.config, n) for n in names}, checks.EQX_ON_ERROR, dict(os.environ))\n"
+        "jk.configure(cache=False, native=False, verbose=False)\nbefore = now()\n"
+        f"for _ in range(2): jk.configure(cache={str(cache)!r}, native=False, verbose=False)\n"
+        "assert now() != before\njk.configure(cache=False, native=False, verbose=False)\nassert now() == before"
+    )
+    python(code)
+
+
 @pytest.mark.parametrize("devices", ["2", True, 2.5, 0])
 def test_devices_that_are_no_number(devices):
     with pytest.raises(ValueError, match="`devices` is a number of CPU devices, 1 or more; got"):
@@ -198,4 +255,4 @@ def test_a_cache_in_the_place_of_a_file(tmp_path):
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "inside"):
         with pytest.raises(ValueError, match=r"file.* is a file, or lies in one: `cache` is the name of a folder"):
-            _store_programs(folder)
+            _made_folder(folder)

@@ -23,6 +23,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
+from jaxkane._common.memory import MOST_REMEMBERED, Memory
 from jaxkane._scalars.fuse import fused
 from jaxkane._scalars.versions import version_of
 from jaxkane.fit._problem.linearization import cost
@@ -437,6 +438,59 @@ def test_input_functions_of_every_kind_are_looked_into(monkeypatch):
     assert version_of(Holder(push, 1.0)) == version_of(Holder(push, 2.0))  # a number that is an argument of the program
 
 
+class Walled(Still):
+    """Beside a wall that it meets before the last sample."""
+
+    def events(self, t, q, u):
+        return {"wall": q[0] - 0.52}
+
+
+@pytest.mark.parametrize("derivative", [pytest.param(jax.jacrev, marks=pytest.mark.slow), jax.jacfwd])
+def test_a_closure_of_an_input_function_has_the_derivatives_of_an_input(derivative):
+    start = jk.State(np.array([0.5]), np.array([0.3]))
+    given = lambda k: jk.simulate(Walled(), start, TS, {"push": k}, **SHORT)["x"]  # noqa: E731
+    captured = lambda k: jk.simulate(Walled(), start, TS, {"push": lambda t, state: 1.0 * k}, **SHORT)["x"]  # noqa: E731
+    slopes = derivative(captured)(jnp.array(1.0))
+    np.testing.assert_allclose(slopes, derivative(given)(jnp.array(1.0)), rtol=RTOL)
+    assert np.isnan(slopes[-1])  # the wall is met before
+
+
+def test_a_sweep_is_differentiated_forward_by_what_its_functions_read():
+    start = jk.State(np.array([0.5]), np.array([0.3]))
+
+    def last(k):
+        inputs = {"push": lambda t, state: 1.0 * k}
+        return jk.sweep.sweep(Walled(), start, TS, inputs, table={"mass": [2.0]}, **SHORT)["x"][0]
+
+    _, slopes = jax.jvp(last, (jnp.array(1.0),), (jnp.array(1.0),))
+    assert slopes[0] == 0.0
+    assert np.isnan(slopes[-1])
+
+
+@pytest.mark.parametrize("method", ["events", "loads"])
+def test_a_traced_number_in_the_closure_of_a_description_is_refused(method):
+    def ends_at(k):
+        read = {"events": lambda self, t, q, u: {"wall": q[0] - k}, "loads": lambda self, *_: [k]}[method]
+        system = type("Walled", (Still,), {method: read, "__module__": __name__})()
+        return jk.simulate(system, HALF, TS, **SHORT).t_end
+
+    with pytest.raises(TypeError, match=r"Walled: its description reads, .* Make it a parameter"):
+        jax.grad(ends_at)(0.52)
+
+
+def test_traced_numbers_that_a_description_has_kept_are_no_closure():
+    """What an earlier trace left behind is nobody's."""
+    kept = []
+
+    class Keeping(Still):
+        def loads(self, t, q, u, motion, inputs):
+            kept.append(q[0])
+            return super().loads(t, q, u, motion, inputs)
+
+    for _ in range(2):
+        assert jk.simulate(Keeping(), HALF, TS, **SHORT).ok
+
+
 class Holder(eqx.Module):
     f: Callable
     gain: jax.Array = eqx.field(converter=jnp.asarray)
@@ -600,6 +654,27 @@ def test_threads_agree():
     [t.join() for t in threads]
     assert len(found) == 200 * n
     assert len(set(found)) == 1
+
+
+def test_threads_share_a_memory_that_is_full():
+    memory, failed = Memory(), []
+
+    def fill(start):
+        try:
+            for i in range(3000):
+                memory[start + i] = i
+                memory.get(start)
+        except RuntimeError as error:  # a dict that another thread is changing
+            failed.append(error)
+
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    threads = [threading.Thread(target=fill, args=(10_000 * n,)) for n in range(8)]
+    [t.start() for t in threads]
+    [t.join() for t in threads]
+    sys.setswitchinterval(before)
+    assert not failed
+    assert len(memory) == MOST_REMEMBERED
 
 
 def test_a_look_walks_through_nothing(monkeypatch):

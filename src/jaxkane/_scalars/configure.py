@@ -6,7 +6,7 @@ import dataclasses
 import os
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -27,6 +27,15 @@ class Configuration:
 
 
 _last: Configuration | None = None
+_before: _Before | None = None  # while programs are kept in a folder
+
+
+class _Before(NamedTuple):
+    """What was set before programs were kept: settings of JAX, variables of the environment, equinox's checks."""
+
+    settings: dict[str, Any]
+    environment: dict[str, str | None]
+    checks: str | None
 
 
 def configure(
@@ -46,11 +55,13 @@ def configure(
 
     - `float64`: double precision, which mechanics needs (`jax_enable_x64`).
     - `cache`: keep compiled programs on disk, so that the next process need not compile them again: True for JAX's
-        own folder where one is set, else `jaxkane` in the user's folder of caches; or a folder; or False.
+        own folder where one is set, else `jaxkane` in the user's folder of caches; or a folder; or False, which also
+        takes back what an earlier call with a cache has set.
     - `devices`: split the CPU into this many devices, which a sweep then uses side by side; one for each core is
         plenty. By default JAX decides: one, unless XLA_FLAGS says otherwise.
     - `native`: right-hand sides and their derivatives as machine code through LLVM (llvmlite), called by XLA;
-        on the CPU only. By default where llvmlite is installed, unless the environment has JAXKANE_NATIVE=0. False
+        on the CPU only. By default where llvmlite is installed, unless the environment has JAXKANE_NATIVE=0 (or
+        false, no, off). False
         leaves all work to XLA. Both agree to rounding errors. On a machine that has called none yet, a first one is
         tried in another process, which takes a second; the verdict is kept beside the programs, or else in the
         user's folder of caches.
@@ -60,7 +71,8 @@ def configure(
     cache and kernels by their environment.
 
     **Warns:** when it comes too late: arrays have been made in float32, or JAX has started with other devices; and
-    where `native=True` is asked of a machine that cannot.
+    where `native=True` is asked of a machine that cannot; and where the folder of the cache cannot be made or written:
+    then programs are not kept.
 
     With a cache, a numerical check *inside* compiled programs can no longer raise (a program that may call back into
     Python cannot be stored): equinox's `EQX_ON_ERROR` becomes "nan". jaxkane's own errors are raised outside of
@@ -80,13 +92,11 @@ def configure(
             UserWarning,
             stacklevel=2,
         )
-    folder = _folder(cache) if cache else None
+    folder = _made_folder(cache) if cache else None
     if folder is not None:
         _store_programs(folder)
     elif jax.config.jax_compilation_cache_dir:  # pyright: ignore[reportAttributeAccessIssue]
-        jax.config.update("jax_compilation_cache_dir", None)
-        os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
-        internals.look_for_cache_again()
+        _store_nothing()
     if devices is not None:
         _split_cpu(devices)
     if native is not None:
@@ -142,12 +152,33 @@ def _folder(cache: bool | str | os.PathLike[str]) -> Path:
     return Path(home).expanduser() / "jaxkane"
 
 
-def _store_programs(folder: Path) -> None:
-    """Have every compiled program kept in a folder."""
+def _made_folder(cache: bool | str | os.PathLike[str]) -> Path | None:
+    """The folder of the cache; None, with a warning, where there can be none, as with a home that is read only."""
+    folder = why = None
     try:
+        folder = _folder(cache)
         folder.mkdir(parents=True, exist_ok=True)
+        if not os.access(folder, os.W_OK):
+            why = "it cannot be written"
     except (FileExistsError, NotADirectoryError):
         raise ValueError(f"{folder} is a file, or lies in one: `cache` is the name of a folder.") from None
+    except (OSError, RuntimeError) as error:  # the latter where there is no home
+        why = str(error)
+    if why is None:
+        return folder
+    where = "" if folder is None else f" {folder}"
+    warnings.warn(
+        f"jaxkane.configure: there can be no folder of compiled programs{where} ({why}): each process compiles anew. "
+        "Give configure(cache=...) a folder that can be written, or say cache=False.",
+        UserWarning,
+        stacklevel=3,
+    )
+    return None
+
+
+def _store_programs(folder: Path) -> None:
+    """Have every compiled program kept in a folder."""
+    global _before
     settings = {
         "jax_compilation_cache_dir": str(folder),
         "jax_enable_compilation_cache": True,
@@ -155,19 +186,43 @@ def _store_programs(folder: Path) -> None:
         "jax_persistent_cache_min_compile_time_secs": 0.0,
         "jax_persistent_cache_min_entry_size_bytes": 0,
     }
+    names = {"EQX_ON_ERROR": "nan"} | {name.upper(): str(value) for name, value in settings.items()}
+    there = {name: getattr(jax.config, name) for name in settings}
+    environment = {name: os.environ.get(name) for name in names}
     for name, value in settings.items():
         jax.config.update(name, value)
-        os.environ[name.upper()] = str(value)
+    os.environ.update(names)
     internals.look_for_cache_again()  # JAX looks for a folder once, when it first compiles
     # JAX stores no program that may call back into Python, as equinox's checks do in order to raise.
-    os.environ["EQX_ON_ERROR"] = "nan"
-    if not internals.checks_give_nan():
+    checks = internals.on_failed_checks("nan")
+    if _before is None:
+        _before = _Before(there, environment, checks)
+    if checks is None:
         warnings.warn(
             "jaxkane.configure: this equinox cannot be told at run time how to treat errors, so simulations will not "
             "be stored. Set EQX_ON_ERROR=nan in the environment before Python starts.",
             UserWarning,
             stacklevel=3,
         )
+
+
+def _store_nothing() -> None:
+    """Keep no programs, and take back what keeping them has set."""
+    global _before
+    if _before is not None:
+        for name, value in _before.settings.items():
+            jax.config.update(name, value)
+        for name, word in _before.environment.items():
+            os.environ.pop(name, None)
+            if word is not None:
+                os.environ[name] = word
+        if _before.checks is not None:
+            internals.on_failed_checks(_before.checks)
+        _before = None
+        jax.clear_caches()  # programs whose checks give NaN
+    jax.config.update("jax_compilation_cache_dir", None)
+    os.environ.pop("JAX_COMPILATION_CACHE_DIR", None)
+    internals.look_for_cache_again()
 
 
 def _why_off() -> str | None:

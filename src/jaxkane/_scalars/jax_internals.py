@@ -99,6 +99,15 @@ def is_moved_forward_below(x: Any) -> bool:
     return is_moved_forward(getattr(x, "primal", None))
 
 
+def is_under_way(x: Tracer) -> bool:
+    """Whether the trace of a number has not ended yet: one that has ended refuses every operation."""
+    try:
+        jax.numpy.isfinite(x)
+    except jax.errors.UnexpectedTracerError:
+        return False
+    return True
+
+
 def as_lowering(f: Callable[..., Any]) -> Callable[..., Any]:
     """A function of JAX, with several results, as a rule that makes text for XLA."""
     return mlir.lower_fun(f, multiple_results=True)
@@ -170,8 +179,8 @@ def look_for_cache_again() -> None:
     reset_cache()
 
 
-def checks_give_nan() -> bool:
-    """Have equinox's checks give NaN rather than raise; whether that could be done.
+def on_failed_checks(how: str) -> str | None:
+    """Have equinox's checks "raise", or give "nan". **Returns:** what they did before; None where that is not known.
 
     equinox reads the environment's EQX_ON_ERROR when it is imported; its checks look at the name in their own module
     when they are traced.
@@ -179,10 +188,10 @@ def checks_give_nan() -> bool:
     try:
         checks: Any = importlib.import_module("equinox._errors")
     except ImportError:
-        return False
-    known = hasattr(checks, "EQX_ON_ERROR")
-    checks.EQX_ON_ERROR = "nan"
-    return known
+        return None
+    before = getattr(checks, "EQX_ON_ERROR", None)
+    checks.EQX_ON_ERROR = how
+    return before
 
 
 def process_allgather(x: Any, *, tiled: bool = False) -> Any:

@@ -83,7 +83,7 @@ class Reads:
     def __init__(self, root: Any, lasting: bool = False):
         self.root, self.lasting = root, lasting
         self.used = 0
-        self.is_passing = False  # something in it is being traced, and must not be held on to
+        self.tracers: list[Tracer] = []  # what is being traced in it, and must not be held on to
         self.named: list[tuple[Mapping[str, Any], str, Any]] = []
         self.attributes: list[tuple[Any, str, Any]] = []
         self.cells: list[tuple[types.CellType, Any]] = []
@@ -184,7 +184,7 @@ class _Walk:
         elif isinstance(value, functools.cached_property):
             self.parts("property", (value.func,))
         elif isinstance(value, Tracer):
-            self.reads.is_passing = True
+            self.reads.tracers.append(value)
             self.opaque(value)
         elif isinstance(value, np.ndarray):
             self.array(value)
@@ -395,5 +395,6 @@ def _serial(thing: Any) -> int:
 
 
 def _gone(place: int, reference: Any) -> None:
-    if place in _serials and _serials[place][0] is reference:
-        del _serials[place]
+    known = _serials.get(place)
+    if known is not None and known[0] is reference:
+        _serials.pop(place, None)

@@ -14,8 +14,9 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
+from jax.core import Tracer
 
-from .jax_internals import settings
+from .jax_internals import is_under_way, settings
 from .reads import NUMBERS, Reads, is_of_library
 
 _MOST_KEPT = 256
@@ -49,7 +50,7 @@ def _reads_of(root: Any) -> Reads:
 
 
 def _kept(reads: Reads) -> Reads:
-    if reads.is_passing:
+    if reads.tracers:
         return reads
     with _lock:
         if len(_known) >= _MOST_KEPT:
@@ -98,6 +99,12 @@ def _roots(value: Any, found: list[Any]) -> list[Any]:
 def version_of(*values: Any) -> bytes:
     """A digest of all that the code in these values reads at this moment, for the key of a program."""
     return b"".join([_forgotten, *[_reads_of(root).version for root in _roots(values, [])]])
+
+
+def captured(*values: Any) -> tuple[Tracer, ...]:
+    """The numbers under a trace that is under way which code in these values reads from outside: by a closure."""
+    found = {id(x): x for root in _roots(values, []) for x in _reads_of(root).tracers}
+    return tuple(filter(is_under_way, found.values()))
 
 
 class Key(NamedTuple):

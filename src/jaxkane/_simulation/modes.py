@@ -5,6 +5,7 @@ Knows JAX; knows no motions.
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -17,12 +18,24 @@ from .._scalars.jax_internals import (
     is_moved_forward_below,
     is_no_tangent,
     new_primitive,
+    nothing_is_traced,
 )
+from .settings import ADJOINTS, Settings
 
 
 def goes_forward(values: Any) -> bool:
     """Whether a derivative in forward mode is under way by any of the arrays in `values`."""
     return any(map(is_moved_forward, jax.tree.leaves(values)))
+
+
+def in_its_mode(settings: Settings, adjoint: Any, given: Any) -> tuple[Settings, Any]:
+    """The settings for a derivative in forward mode that is under way, where `adjoint` leaves the choice; and what is
+    given to a motion, guarded where that is for reverse mode."""
+    if adjoint == "auto" and goes_forward(given):
+        settings = dataclasses.replace(settings, adjoint=ADJOINTS["forward"]())
+    if isinstance(settings.adjoint, ADJOINTS["reverse"]) and not nothing_is_traced():
+        given = for_reverse_mode(given)
+    return settings, given
 
 
 def for_reverse_mode(values: Any) -> Any:

@@ -23,7 +23,7 @@ from .._scalars.fuse import fused
 from .._scalars.linear import as_vector
 from .._scalars.nan import derivative_free_where_not_finite, flat, nan_derivative_where, nan_where
 from .._scalars.types import Component
-from .._scalars.versions import compiled
+from .._scalars.versions import captured, compiled
 from .events import Events, at_zero, events_of
 from .loops import keeping
 from .settings import Settings, refuse_held
@@ -86,9 +86,17 @@ class _Found(NamedTuple):
 
 @compiled
 def solve(
-    system: System, state: State, ts: Array, signals: Any, settings: Settings, disturbance: Any = None
+    system: System,
+    state: State,
+    ts: Array,
+    signals: Any,
+    settings: Settings,
+    disturbance: Any = None,
+    closures: Any = (),
 ) -> Trajectory:
     """`simulate` without its checks: one compiled program.
+
+    `closures`: what functions among the signals read by closures, so that derivatives by it are NaN where they are not.
 
     `disturbance`: of t, inputs and state, gives the inputs as disturbed, and a `State` of what is added to its rates.
     """
@@ -96,7 +104,7 @@ def solve(
     if settings.step is not None:
         refuse_held(settings.solver, signals)
         signals = for_fixed_steps(signals)
-    origin = flat((system, state, ts, signals, disturbance))
+    origin = flat((system, state, ts, signals, disturbance, closures))
     rises = None if settings.rising else is_rising(ts)
     ts = ts if rises is None else jnp.where(rises, ts, jnp.arange(ts.shape[0], dtype=ts.dtype))
     times = times_of(ts, settings)
@@ -136,6 +144,16 @@ def _calling_samples(system: System) -> dict[str, Callable[..., Any]]:
         return packed_rates(system, t, packed(State(now.q, now.u, now.x)), {})
 
     return {type(system).__name__: rates} if samples_of(system) else {}
+
+
+def refuse_captured(system: System) -> None:
+    """**Raises:** `TypeError` where a description reads a number of a trace that is under way from outside: the rules
+    by which events, constraints and steps are differentiated know what they are given alone."""
+    if captured(system):
+        raise TypeError(
+            f"{type(system).__name__}: its description reads, by a closure or a global, a number that is being traced "
+            "(by jax.grad, jax.jvp, jax.jit or jax.vmap). Make it a parameter of the system, or an input."
+        )
 
 
 def _rates(valid: Array, stabilize: float) -> Callable[..., Any]:

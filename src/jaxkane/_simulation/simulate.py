@@ -15,8 +15,9 @@ from .._method.diagnose import diagnosis
 from .._method.right_hand_side import values_of
 from .._scalars.jax_internals import nothing_is_traced
 from .._scalars.types import Inputs
-from .modes import for_reverse_mode, goes_forward
-from .ride import inputs_at, solve
+from .._scalars.versions import captured
+from .modes import in_its_mode
+from .ride import inputs_at, refuse_captured, solve
 from .settings import ADJOINTS, checked_state, checked_times, of_any_accuracy, settings_for
 from .signals import as_signals, with_one_times
 from .trajectory import Status, Trajectory
@@ -66,6 +67,7 @@ def simulate(
     description that contradicts itself, or equations without a finite solution at the first state. `TypeError` for a
     derivative in forward mode through a motion for reverse mode, as in `jax.jacfwd(jax.jit(f))` with "auto".
     """
+    refuse_captured(system)
     state = checked_state(system, state)
     ts = checked_times(ts, state.q.dtype)
     signals = as_signals(inputs, system.inputs, ts, type(system).__name__)
@@ -87,17 +89,14 @@ def simulate(
         progress=progress,
         rising=not isinstance(ts, Tracer),
     )
-    given = (system, state, ts, with_one_times(signals))
-    if adjoint == "auto" and goes_forward(given):
-        settings = dataclasses.replace(settings, adjoint=ADJOINTS["forward"]())
+    given = (system, state, ts, with_one_times(signals)), captured(signals)
+    settings, (parts, closures) = in_its_mode(settings, adjoint, given)
     name_of_adjoint = type(settings.adjoint).__name__
-    if isinstance(settings.adjoint, ADJOINTS["reverse"]):
+    if nothing_is_traced() and isinstance(settings.adjoint, ADJOINTS["reverse"]):
         # A motion that nobody can differentiate is compiled without what its derivative would need: the same numbers.
-        if nothing_is_traced():
-            settings = dataclasses.replace(settings, adjoint=ADJOINTS["forward"]())
-        else:
-            given = for_reverse_mode(given)
-    ride = dataclasses.replace(solve(*given, of_any_accuracy(settings, ts.dtype)), adjoint=name_of_adjoint)
+        settings = dataclasses.replace(settings, adjoint=ADJOINTS["forward"]())
+    ride = solve(*parts, of_any_accuracy(settings, ts.dtype), closures=closures)
+    ride = dataclasses.replace(ride, adjoint=name_of_adjoint)
     if is_concrete(ride.status) and int(ride.status) == Status.NO_SOLUTION:
         inputs_now = values_of(system, state.x, inputs_at(system, signals, ts[0], state))
         raise ValueError(

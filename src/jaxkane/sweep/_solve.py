@@ -51,6 +51,7 @@ class Job(eqx.Module):
     settings: Settings
     reduce: Callable[[Trajectory], Any] | None
     mesh: Mesh | None = eqx.field(static=True)
+    closures: tuple[Any, ...] = ()  # what is traced, and read from outside by the functions among these
 
     def whole(self, own: Any) -> Part:
         """The motion of one member."""
@@ -60,7 +61,7 @@ class Job(eqx.Module):
         """The motion of one member from its first state."""
         system, signals = system_and_signals(own, self.shared)
         start = with_possible_bodies(system, self.ts[0], start)
-        ride = solve(system, start, self.ts, signals, self.settings)
+        ride = solve(system, start, self.ts, signals, self.settings, closures=self.closures)
         if self.reduce is None:
             values = (ride.q, ride.u, ride.u_dep, ride.x, ride.inputs, ride.outputs, ride.end, ride.sides)
         else:

@@ -16,6 +16,9 @@ from tqdm import tqdm
 from .._description.system import State, System
 from .._method.checks import is_concrete
 from .._scalars.types import Inputs
+from .._scalars.versions import captured
+from .._simulation.modes import in_its_mode
+from .._simulation.ride import refuse_captured
 from .._simulation.settings import as_state, checked_times, settings_for
 from .._simulation.trajectory import Status, Trajectory
 from ._cluster import on_cluster
@@ -88,16 +91,22 @@ def sweep(
         state = as_state(system, state)
     ts = checked_times(ts, getattr(state.q, "dtype", float) if isinstance(state, State) else float)
     settings = settings_for(ts, progress=False, rising=is_concrete(ts), **options)
+    if isinstance(system, System):
+        refuse_captured(system)
     members, shared, n = members_of(system, state, inputs, table, ts)
     found = table if table is not None else Table({}, ("member",), (n,))
-    job = Job(shared, ts, settings, reduce, None if client is not None else mesh_of(devices))
+    closures = captured(shared, reduce)
+    job = Job(shared, ts, settings, reduce, None if client is not None else mesh_of(devices), closures)
     own = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), members)
     if n == 0:
         like = jax.eval_shape(job.whole, own)
         return Sweep.of(jax.tree.map(lambda x: np.zeros((0, *x.shape), x.dtype), like), found, ts, reduce is not None)
-    if not is_concrete(members, shared, ts):  # inside jit, grad or vmap
+    if not is_concrete(members, shared, ts, closures):  # inside jit, grad or vmap
         if folder is not None or client is not None:
             raise ValueError("sweep: `folder` and `client` cannot be used inside jit, grad or vmap.")
+        given = members, shared, ts, closures
+        settings, (members, shared, ts, closures) = in_its_mode(settings, options.get("adjoint", "auto"), given)
+        job = Job(shared, ts, settings, reduce, job.mesh, closures)
         return Sweep.of(job.solve(members, n), found, ts, reduce is not None)
 
     size = n if n <= GROUP else GROUP * -(-min(chunk, n) // GROUP)

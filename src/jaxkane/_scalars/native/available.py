@@ -12,7 +12,17 @@ import jax
 from . import probe
 from .machine import Machine, without_llvm
 
-_wanted = os.environ.get("JAXKANE_NATIVE", "1") != "0"
+_ON, _OFF = ("", "1", "true", "yes", "on"), ("0", "false", "no", "off")
+
+
+def switched_on(word: str) -> bool:
+    """What JAXKANE_NATIVE says in the environment; where it is empty, it is as if it were not set."""
+    if word.strip().lower() not in (*_ON, *_OFF):
+        raise ValueError(f"JAXKANE_NATIVE={word!r} in the environment: it is one of {', '.join((*_ON[1:], *_OFF))}.")
+    return word.strip().lower() in _ON
+
+
+_wanted = switched_on(os.environ.get("JAXKANE_NATIVE", ""))
 _lock = threading.RLock()
 _told: set[str] = set()
 
