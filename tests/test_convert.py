@@ -223,6 +223,36 @@ def test_limits_of_what_actuators_do_to_a_joint_are_said():
 
 
 @needs_mujoco
+@pytest.mark.parametrize(("first", "second"), [("j_1", "j.1"), ("j.1", "j_1")])
+def test_two_names_that_become_one_are_refused(first, second):
+    links = f"""<body name="a"><joint name="{first}" axis="0 1 0"/><geom size=".1"/>
+      <body><joint name="{second}" axis="0 1 0"/><geom size=".1"/></body></body>"""
+    with pytest.raises(ValueError, match=f"the joints '{first}' and '{second}' would both be 'j_1'"):
+        jk.convert.from_mjcf(mjcf(links))
+    motors = f'<actuator><motor name="{first}" joint="j"/><motor name="{second}" joint="j"/></actuator>'
+    with pytest.raises(ValueError, match=f"the actuators '{first}' and '{second}' would both be 'j_1'"):
+        jk.convert.from_mjcf(mjcf(BODY.format(""), motors))
+    with pytest.raises(ValueError, match=r"the bodies 'tool_tip' and 'tool.tip' would both be 'tool_tip'"):
+        jk.convert.from_urdf(ELBOW.replace('"lower"', '"tool_tip"'))
+
+
+@needs_mujoco
+def test_a_name_of_the_file_is_not_given_to_what_has_none():
+    body = '<body><joint axis="0 1 0"/><geom size=".1" contype="0"/>{}</body>'
+    named = body.replace("<joint", '<joint name="joint0"')
+    system = jk.convert.from_mjcf(mjcf(body.format(named)))
+    assert system.coordinates == ("joint0_", "joint0")
+
+
+@needs_mujoco
+def test_friction_of_zero_is_none():
+    smooth = ELBOW.replace('damping="0.02"', 'damping="0.02" friction="0"')
+    assert jk.convert.from_urdf(smooth, strict=True).left_out == ()
+    with pytest.raises(ValueError, match="no counterpart: friction of joints"):
+        jk.convert.from_urdf(smooth.replace('friction="0"', 'friction="0.1"'), strict=True)
+
+
+@needs_mujoco
 def test_names_that_clash_or_are_missing():
     off = "<option><flag contact='disable'/></option>"
     text = mjcf(

@@ -1,7 +1,9 @@
 """Steady motions and their families: closed forms, Basu-Mandal et al. (2007), and derivatives against differences."""
 
 import dataclasses
+from types import MappingProxyType
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -278,6 +280,57 @@ def test_other_independent_speeds_move_alike():
     np.testing.assert_allclose(u_dot, [rates[names.index(k)] for k in bicycle.speeds], rtol=rtol)
     with pytest.raises(ValueError, match="name 3 different ones of roll_rate"):
         with_speeds(BIKE, ("roll_rate", "speed", "yaw_rate"))
+
+
+class Skate(jk.System):
+    """A particle on a blade that is turned by `angle`, drawn by a motor that lags, with an accelerometer."""
+
+    slope: jk.Scalar = jk.parameter(0.5)
+    lag: jk.Scalar = jk.parameter(0.2)
+    coordinates, speeds, dependent_speeds = ("x", "y"), ("x_dot",), ("y_dot",)
+    inputs, states = ("command",), ("pull",)
+    units = MappingProxyType({"x": "m", "pull": "N", "along": "m/s^2"})
+    check_inertia = False
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(N.vector(q["x"], q["y"], 0.0), N.vector(u["x_dot"], u["y_dot"], 0.0))
+        flat = jk.Body(1.0, (1.0, 2.0, 9.0), P, N, name="flat")  # no body's, which check_inertia passes over
+        return jk.Motion([flat], [u["y_dot"] - self.slope * u["x_dot"]], points={"P": P})
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force(inputs["pull"] * motion.N.x, motion["P"])
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return ((now["command"] - x["pull"] - 0.1 * now.u_dot[0]) / self.lag,)  # by place: of x_dot
+
+    def outputs(self, t, q, u, motion, now):
+        return {"along": now.acceleration(motion["P"]).dot(motion.N.x), "rate": u[0]}
+
+
+def test_other_independent_speeds_keep_all_else():
+    rtol = 1e-6
+    skate, start = Skate(), {"x_dot": 1.0}
+    other = with_speeds(skate, ("y_dot",))
+    assert (other.states, other.units, other.check_inertia) == (("pull",), skate.units, False)
+    ts, inputs = jnp.linspace(0.0, 1.0, 5), {"command": 2.0}
+    ride = jk.simulate(skate, jk.State({}, start, {"pull": 0.3}), ts, inputs=inputs)
+    again = jk.simulate(other, jk.State({}, {"y_dot": 0.5}, {"pull": 0.3}), ts, inputs=inputs)
+    np.testing.assert_allclose(again.x, ride.x, rtol=rtol)
+    for name in ("along", "rate"):
+        np.testing.assert_allclose(jk.outputs(other, again)[name], jk.outputs(skate, ride)[name], rtol=rtol)
+    # Systems of one class may differ in their names.
+    pair = [with_speeds(Row(n), ("v0",)) for n in (1, 2)]
+    assert [each.dependent_speeds for each in pair] == [("v1",), ("v1", "v2")]
+
+
+class Row(jk.System):
+    """Particles on a line that move with the first."""
+
+    n: int = eqx.field(static=True)
+    coordinates = property(lambda self: tuple(f"x{i}" for i in range(self.n + 1)))
+    speeds = ("v0",)
+    dependent_speeds = property(lambda self: tuple(f"v{i + 1}" for i in range(self.n)))
 
 
 @pytest.mark.slow

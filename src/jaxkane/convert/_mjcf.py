@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Sequence
 from typing import Any
 
 from ..joints import Mechanism
 from ._mujoco_model import Reader
-from ._urdf import for_mujoco, mimics, robot_of
+from ._urdf import for_mujoco, has_friction, mimics, robot_of
 
 Path = str | os.PathLike[str]
 
@@ -39,7 +38,7 @@ def from_mjcf(
     equalities, as rigid constraints. What is not is listed in `left_out`: contacts, limits, friction, tendons, ...
 
     **Raises:** `ImportError` without MuJoCo; `ValueError` for a file that MuJoCo does not read, one without a moving
-    body, and with `strict` for what would be left out.
+    body, two names that differ by a dot alone, and with `strict` for what would be left out.
     """
     mujoco = _mujoco()
     return Reader(mujoco, _compiled(mujoco, model), name).mechanism(strict, dependent)
@@ -66,7 +65,7 @@ def from_urdf(
     compiled = _compiled(mujoco, for_mujoco(text, floating))
     reader = Reader(mujoco, compiled, name or robot_of(text).get("name"))
     reader.gravity = gravity
-    reader.left_out += ["friction of joints"] * bool(re.search(r"<dynamics[^>]*friction=", text))
+    reader.left_out += ["friction of joints"] * has_friction(text)
     reader.loops += couplings
     return reader.mechanism(strict, dependent)
 

@@ -32,11 +32,22 @@ class Reader:
         return any(int(self.m.opt.disableflags) & bit for bit in bits)
 
     def _names(self, kind: str, n: int) -> list[str]:
-        found: list[str] = []
-        for i in range(n):
-            name = getattr(self.m, kind)(i).name.replace(".", "_") or f"{kind}{i}"
-            found.append(_other(name, found, "_"))
-        return found
+        """The file's names; what has none is numbered, past these.
+
+        **Raises:** `ValueError` for two names that become one, since either could then stand for the other's part.
+        """
+        given = [getattr(self.m, kind)(i).name for i in range(n)]
+        names = [name.replace(".", "_") for name in given]
+        for i, name in enumerate(names):
+            if name and name in names[:i]:
+                raise ValueError(
+                    f"{self.name}: the {_PLURALS.get(kind, kind + 's')} {given[names.index(name)]!r} and {given[i]!r} "
+                    f"would both be {name!r}, since a dot becomes an underscore: rename one in the file."
+                )
+        for i, name in enumerate(names):
+            if not name:
+                names[i] = _other(f"{kind}{i}", names, "_")
+        return names
 
     def mechanism(self, strict: bool, dependent: Sequence[str] | None) -> Mechanism:
         m = self.m
@@ -44,13 +55,11 @@ class Reader:
             raise ValueError(f"{self.name}: the file has no joint, so that nothing moves.")
         links = [self._link(i) for i in range(1, m.nbody)]
         taken = {*self.bodies, *(f"{j} joint" for j in self.joints)}
-        for i in range(m.nsite):
-            name = _other(m.site(i).name.replace(".", "_") or f"site{i}", taken, "_site")
-            taken.add(name)
+        for i, name in enumerate(_others(self._names("site", m.nsite), taken, "_site")):
             self.sites.append(
                 Site(name, self._carrier(m.site_bodyid[i]), _floats(m.site_pos[i]), _euler(m.site_quat[i]))
             )
-        self._read_equalities(taken)
+        self._read_equalities({*taken, *(site.name for site in self.sites)})
         actuators = list(self._actuators())
         self.left_out += self._not_taken()
         left_out = tuple(dict.fromkeys(self.left_out))
@@ -124,17 +133,15 @@ class Reader:
         for j, name in enumerate(self.joints):
             if m.jnt_type[j] in (int(kinds.mjtJoint.mjJNT_HINGE), int(kinds.mjtJoint.mjJNT_SLIDE)):
                 taken.add(f"{name}_rate")
-        for i in range(0 if self._is_off("ACTUATION") else int(m.nu)):
+        names = self._names("actuator", int(m.nu))
+        for i, name in enumerate([] if self._is_off("ACTUATION") else _others(names, taken, "_input")):
             group = int(m.actuator_group[i])
             if 0 <= group <= 30 and int(m.opt.disableactuator) >> group & 1:
                 continue
-            own = m.actuator(i).name or f"actuator{i}"
             why = self._why_not(i)
             if why:
-                self.left_out.append(f"the actuator {own!r}, {why}")
+                self.left_out.append(f"the actuator {names[i]!r}, {why}")
                 continue
-            name = _other(own.replace(".", "_"), taken, "_input")
-            taken.add(name)
             j = int(m.actuator_trnid[i, 0])
             size = 3 if m.jnt_type[j] == int(kinds.mjtJoint.mjJNT_BALL) else 1
             bias = m.actuator_biasprm[i] * (m.actuator_biastype[i] == int(kinds.mjtBias.mjBIAS_AFFINE))
@@ -179,7 +186,7 @@ class Reader:
         m, kinds = self.m, self.kinds.mjtEq
         for i in range(0 if self._is_off("EQUALITY", "CONSTRAINT") else m.neq):
             kind, data = m.eq_type[i], m.eq_data[i]
-            name = m.eq(i).name.replace(".", "_") or f"equality{i}"
+            name = m.eq(i).name.replace(".", "_") or f"equality{i}"  # of sites that are made for it
             if not m.eq_active0[i]:
                 continue
             first, second = int(m.eq_obj1id[i]), int(m.eq_obj2id[i])
@@ -246,6 +253,14 @@ def _other(name: str, taken: Any, ending: str) -> str:
     while name in taken:
         name += ending
     return name
+
+
+def _others(names: Sequence[str], taken: Any, ending: str) -> list[str]:
+    """The names, those of something else with an ending that makes them names of nothing."""
+    return [_other(name + ending, {*taken, *names}, ending) if name in taken else name for name in names]
+
+
+_PLURALS = {"body": "bodies"}
 
 
 def _floats(values: Any) -> tuple[float, ...]:

@@ -68,6 +68,10 @@ def _turn_back(inertial: ElementTree.Element) -> None:
     origin.set("rpy", "0 0 0")
 
 
+def has_friction(text: str) -> bool:
+    return any(float(dynamics.get("friction", 0.0)) for dynamics in robot_of(text).findall("joint/dynamics"))
+
+
 def mimics(text: str) -> list[Loop | Coupling]:
     found: list[Loop | Coupling] = []
     for joint in robot_of(text).findall("joint"):
