@@ -8,11 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.linalg
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 import jaxkane as jk
 from jaxkane import Scalar, parameter
+from jaxkane.bicycles import sharp_motorcycle
 from jaxkane.stability import critical_speeds, eigenvalues, linearize, straight_ahead
-from jaxkane.stability._eigenvalues import track
+from jaxkane.stability._eigenvalues import _tracked, track
+from jaxkane.stability._modes import pairs
 
 BIKE = jk.catalog.WhippleBicycle.benchmark()
 PUBLISHED = json.loads((Path(__file__).parent / "data" / "meijaard2007.json").read_text())
@@ -84,7 +89,7 @@ def test_crossing_modes_keep_their_columns():
     X = X / np.linalg.norm(X, axis=0)
     shuffles = np.stack([rng.permutation(5) for _ in p])
     shuffled = np.take_along_axis(lam, shuffles, axis=1)
-    order = track(shuffled, np.stack([X[:, s] for s in shuffles]))
+    order, _ = track(p, shuffled, np.stack([X[:, s] for s in shuffles]))
     tracked = np.take_along_axis(shuffled, order, axis=1)
     columns = [int(np.abs(lam - tracked[:, [j]]).sum(axis=0).argmin()) for j in range(5)]
     assert sorted(columns) == [0, 1, 2, 3, 4]
@@ -154,6 +159,197 @@ def test_derivatives_of_critical_speeds_with_respect_to_all_parameters():
 
     np.testing.assert_allclose(both(BIKE), [WEAVE, CAPSIZE], atol=1e-11)
     agree(jax.jit(jax.jacrev(both))(BIKE), differences(both, 4e-4), rtol)
+
+
+class Pencil(jk.System):
+    """States that follow x_dot = A x, beside a point that comes to rest."""
+
+    A: jax.Array = parameter(shape=(4, 4))
+
+    coordinates = ("place",)
+    speeds = ("speed",)
+    states = ("x1", "x2", "x3", "x4")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(q["place"] * N.x, u["speed"] * N.x)
+        return jk.Motion([jk.Body(1.0, 0.0, P, name="point")])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force(-(q["place"] + u["speed"]) * motion.N.x, motion["point"])
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return [sum(self.A[i, j] * x[k] for j, k in enumerate(self.states)) for i in range(4)]
+
+
+REST = jk.State(jnp.zeros(1), jnp.zeros(1), jnp.zeros(4))
+STEPS = np.linspace(-1.0, 1.0, 5)
+
+
+@jax.jit
+def crossings_of(A, dA):
+    """Where x_dot = (A + p dA) x becomes stable or unstable for p from -1 to 1, and the slopes along A."""
+
+    def critical(s):
+        at = lambda system, p: (Pencil(A=(1 + s) * A + p * dA), REST)  # noqa: E731
+        found = critical_speeds(Pencil(A=A), STEPS, at, states=Pencil.states, most=24)
+        return found.values, found
+
+    slopes, found = jax.jacfwd(critical, has_aux=True)(0.0)
+    return found, slopes
+
+
+def pencil(seed):
+    """A and dA of a random pencil: dense, of an oscillator, of parts that do not notice each other, of one that hardly
+    decays, or of one of its own beside them that is a thousand times as fast."""
+    rng = np.random.default_rng(seed)
+    A, dA = rng.standard_normal((2, 4, 4))
+    match seed % 5:
+        case 1:
+            A[:2], dA[:2] = np.eye(4)[2:], 0.0
+        case 2:
+            for x in (A, dA):
+                x[:2, 2:] = x[2:, :2] = 0.0
+        case 3:
+            A, dA = A - A.T + 0.05 * dA, dA - dA.T + 0.05 * A
+        case 4:
+            for x, own in ((A, rng.standard_normal()), (dA, 1e3)):
+                x[3], x[:, 3] = 0.0, 0.0
+                x[3, 3] = own
+    return A, dA
+
+
+def every_crossing_is_found(seed):
+    """The number of growing modes at 2001 values follows from the crossings, at which a real part is zero; and slopes
+    are those of first-order perturbation: Re(y A x) + Re(y dA x) dp = 0."""
+    atol, (A, dA) = 1e-9, pencil(seed)
+    found, slopes = crossings_of(A, dA)
+    some = np.isfinite(found.values)
+    p, frequency, direction, slopes = (
+        np.asarray(x)[some] for x in (found.values, found.frequency, found.direction, slopes)
+    )
+    fine = np.linspace(-1.0, 1.0, 2001)
+    growing = (np.linalg.eigvals(A + fine[:, None, None] * dA).real > 0).sum(axis=1)
+    changes = direction * np.where(frequency > 0, 2, 1)
+    told = growing[0] + (changes[None, :] * (p[None, :] < fine[:, None])).sum(axis=1)
+    beside = (np.abs(p[None, :] - fine[:, None]) < 1e-6).any(axis=1)
+    np.testing.assert_array_equal(told[~beside], growing[~beside])
+    for value, w, slope in zip(p, frequency, slopes, strict=True):
+        x, Y, X = scipy.linalg.eig(A + value * dA, left=True)
+        i = np.argmin(np.abs(x - 1j * w))
+        assert abs(x[i] - 1j * w) < atol * max(1.0, np.abs(x).max())
+        y = Y[:, i].conj() / (Y[:, i].conj() @ X[:, i])
+        by_hand = -(y @ A @ X[:, i]).real / (y @ dA @ X[:, i]).real
+        assert abs(slope - by_hand) <= 1e-6 * abs(by_hand) or np.linalg.norm(y) > 1e6
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.integers(0, 2**20))
+def test_every_crossing_of_a_random_pencil_is_found(seed):
+    """In four steps, against two thousand."""
+    every_crossing_is_found(seed)
+
+
+@pytest.mark.slow
+@settings(max_examples=2000, deadline=None)
+@given(st.integers(0, 2**32))
+def test_every_crossing_of_many_random_pencils_is_found(seed):
+    every_crossing_is_found(seed)
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.integers(0, 2**20), st.integers(2, 12))
+def test_a_pair_is_not_torn_while_it_is_one(seed, n):
+    """Along a pencil in steps that are small enough, what is a pair in two rows stays in its two columns."""
+    A, dA = pencil(seed)
+    p = np.linspace(0.0, 0.01, n)
+    values, vectors = np.linalg.eig(A + p[:, None, None] * dA)
+    order, _ = track(p, values, vectors)
+    together = pairs(np.take_along_axis(values, order, axis=1))
+    kept = (together.sum(axis=(1, 2))[1:] == 2) & (together.sum(axis=(1, 2))[:-1] == 2)
+    np.testing.assert_array_equal(together[1:][kept], together[:-1][kept])
+
+
+def test_a_pair_that_becomes_real_and_unstable_within_a_step():
+    """x'' = (p - 0.1) x - 0.4 x' has a pair up to p = 0.06 and grows from 0.1 on; beside it one decays up to 0.07, and
+    one exactly up to a value that is given."""
+    A, dA = np.zeros((2, 4, 4))
+    A[0, 1], A[1, :2], dA[1, 0] = 1.0, (-0.1, -0.4), 1.0
+    A[2, 2], dA[2, 2], A[3, 3], dA[3, 3] = -0.7, 10.0, -0.5, 1.0
+    found, slopes = crossings_of(A, dA)
+    np.testing.assert_allclose(found.values[:3], [0.07, 0.1, 0.5], rtol=1e-12)
+    np.testing.assert_allclose(slopes[:3], [0.07, 0.1, 0.5], rtol=1e-9)
+    np.testing.assert_array_equal(found.direction[:3], 1)
+    np.testing.assert_array_equal(found.frequency[:3], 0.0)
+    assert np.isnan([*found.values[3:], *slopes[3:]]).all()
+
+
+def canonical(v):
+    """Matrices (m, 4, 4) of the benchmark bicycle: Meijaard et al. (2007), eq. (5.3)."""
+    M, C1, K0, K2 = (np.array(PUBLISHED["canonical"][name]) for name in ("M", "C1", "K0", "K2"))
+    right = [np.hstack([-9.81 * K0 - x**2 * K2, -x * C1]) for x in v]
+    return np.array([np.vstack([np.eye(4)[2:], np.linalg.solve(M, below)]) for below in right])
+
+
+def in_order(v):
+    """Eigenvalues of the benchmark by modes, and whether these are clear."""
+    A = canonical(v)
+    values, vectors = np.linalg.eig(A)
+    left = np.linalg.inv(vectors).conj().swapaxes(1, 2)
+    order, clear = _tracked((v, values, left, vectors), LATERAL, {})
+    return np.take_along_axis(values, order, axis=1), clear
+
+
+FINE = np.arange(1001) / 100  # [m/s]
+
+
+@pytest.fixture(scope="module")
+def reference():
+    values, clear = in_order(FINE)
+    assert clear.all()
+    return values
+
+
+@given(first=st.integers(0, 900), n=st.integers(1, 12), step=st.integers(1, 1000))
+@settings(max_examples=200, deadline=None, derandomize=True)
+def test_names_are_right_or_not_given(reference, first, n, step):
+    """From any speed on, in few or coarse steps, against steps of 0.01 m/s; and they are clear where steps are small,
+    or where a pair swings at a single speed."""
+    rows = np.arange(first, 1001, step)[:n]
+    values, clear = in_order(FINE[rows])
+    for name in (slice(0, 2), slice(2, 3), slice(3, 4)):
+        if clear[name].all():
+            as_set = (np.sort_complex(x[:, name]) for x in (values, reference[rows]))
+            np.testing.assert_allclose(*as_set, atol=1e-9)
+    if step <= 5 or (len(rows) == 1 and first > 70):
+        assert clear.all()
+
+
+def test_a_doubtful_name_is_not_given_and_a_warning_says_so():
+    """From 0.22 to 12 m/s in one step two real modes become the weave; which of four cannot be told."""
+    speeds = jnp.repeat(jnp.array([0.22, 12.0]), jnp.array([50, 51]), total_repeat_length=101)
+    with pytest.warns(UserWarning, match="which modes are weave, .*capsize.* is not clear: numbered instead"):
+        found = eigenvalues(BIKE, speeds)
+    assert found.modes[0] == "mode 1"
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:which modes are")
+def test_names_of_a_motorcycle_at_one_speed_and_in_coarse_steps():
+    """What is named weave, wobble or capsize is it, and no pair has two names."""
+    motorcycle = sharp_motorcycle()
+    for v in (20.0, 30.0, 40.0):
+        found = eigenvalues(motorcycle, jnp.array([v]))
+        values, names = np.asarray(found.eigenvalues[0]), np.array(found.modes)
+        for i, j in np.argwhere(pairs(values)):
+            assert names[i] == names[j] or {*names[[i, j]]} <= {f"mode {k}" for k in range(1, 9)}
+    for first in (1.0, 3.0, 5.0):
+        found = critical_speeds(motorcycle, jnp.arange(first, 50.1, 5.0))
+        np.testing.assert_allclose(found.values, [5.934966209, 10.98552992], rtol=1e-9)
+        for i, name in zip(found.mode, ("weave", "capsize"), strict=True):
+            assert found.modes[i] in (name, f"mode {i + 1}")
+    fine = critical_speeds(motorcycle, jnp.linspace(1.0, 50.0, 99))
+    assert [fine.modes[i] for i in fine.mode] == ["weave", "capsize"]
 
 
 class Inverted(jk.System):

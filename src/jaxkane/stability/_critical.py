@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optimistix as optx
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Complex, Float, Int
 
 from .._common.lookup import not_there
 from .._description.system import System
 from .._method.checks import is_concrete
 from .._scalars.nan import nan_where
 from .._scalars.versions import compiled
-from ._eig import eig
-from ._eigenvalues import Eigenvalues, MotionAt, eigenvalues, family_of, matrix
+from ._eig import Eig, eig
+from ._eigenvalues import MotionAt, eigenvalues, family_of, followed, matrix, names_of_modes
 
 _MOST = 8
 _GRID = np.linspace(0.0, 20.0, 201)  # [m/s]
+_HALVINGS = 32  # of a step between two values
+_TRIALS = 200  # between two values
+_NEUTRAL = 1e-10  # of the largest eigenvalue: what neither grows nor decays has a real part of rounding errors
+_MOST_NEUTRAL = 1e-7  # the same where eigenvalues coalesce, which magnifies rounding errors
 
 
 class CriticalSpeeds(eqx.Module):
@@ -72,110 +75,252 @@ def critical_speeds(
 
         Re lambda(p) = 0
 
-    Modes are followed along `values`; where the real part of one changes sign it is bisected to rounding.
+    The steps between `values` are halved until no eigenvalue can reach the imaginary axis, or one alone (or a conjugate
+    pair) passes it once, which is bisected to rounding. How far eigenvalues move while A changes by dA is told by
+    Gershgorin's discs of X^-1 dA X about them, X being the eigenvectors.
 
-    **Arguments:** as `eigenvalues`. `values` must be close enough for no mode to pass zero twice between two of them;
-    for the bicycle they are 0 to 20 m/s by 0.1 by default. `most`: how many are kept under a trace, where their number
-    cannot be known; the rest are NaN.
+    **Arguments:** as `eigenvalues`, and there must be a steady motion between the `values` too; for the bicycle they
+    are 0 to 20 m/s by 0.1 by default. `most`: how many are kept under a trace, where their number cannot be known; the
+    rest are NaN.
 
     **Returns:** `CriticalSpeeds`. They are differentiable in the parameters of the system by the implicit function
     theorem,
 
         dp = -(d Re lambda / d parameters) / (d Re lambda / dp),
 
-    with NaN where the mode has no derivative because it coalesces with another.
+    with NaN where the mode has no derivative because it coalesces with another. Names are those of `eigenvalues`; under
+    a trace a value is NaN where the name of its mode is not clear.
 
-    **Raises:** `ValueError` as `eigenvalues`, and where some of `values` have no steady motion; under a trace all are
-    NaN then.
+    **Raises:** `ValueError` as `eigenvalues`, and where some of `values`, or something between them, has no steady
+    motion; under a trace all are NaN then.
     """
-    values, at, states, _ = family_of(system, _default_grid(system, values, motion), motion, states)
-    found = eigenvalues(system, values, motion, states=states, modes=modes)
-    roots: Any = jax.lax.stop_gradient(found.eigenvalues)
-    concrete = is_concrete(roots)
-    if concrete:
-        # What is decided by numbers that are known is left to NumPy: every operation would be a program of its own.
-        roots = np.asarray(roots)
-        if not np.all(np.isfinite(roots)):
-            gone = np.asarray(found.values)[~np.isfinite(roots).all(axis=1)]
-            places = ", ".join(f"{x:.6g}" for x in gone)
+    values, at, states, groups = family_of(system, _default_grid(system, values, motion), motion, states)
+    if len(values) < 2:
+        names = eigenvalues(system, values, motion, states=states, modes=modes).modes
+        empty, none = jnp.zeros(0, values.dtype), jnp.full((), jnp.nan, values.dtype)
+        return CriticalSpeeds(empty, empty, empty.astype(int), empty.astype(int), none, names)
+    found, kept = _crossings(system, values, at, states, groups, most)
+    known = jax.lax.stop_gradient(found)
+    origin = (system, values, found.values)  # which follow from what `motion` closes over, too
+    names, unnamed = names_of_modes(kept, groups, known.clear, modes)
+    # What is decided by numbers that are known is left to NumPy: every operation would be a program of its own.
+    as_array: Any = np.asarray if is_concrete(found, origin) else jnp.asarray
+    critical, frequency, direction, column = map(
+        as_array, (found.values, found.frequency, known.direction, known.column)
+    )
+    if is_concrete(known):
+        if known.is_missing:
             raise ValueError(
-                f"critical_speeds({type(system).__name__}): there is no steady motion at {places}, so that what "
-                "becomes stable or unstable beside it would be missed. Give values at which there is one."
+                f"critical_speeds({type(system).__name__}): there is no steady motion at {float(known.missing):.6g}, "
+                "so that what becomes stable or unstable beside it would be missed. Give values at which, and between "
+                "which, there is one."
             )
-    row, column, is_one = _sign_changes(roots, most)
-    critical, frequency = _refine(system, found, at, states, row, column)
-    xp = np if concrete else jnp
-    direction = xp.sign(roots.real[row + 1, column] - roots.real[row, column]).astype(int)
-    origin = (system, values)
-    if not concrete:
-        critical, frequency = nan_where(~(is_one & jnp.all(jnp.isfinite(roots))), (critical, frequency), origin)
-    if is_concrete(critical, frequency, origin):
-        critical, frequency, none = np.asarray(critical), np.asarray(frequency), np.full((), np.nan, values.dtype)
-        order: Any = np.argsort(critical)
+        if known.count > most:
+            return critical_speeds(system, values, motion, states=states, modes=modes, most=2 * int(known.count))
+        rows = np.flatnonzero(known.there)
+        order: Any = rows[np.argsort(np.asarray(known.values)[rows])]
     else:
-        none = nan_where(jnp.array(True), jnp.zeros((), values.dtype), origin)
+        there = known.there & ~jnp.asarray(unnamed)[column] & ~known.is_missing
+        critical, frequency = nan_where(~there, (critical, frequency), origin)
         order = jnp.argsort(jax.lax.stop_gradient(critical))
-    critical, frequency, direction, mode = (jnp.asarray(x[order]) for x in (critical, frequency, direction, column))
-    return CriticalSpeeds(critical, frequency, direction, mode, jnp.asarray(none), found.modes)
+    none = np.full((), np.nan, values.dtype)
+    if not is_concrete(found, origin):
+        none = nan_where(jnp.array(True), jnp.zeros((), values.dtype), origin)
+    found = [jnp.asarray(x[order]) for x in (critical, frequency, direction, column)]
+    return CriticalSpeeds(found[0], found[1], found[2], found[3], jnp.asarray(none), names)
 
 
 def _default_grid(system: System, values: Any, motion: MotionAt) -> Any:
     return _GRID if values is None and motion is None else values
 
 
-def _sign_changes(x: Any, most: int) -> tuple[Any, Any, Any]:
-    """Rows after which, and columns in which, a real part of the eigenvalues (m, n) changes sign; of a conjugate pair
-    only the upper one."""
-    xp = np if isinstance(x, np.ndarray) else jnp
-    upper = (x.imag[:-1] >= 0) & (x.imag[1:] >= 0)
-    # What neither grows nor decays (an undamped oscillation) has a real part of rounding errors only.
-    sign = xp.sign(xp.where(xp.abs(x.real) > 1e-10 * xp.max(xp.abs(x), initial=0.0), x.real, 0.0))
-    # One that is zero at a value itself, between two signs, has passed it.
-    before, after = xp.concatenate([sign[:1], sign[:-1]]), xp.concatenate([sign[1:], sign[-1:]])
-    sign = xp.where((sign == 0) & (before * after < 0), after, sign)
-    changes = (sign[:-1] * sign[1:] < 0) & upper
-    if xp is np:
-        row, column = np.nonzero(changes)
-        return row, column, np.ones(row.shape, bool)
-    row, column = jnp.nonzero(changes, size=most, fill_value=-1)
-    is_one = row >= 0
-    # Empty places repeat the first, so that nothing there can spoil a derivative.
-    return jnp.where(is_one, row, row[0]), jnp.where(is_one, column, column[0]), is_one
+class _Crossings(NamedTuple):
+    """Of `count` crossings the first k, of which `there` are some; `missing`: a value without a steady motion."""
+
+    values: Float[Array, " k"]
+    frequency: Float[Array, " k"]
+    direction: Int[Array, " k"]
+    column: Int[Array, " k"]
+    there: Any
+    count: Any
+    is_missing: Any
+    missing: Any
+    clear: Any
+
+
+class _Brackets(NamedTuple):
+    """Between `lower` and `upper` (k,) an eigenvalue passes the imaginary axis: the one that is next to `near`."""
+
+    lower: Float[Array, " k"]
+    upper: Float[Array, " k"]
+    near: Complex[Array, " k"]
+    rises: Any
+    count: Any
+    is_missing: Any
+    missing: Any
+
+    def with_more(self, lower, upper, near, rises, is_one) -> _Brackets:
+        """Those of `near` (n,) that are one are added as far as there is room; all are counted."""
+        at = jnp.where(is_one, self.count + jnp.cumsum(is_one) - 1, len(self.lower))
+        old = (self.lower, self.upper, self.near, self.rises)
+        rows = [x.at[at].set(y, mode="drop") for x, y in zip(old, (lower, upper, near, rises), strict=True)]
+        lower, upper, near, rises = rows
+        return self._replace(lower=lower, upper=upper, near=near, rises=rises, count=self.count + jnp.sum(is_one))
 
 
 @compiled
-def _refine(system, found: Eigenvalues, motion, states, rows, columns):
-    eps = float(jnp.finfo(found.values.dtype).eps)
-    fixed = jax.lax.stop_gradient(found)
+def _crossings(system, values, motion, states, groups, most: int):
+    fixed = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, (system, values))
+    kept: list[tuple[str, ...]] = []
 
-    def selected(p, args):
-        system, near, vector = args
-        A, _ = matrix(system, p, motion, states)
-        decomposed = eig(A)
-        x = jax.lax.stop_gradient(decomposed)
-        far = jnp.abs(x.values - near) / (1.0 + jnp.abs(near)) + 1.0 - jnp.abs(vector.conj() @ x.vectors)
-        return decomposed.values[jnp.argmin(far)]
+    def at(p):
+        A, names = matrix(fixed[0], p, motion, states)
+        kept.append(names)
+        return jax.lax.stop_gradient(A)
 
-    def one(place):
-        row, column = place
-        lower, upper = fixed.values[row], fixed.values[row + 1]
-        beside = 1e-3 * (upper - lower)  # a zero at one of them has the sign of its rounding
-        a, b = fixed.eigenvalues[row, column], fixed.eigenvalues[row + 1, column]
-        s = a.real / (a.real - b.real)
-        near = jax.lax.complex(jnp.zeros_like(s), a.imag + s * (b.imag - a.imag))
-        nearest = jnp.where(s < 0.5, row, row + 1)
-        args = (system, near, fixed.vectors[nearest, :, column])
-        root = optx.root_find(
-            lambda p, args: selected(p, args).real,
-            optx.Bisection(rtol=eps, atol=eps, flip="detect"),
-            lower + s * (upper - lower),
-            args,
-            options={"lower": lower - beside, "upper": upper + beside},
-            max_steps=64,
-            throw=False,
-        )
-        return root.value, jnp.abs(selected(root.value, args).imag)
+    p = fixed[1]
+    A = jax.vmap(at)(p)
+    spectra = eig(A)
+    brackets = _bracketed(at, p, A, spectra.values, most)
+    is_one = jnp.arange(most) < brackets.count
+    # Empty places repeat the first, so that nothing there can spoil a derivative.
+    brackets = jax.tree.map(lambda x: jnp.where(is_one, x, x[0]) if x.ndim else x, brackets)
+    roots = _bisected(at, brackets)
+    roots, frequency, there_too, place = jax.lax.map(
+        lambda root: _differentiable(system, motion, states, *root), (roots, brackets.near)
+    )
+    rows = jnp.concatenate([p, jax.lax.stop_gradient(roots)])
+    order = jnp.argsort(rows)
+    all_of = jax.tree.map(lambda x, y: jnp.concatenate([x, y])[order], spectra, jax.lax.stop_gradient(there_too))
+    columns, clear = followed(rows[order], all_of, kept[0], groups)
+    columns = columns[jnp.argsort(order)][len(p) :]
+    column = jnp.argmax(columns == place[:, None].astype(columns.dtype), axis=1)
+    # What is zero at the first or the last value has not passed it.
+    ends, step = p[jnp.array([0, -1])], jnp.abs(p[jnp.array([1, -2])] - p[jnp.array([0, -1])])
+    inside = jnp.all(jnp.abs(rows[len(p) :, None] - ends[None, :]) > 1e-9 * step[None, :], axis=1)
+    there = is_one & inside
+    direction = jnp.where(brackets.rises, 1, -1)
+    counted = brackets.count, brackets.is_missing, brackets.missing
+    return _Crossings(roots, frequency, direction, column, there, *counted, clear), kept[0]
 
-    if rows.shape[0] == 0:
-        return jnp.zeros(0, found.values.dtype), jnp.zeros(0, found.values.dtype)
-    return jax.lax.map(one, (rows, columns))
+
+def _bracketed(at, p, A, x, most: int) -> _Brackets:
+    """Where eigenvalues of A = at(p) pass the imaginary axis between the values p (m,), where A is (m, n, n) and has
+    the eigenvalues x (m, n)."""
+    depth = _HALVINGS + 2
+    gone = ~jnp.all(jnp.isfinite(A), axis=(1, 2))
+    nothing = jnp.zeros(most, p.dtype)
+    brackets = _Brackets(
+        nothing,
+        nothing,
+        nothing.astype(x.dtype),
+        jnp.zeros(most, bool),
+        jnp.zeros((), int),
+        jnp.any(gone),
+        p[jnp.argmax(gone)],
+    )
+
+    def within(brackets, step):
+        """The halves of a step that are still to be looked at lie on a stack."""
+        stack = jax.tree.map(lambda x: jnp.zeros((depth, *x.shape), x.dtype).at[0].set(x), step)
+
+        def look(carry):
+            brackets, stack, height, trial = carry
+            lower, upper = jax.tree.map(lambda x: x[height - 1], stack)
+            p = 0.5 * (lower[0] + upper[0])
+            A = at(p)
+            found = eig(A)
+            middle = p, A, found.values
+            exists = jnp.all(jnp.isfinite(lower[1] + A + upper[1]))
+            clear, *passing = _passing(found, lower, middle, upper)
+            last = (jnp.abs(upper[0] - lower[0]) <= 0.5**_HALVINGS * jnp.abs(step[1][0] - step[0][0])) | (
+                trial >= _TRIALS
+            )
+            near, rises, is_one = (
+                jnp.where(clear, x, y) for x, y in zip(passing, _changes(lower[2], upper[2]), strict=True)
+            )
+            brackets = brackets.with_more(lower[0], upper[0], near, rises, is_one & (clear | last) & exists)
+            missing = jnp.where(brackets.is_missing | exists, brackets.missing, p)
+            brackets = brackets._replace(is_missing=brackets.is_missing | ~exists, missing=missing)
+            for i, half in enumerate(((middle, upper), (lower, middle))):
+                stack = jax.tree.map(lambda x, y, i=i: x.at[height - 1 + i].set(y), stack, half)
+            return brackets, stack, jnp.where(clear | last | ~exists, height - 1, height + 1), trial + 1
+
+        carry = (brackets, stack, jnp.ones((), int), jnp.zeros((), int))
+        return jax.lax.while_loop(lambda carry: carry[2] > 0, look, carry)[0], None
+
+    ends = p, A, x
+    return jax.lax.scan(within, brackets, (jax.tree.map(lambda x: x[:-1], ends), jax.tree.map(lambda x: x[1:], ends)))[
+        0
+    ]
+
+
+def _passing(found: Eig, lower, middle, upper):
+    """Whether it is clear what passes the imaginary axis about A; and the eigenvalues (n,), which of them pass it
+    towards the right, and which pass it at all (of a conjugate pair the upper one)."""
+    (_, A_lower, before), (_, A, x), (_, A_upper, after) = lower, middle, upper
+    s = jnp.abs(jnp.sum(found.left.conj() * found.vectors, axis=0))
+    # Both vectors of one length: discs then do not depend on how LAPACK scales them.
+    by = (1 / jnp.sqrt(s)).astype(x.dtype)
+    Y, X = found.left.conj().T * by[:, None], found.vectors * by[None, :]
+    changes = (A_lower - A, A_upper - A, A_lower - 2 * A + A_upper)  # the last where A is not linear in p
+    M = jnp.max(jnp.stack([jnp.abs(Y @ dA.astype(X.dtype) @ X) for dA in changes]), axis=0)
+    radius = jnp.sum(M, axis=1)
+    before, after = (y[jnp.argmin(jnp.abs(x[:, None] - y[None, :]), axis=1)] for y in (before, after))
+    real = jnp.stack([before.real, x.real, after.real])
+    rounding = jnp.clip(10 * jnp.finfo(A.dtype).eps / s, _NEUTRAL, _MOST_NEUTRAL) * jnp.max(jnp.abs(x))
+    neutral = jnp.all(jnp.abs(real) <= rounding[None, :], axis=0)
+    radius = jnp.where(neutral, 0.0, radius)
+    within_reach = ~(jnp.abs(x.real) > radius) & ~neutral
+    apart = jnp.abs(x[:, None] - x[None, :]) > radius[:, None] + radius[None, :]
+    alone = jnp.all(apart | jnp.eye(len(x), dtype=bool), axis=1)
+    bend, rise = jnp.abs(real[0] - 2 * real[1] + real[2]), jnp.abs(real[2] - real[0])
+    negative = real < 0
+    never = jnp.all(negative == negative[:1], axis=0) & (jnp.min(jnp.abs(real), axis=0) > 2 * bend)
+    once = 4 * bend <= rise
+    clear = jnp.all(~within_reach | (alone & (never | once)))
+    rises = negative[0] & ~negative[2]
+    return clear, x, rises, within_reach & (negative[0] != negative[2]) & (x.imag >= 0)
+
+
+def _changes(before, after):
+    """The same where it is not clear: by the order of the real parts, which change continuously."""
+    before, after = (x[jnp.lexsort((-x.imag, -x.real))] for x in (before, after))
+    rounding = 1e3 * jnp.finfo(before.dtype).eps * jnp.max(jnp.abs(before))
+    rises = before.real < after.real
+    changed = (before.real * after.real < 0) & (jnp.abs(after.real - before.real) > rounding)
+    return (before + after) / 2, rises, changed & ((before.imag >= 0) | (after.imag >= 0))
+
+
+def _bisected(at, brackets: _Brackets):
+    """The critical values (k,), to rounding."""
+
+    def half(ends, _):
+        lower, upper = ends
+        middle = 0.5 * (lower + upper)
+        x = jax.lax.map(lambda row: _next_to(eig(at(row[0])), row[1])[0], (middle, brackets.near))
+        is_below = (x.real < 0) == brackets.rises
+        return (jnp.where(is_below, middle, lower), jnp.where(is_below, upper, middle)), None
+
+    bits = -int(np.log2(jnp.finfo(brackets.lower.dtype).eps))
+    lower, upper = jax.lax.scan(half, (brackets.lower, brackets.upper), length=bits)[0]
+    return 0.5 * (lower + upper)
+
+
+def _next_to(found: Eig, near):
+    place = jnp.argmin(jnp.abs(jax.lax.stop_gradient(found.values) - near))
+    return found.values[place], place
+
+
+def _differentiable(system, motion, states, root, near):
+    """A critical value with its derivatives, its frequency, the eigenvalues there and the place of the critical one."""
+
+    def spectrum(p):
+        found = eig(matrix(system, p, motion, states)[0])
+        return *_next_to(found, near), found
+
+    root = jax.lax.custom_root(
+        lambda p: spectrum(p)[0].real, root, lambda _, root: root, lambda f, y: y / f(jnp.ones_like(y))
+    )
+    x, place, found = spectrum(root)
+    return root, jnp.abs(x.imag), found, place

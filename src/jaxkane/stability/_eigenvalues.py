@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -21,8 +22,10 @@ from ..catalog import WhippleBicycle
 from ._bicycle import LATERAL, straight_ahead
 from ._eig import MOST_CONDITION, Eig, eig
 from ._linearize import linearize
-from ._modes import OTHER, Groups, mode_names, named_order, participation
+from ._modes import OTHER, Groups, mode_names, named_order, pairs, participation
 from ._steady import SteadyMotion
+
+_MARGIN = 1.5  # by how much more the modes would have to change if two of them changed places
 
 MotionAt = Callable[[Any, Any], Any] | State | SteadyMotion | None
 
@@ -94,7 +97,8 @@ def eigenvalues(
         its parts.
     - `modes`: names of the modes, one for each column. By default those of a bicycle that rides straight: weave,
         capsize, castering, wobble, and those of its parts and tyres, recognized by how much their states take part;
-        "mode 5" where less than half of a mode is theirs. All others are numbered.
+        "mode 5", with a warning, where that is not clear: less than half of a mode is theirs, a conjugate pair would
+        have two names, or two modes may have changed places within a step. All others are numbered.
 
     **Returns:** `Eigenvalues`, differentiable in the system's parameters. A mode is followed by its eigenvalue, that
     is extrapolated, and its eigenvector: the assignment with the least sum of both changes. Under a trace, where names
@@ -107,23 +111,33 @@ def eigenvalues(
     found, kept, clear = _along(system, values, at, states, groups)
     if motion is None and is_concrete(found.values) and not np.isfinite(np.asarray(found.values)).any():
         matrix(system, values[0], at, states)  # which says why
-    modes = None if modes is None else as_names(modes)
-    if modes is None:
-        modes, found = _named(found, kept, groups, clear, (system, values))
-    if len(modes) != len(kept):
-        raise ValueError(f"eigenvalues: {len(kept)} modes, but {len(modes)} names: {', '.join(modes)}.")
-    return Eigenvalues(values, found.values, found.vectors, found.condition, modes, kept)
+    names, lost = names_of_modes(kept, groups, clear, modes)
+    roots = found.values if is_concrete(lost) else nan_where(lost, found.values.T, (system, values)).T
+    return Eigenvalues(values, roots, found.vectors, found.condition, names, kept)
 
 
-def _named(found: Eig, states: tuple[str, ...], groups: Groups | None, clear: Any, origin: Any):
-    """Names of the modes, and the eigenvalues: NaN under a trace where a name is not clear."""
-    names = None if groups is None else mode_names(states, groups)
-    if names is None:
-        return tuple(OTHER.format(i + 1) for i in range(len(states))), found
-    if is_concrete(clear):
-        return tuple(k if c else OTHER.format(i + 1) for i, (k, c) in enumerate(zip(names, clear, strict=True))), found
-    roots = [nan_where(~clear[i], found.values[:, i], origin) for i in range(len(names))]
-    return names, found._replace(values=jnp.stack(roots, axis=1))
+def names_of_modes(
+    states: tuple[str, ...], groups: Groups | None, clear: Any, modes: Sequence[str] | None
+) -> tuple[tuple[str, ...], Any]:
+    """Names of the columns, and those of them (n,) that must be NaN: under a trace, where its name is not clear."""
+    names = as_names(modes) if modes is not None else None if groups is None else mode_names(states, groups)
+    others = [OTHER.format(i + 1) for i in range(len(states))]
+    if names is not None and len(names) != len(states):
+        raise ValueError(f"eigenvalues: {len(states)} modes, but {len(names)} names: {', '.join(names)}.")
+    if modes is not None or names is None:
+        return names or tuple(others), np.zeros(len(states), bool)
+    if not is_concrete(clear):
+        return names, ~clear
+    doubtful = dict.fromkeys(name for name, c in zip(names, clear, strict=True) if not c)
+    if doubtful:
+        warnings.warn(
+            f"which modes are {', '.join(doubtful)} is not clear: numbered instead. Values that lie closer, "
+            "or over a wider range, may tell; or give `modes`, names of your own.",
+            UserWarning,
+            stacklevel=3,
+        )
+    named = (k if c else other for k, c, other in zip(names, clear, others, strict=True))
+    return tuple(named), np.zeros(len(states), bool)
 
 
 def family_of(system: System, values: Any, motion: MotionAt, states: Sequence[str] | None):
@@ -184,12 +198,7 @@ def _along(system, values, motion, states, groups):
         return A
 
     found = eig(jax.vmap(one)(values))
-    order, clear = jax.pure_callback(
-        lambda x, Y, X: _tracked(x, Y, X, names[0], groups),
-        (jax.ShapeDtypeStruct(found.values.shape, jnp.int32), jax.ShapeDtypeStruct(found.values.shape[-1:], jnp.bool_)),
-        *jax.lax.stop_gradient((found.values, found.left, found.vectors)),
-        vmap_method="sequential",
-    )
+    order, clear = followed(values, found, names[0], groups)
     rows = jnp.arange(len(values))[:, None]
     picked = Eig(
         found.values[rows, order],
@@ -200,39 +209,72 @@ def _along(system, values, motion, states, groups):
     return picked, names[0], clear
 
 
-def _tracked(values: Any, left: Any, right: Any, states: tuple[str, ...], groups: Groups | None):
+def followed(values: Any, found: Eig, states: tuple[str, ...], groups: Groups | None):
+    """Columns (m, n) that follow each mode along `values` (m,), and whether (n,) the names that they have are clear."""
+    shapes = (found.values.shape, jnp.int32), (found.values.shape[-1:], jnp.bool_)
+    return jax.pure_callback(
+        lambda *numbers: _tracked(numbers, states, groups),
+        tuple(jax.ShapeDtypeStruct(*shape) for shape in shapes),
+        *jax.lax.stop_gradient((values, found.values, found.left, found.vectors)),
+        vmap_method="sequential",
+    )
+
+
+def _tracked(numbers: Any, states: tuple[str, ...], groups: Groups | None):
     """Columns (m, n) that follow each mode, those with names in their order, and whether (n,) these are clear."""
-    values, left, right = map(np.asarray, (values, left, right))
-    order = track(values, right)
+    at, values, left, right = map(np.asarray, numbers)
+    order, confused = track(at, values, right)
     clear = np.ones(order.shape[1], bool)
     rows = np.isfinite(values).all(axis=1)
     if groups is not None and rows.any() and mode_names(states, groups) is not None:
         followed = np.take_along_axis(values, order, axis=1)[rows]
         shares = np.take_along_axis(participation(left, right), order[:, None, :], axis=2)[rows]
-        columns, clear = named_order(followed, shares, states, groups)
+        columns, clear = named_order(followed, shares, confused, states, groups)
         order = order[:, columns]
     return order.astype(np.int32), clear
 
 
-def track(values: Any, vectors: Any) -> np.ndarray:
-    """The order (m, n) in which each row's eigenvalues (m, n) and vectors (m, n, n) continue those of the row above."""
-    values, vectors = np.asarray(values), np.asarray(vectors)
+def track(at: Any, values: Any, vectors: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The order (m, n) in which each row's eigenvalues (m, n) and vectors (m, n, n) continue those of the row above, at
+    `at` (m,); and whether (n, n) the i-th and the j-th column could as well have changed places somewhere."""
+    at, values, vectors = map(np.asarray, (at, values, vectors))
     m, n = values.shape
     order = np.tile(np.arange(n), (m, 1))
     if m:
         order[0] = np.lexsort((-values[0].imag, -values[0].real))
-    followed: list[int] = []  # rows without NaN so far
+    confused = np.zeros((n, n), bool)
+    known: list[int] = []  # rows without NaN so far
     for k in range(m):
         if not np.all(np.isfinite(values[k])):
             continue
-        if followed:
-            i = followed[-1]
+        if known:
+            i = known[-1]
             last, X = values[i, order[i]], vectors[i][:, order[i]]
-            # One step further along the line through the last two, where that is a small change
-            ahead = last + (last - values[i - 1, order[i - 1]] if len(followed) > 1 and followed[-2] == i - 1 else 0.0)
+            ahead = last
+            if len(known) > 1:  # along the line through the last two, where these are not much closer
+                j = known[-2]
+                far, step = at[k] - at[i], at[i] - at[j]
+                ahead = last + far / step * (last - values[j, order[j]]) if abs(far) <= 4 * abs(step) > 0 else last
             size = 1e-12 + np.abs(values[k]).max()
             near = np.abs(values[k][None, :] - ahead[:, None]) / size
             alike = np.abs(X.conj().T @ vectors[k])
-            order[k] = linear_sum_assignment(near + 0.1 * (1.0 - alike))[1]
-        followed.append(k)
+            change = near + 0.1 * (1.0 - alike)
+            columns = linear_sum_assignment(change)[1]
+            change = change[:, columns]
+            kept = np.diag(change)
+            confused |= change + change.T < _MARGIN * (kept[:, None] + kept)
+            order[k] = _pairs_in_order(last, values[k], columns)
+        known.append(k)
+    return order, confused
+
+
+def _pairs_in_order(last: Any, values: Any, order: Any) -> np.ndarray:
+    """The same, where a pair becomes real, or real ones a pair: its upper one and the larger one are of one column."""
+    either = pairs(last) | pairs(values[order])
+    for i, j in zip(*np.nonzero(either), strict=True):
+        new = values[order[[i, j]]]
+        alike = [pairs(both).any() or not both.imag.any() for both in (last[[i, j]], new)]
+        above = [(x[0].imag, x[0].real) >= (x[1].imag, x[1].real) for x in (last[[i, j]], new)]
+        if all(alike) and above[0] != above[1]:
+            order[[i, j]] = order[[j, i]]
     return order

@@ -36,14 +36,21 @@ def participation(left: Any, right: Any) -> np.ndarray:
     return each / np.maximum(each.sum(axis=-2, keepdims=True), 1e-300)
 
 
+def pairs(values: Any) -> np.ndarray:
+    """Whether (..., n, n) the i-th and the j-th of eigenvalues (..., n) are a conjugate pair, its upper one first."""
+    return (values.imag[..., :, None] > 0) & (values[..., :, None] == values[..., None, :].conj())
+
+
 def named_order(
-    values: np.ndarray, shares: np.ndarray, states: Sequence[str], groups: Groups
+    values: np.ndarray, shares: np.ndarray, confused: np.ndarray, states: Sequence[str], groups: Groups
 ) -> tuple[np.ndarray, np.ndarray]:
     """Columns (n,) of tracked eigenvalues (m, n) in the order of `mode_names`, and whether (n,) each name is clear.
 
-    `shares` (m, states, modes): participations. Modes are dealt out to groups where they belong to them most clearly:
-    at the value at which the smallest share of a group in a mode of its own is largest. Two groups that vibrate with
-    the steer, "wobble" and "front end", are distinguished by their frequencies: the slower one is the wobble.
+    `shares` (m, states, modes): participations; `confused` (n, n): columns that may have changed places. Modes are
+    dealt out to groups where they belong to them most clearly: at the value at which the smallest share of a group in a
+    mode of its own is largest. Two groups that vibrate with the steer, "wobble" and "front end", are distinguished by
+    their frequencies: the slower one is the wobble. A name is clear where at least half of each of its modes belongs
+    to it, no pair has two names, and no mode of another name may have changed places with one of its own.
     """
     members = [[states.index(k) for k in group] for group in (LATERAL, *groups.values())]
     owner = np.repeat(np.arange(len(members)), [len(group) for group in members])  # of each slot
@@ -54,7 +61,14 @@ def named_order(
     order, sure = dealt[best], own_share[best] >= _CLEAR
     own = order[: len(LATERAL)]
     order[: len(LATERAL)] = own[mode_order(values[:, own])]
-    return _slower_first(order, values[best], groups), sure
+    order = _slower_first(order, values[best], groups)
+    names = np.array(mode_names(states, groups))
+    others = names[:, None] != names
+    torn = pairs(values[:, order]) & others
+    if torn[best].any():
+        return order, np.zeros(len(order), bool)
+    doubtful = ~sure | np.any((confused[np.ix_(order, order)] | torn.any(axis=0) | torn.any(axis=0).T) & others, axis=1)
+    return order, ~np.isin(names, names[doubtful])
 
 
 def _slower_first(order: np.ndarray, values: np.ndarray, groups: Groups) -> np.ndarray:
