@@ -642,6 +642,20 @@ def test_what_is_gone_is_not_kept():
     assert not any(ref() for ref in gone)
 
 
+def test_systems_and_their_arrays_are_not_kept():
+    """A program takes the numbers of a system; it keeps neither them nor the system."""
+    system = Bead(jnp.array(3.0))
+    gone = [weakref.ref(system), weakref.ref(system.mass)]
+    jk.kinetic_energy(system, 0.0, [0.5], [0.3])
+    jk.equations_of_motion(system, 0.0, [0.5], [0.3], {"lag": 0.2})
+    jk.positions(system, 0.0, [0.5], [0.3])
+    jk.export.numpy(system)
+    jk.symbolic.equations(system)
+    del system
+    gc.collect()
+    assert [ref() for ref in gone] == [None, None]
+
+
 def test_threads_agree():
     found, n = [], 8
 

@@ -143,6 +143,11 @@ def test_after_an_interruption_the_rest_is_called_so_and_not_kept(rides, tmp_pat
         ({"table": jk.sweep.grid(theta1=np.linspace(0.1, 3.0, 50), mass=np.linspace(1.0, 2.1, 12))}, r"table mass \("),
         ({"chunk": 64}, r"layout chunk \(32 there, 64 here\)"),
         ({"system": DoublePendulum(1.0, 1.0, gravity=1.62)}, r"parameter gravity \(9.81 there, 1.62 here\)"),
+        (
+            {"system": type("Other", (DoublePendulum,), {})(1.0, 1.0)},
+            r"system class \(DoublePendulum there, Other here\)",
+        ),
+        ({"state": jk.State(np.full(2, 0.1), np.zeros(2))}, r"state q \("),
         ({"ts": TS * 2}, r"times \("),
         ({"inputs": {"elbow_torque": 0.1}}, r"input elbow_torque \(nothing there, 0.1 here\)"),
         ({"inputs": lambda t, state: {"elbow_torque": 0.1}}, r"input \(nothing there, <lambda> "),
