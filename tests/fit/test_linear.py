@@ -321,6 +321,20 @@ def test_a_wider_prior_pays_for_itself(evidence):
     assert none.sample(3)["gain"].shape == (3,)
 
 
+def test_what_has_no_influence_takes_no_error_from_the_others():
+    """Without a push its gain is free: infinite errors of both kinds, and those of the drift as without it."""
+    trials = [Trial(t, x.measured, {"push": 0.0 * t}, sigma=SIGMA[0]) for x in trials_of(recorded(5, wander=0.2))]
+    both, alone = (
+        minimize(Problem.of(Track(), trials, free, **OPTIONS), LeastSquares(rtol=1e-14))
+        for free in (("gain", "drift"), ("drift",))
+    )
+    assert both.robust
+    for errors, others in ((both.standard_errors, alone.standard_errors), (both.errors, alone.errors)):
+        assert errors["gain"] == np.inf
+        assert errors["drift"] == pytest.approx(others["drift"], rel=1e-2)
+    assert both.intervals()["gain"] == (-np.inf, np.inf)
+
+
 def test_the_verdict_does_not_know_units():
     # A push in mN with a gain in 1/g is the same experiment: so is what the data tell.
     def told(unit, noise):
