@@ -132,7 +132,8 @@ def is_clustered(rows: Rows, parameters: int, correlation: float) -> bool:
 
 def beside_zero(step: np.ndarray, covariance: np.ndarray, trials: int) -> float:
     """The probability that numbers (q,) which are zero are found as far from it, with a covariance from so many trials
-    (Wald's test; Hotelling 1931; of one number, Student's t)."""
+    (Wald's test; Hotelling 1931; of one number, Student's t). Of several numbers it is too small, by up to two, where
+    few trials tell most."""
     q = len(step)
     size = np.sqrt(np.diagonal(covariance))
     squared = float((step / size) @ np.linalg.pinv(covariance / np.outer(size, size), rcond=1e-12) @ (step / size))
