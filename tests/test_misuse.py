@@ -1,6 +1,7 @@
 """What is easily done wrong, and used to be computed in silence or refused in words of Python and JAX."""
 
 import functools
+import inspect
 import pickle
 
 import jax
@@ -289,3 +290,85 @@ def test_elements_that_cannot_be(element, error, match):
     N, O = jk.inertial()
     with pytest.raises(error, match=match):
         element(N.rotate(3, 0.1, 0.2), O)
+
+
+NO_NUMBERS = {
+    "text": "a",
+    "None": None,
+    "complex": 1j,
+    "bool": True,
+    "texts": ["a", "b"],
+    "Nones": [None, 0.0],
+    "bools": [True, False],
+    "complexes": [1j, 0.0],
+    "uneven": [[1.0], [1.0, 2.0]],
+    "object": object(),
+    "three numbers": [0.0, 0.1, 0.2],
+}
+AT = {"t": 0.0, "q": [0.3], "u": [0.5], "inputs": {"torque": 1.0}}
+OF_A_STATE = [
+    name
+    for name, f in vars(jk).items()
+    if inspect.isfunction(f) and {"system", "t", "q"} <= {*inspect.signature(f).parameters}
+]
+
+
+@pytest.mark.parametrize("wrong", NO_NUMBERS)
+@pytest.mark.parametrize("name", OF_A_STATE)
+def test_what_is_no_number_is_refused_by_name(name, wrong):
+    """By every public function of a state, in one line."""
+    f, value = getattr(jk, name), NO_NUMBERS[wrong]
+    system = Welded() if name == "best_dependent_speeds" else Pendulum()
+    known = {"q": [0.3, 0.0]} if name == "best_dependent_speeds" else {}
+    arguments = {key: x for key, x in (AT | known).items() if key in inspect.signature(f).parameters}
+    wrongs = {key: value for key in arguments} | {"inputs": {"torque": value}}
+    for key in arguments:
+        if (name, key, wrong) == ("assemble", "u", "None"):
+            continue  # at rest
+        label = {"t": "`t`", "inputs": "'torque'"}.get(key, f": {key} must")
+        with pytest.raises((TypeError, ValueError), match=label) as caught:
+            f(system, **arguments | {key: wrongs[key]})
+        assert "\n" not in str(caught.value)
+
+
+class Welded(Pendulum):
+    """With a speed that depends on the other, for what asks for such."""
+
+    coordinates, speeds, dependent_speeds = ("angle", "twice"), ("rate",), ("double",)
+
+    def motion(self, t, q, u):
+        motion = Pendulum.motion(self, t, q, u)
+        return jk.Motion(motion.bodies, [u["double"] - 2.0 * u["rate"]], frames=motion.frames)
+
+
+@pytest.mark.parametrize("wrong", NO_NUMBERS)
+def test_what_is_no_number_is_refused_in_a_simulation(wrong):
+    value, start = NO_NUMBERS[wrong], jk.State([0.3], [0.5])
+    simulate = functools.partial(jk.simulate, Pendulum())
+    cases = [
+        ("'torque'", lambda: simulate(start, TS, {"torque": lambda t, state: value})),
+        ("'torque'", lambda: simulate(start, TS, lambda t, state: {"torque": value})),
+        ("function of the inputs", lambda: simulate(start, TS, lambda t, state: value)),
+        ("`stabilize`", lambda: simulate(start, TS, stabilize=value)),
+        ("state", lambda: simulate(value, TS)),
+        (r"state\.q", lambda: simulate(jk.State({"angle": value}, [0.5]), TS)),
+        ("instance of a System", lambda: jk.simulate(value, start, TS)),
+        ("instance of a System", lambda: jk.accelerations(value, 0.0, [0.3], [0.5])),
+        ("instance of a System", lambda: jk.assemble(value, [0.3])),
+    ]
+    if wrong != "three numbers":
+        cases += [
+            ("`ts`", lambda: simulate(start, value)),
+            ("'torque'", lambda: simulate(start, TS, {"torque": value})),
+            ("values", lambda: jk.Samples([0.0, 1.0], value)),
+            ("ts", lambda: jk.Samples(value, [0.0, 1.0])),
+        ]
+    if value is not None:
+        cases += [
+            (f"`{name}`", lambda name=name: simulate(start, TS, **{name: value})) for name in ("rtol", "atol", "step")
+        ]
+        cases += [("`max_steps`", lambda: simulate(start, TS, max_steps=value))]
+    for label, call in cases:
+        with pytest.raises((TypeError, ValueError), match=label) as caught:
+            call()
+        assert "\n" not in str(caught.value).split("\n-----")[0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
@@ -124,7 +125,7 @@ class System(eqx.Module, metaclass=Kind):
         `now` is a `Now`: inputs and states by name, and accelerations, for the filter of an accelerometer. Of a class
         without states there are none: `super().state_rates(...)` gives an empty dict.
         """
-        if type(self).state_rates is not System.state_rates or not self.states:
+        if inspect.unwrap(type(self).state_rates) is not System.state_rates or not self.states:
             return {}
         raise NotImplementedError(
             f"{type(self).__name__} has states ({', '.join(self.states)}): define state_rates(self, t, q, u, x, "

@@ -17,7 +17,7 @@ from .description_facts import configuration_residual
 from .equations import dependent_speeds
 from .free_coordinates import Plan, plan_of
 from .newton import Found, newton, newton_in_numbers
-from .values import as_array
+from .values import as_array, check_is_system, check_time
 
 
 class NoConfiguration(ValueError):
@@ -54,8 +54,9 @@ def assemble(
     **Raises:** `ValueError` where no such configuration is found, or given dependent speeds contradict the residuals.
     Under a trace the coordinates, and all their derivatives, become NaN instead.
     """
+    check_is_system(system)
     name = type(system).__name__
-    _check_time(name, t)
+    check_time(name, t)
     plan = plan_of(system, q, free)
     q0 = as_array(plan.guess | dict(q) if isinstance(q, Mapping) else q, system.coordinates, f"{name}: q")
     given: dict[str, Any] = {}
@@ -78,14 +79,6 @@ def assemble(
             u_dep = dict(zip(system.dependent_speeds, dependent_speeds(system, t, q0, u0), strict=True))
             _check_dependent_speeds(name, given, u_dep)
     return State(q0, u0, x0)
-
-
-def _check_time(name: str, t: Any) -> None:
-    is_number = not isinstance(t, (str, bytes, type(None))) and np.shape(t) == ()
-    if not is_number or (not isinstance(t, jax.Array) and np.asarray(t).dtype.kind not in "iuf"):
-        raise TypeError(f"{name}: the time `t` is one number [s], got {t!r}.")
-    if is_concrete(t) and not np.isfinite(np.asarray(t)):
-        raise ValueError(f"{name}: the time t = {t} is not finite.")
 
 
 def _solve_configuration(system: System, q0, t, plan: Plan):

@@ -20,7 +20,7 @@ from .._scalars.linear import as_vector, solve, stack
 from .._scalars.types import Component
 from .description_facts import configuration_residual
 from .kane import Instant
-from .values import as_array, refuse_incomplete
+from .values import as_array, check_is_system, check_time, refuse_incomplete
 
 
 def correction(system: System, t: Component, q: Array) -> Float[Array, " n_q"]:
@@ -110,11 +110,13 @@ def best_dependent_speeds(system: System, t: Component, q: Any) -> DependentSpee
 
     **Raises:** `ValueError` for a system without dependent speeds.
     """
+    check_is_system(system)
     name = type(system).__name__
     if not system.dependent_speeds:
         raise ValueError(f"{name} has no dependent speeds.")
     refuse_incomplete(system, q, {})
     q = as_array(q, system.coordinates, f"{name}: q")
+    check_time(name, t)
     C, c0 = (np.asarray(x, dtype=float) for x in constraint_rows(system, jnp.asarray(t, q.dtype), q))
     return dependent_speeds_from(C, c0, (*system.speeds, *system.dependent_speeds), system.dependent_speeds, name)
 

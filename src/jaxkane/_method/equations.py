@@ -23,21 +23,20 @@ from .derivatives import jvp
 from .diagnose import diagnosis
 from .kane import Instant
 from .rates import motion_rates, rates_and_equations
-from .values import as_array, as_row, checked_values, refuse_incomplete
+from .values import as_array, as_row, check_is_system, check_time, checked_values, refuse_incomplete
 
 InputValues = Mapping[str, Component] | None
 
 
 def _arrays(system: System, t: Component, q: Any, u: Any, inputs: InputValues = None):
     """The arguments of a public function as arrays of one type, checked."""
-    if not isinstance(system, System):
-        hint = f" Make one: {system.__name__}(...)." if isinstance(system, type) else ""
-        raise TypeError(f"The first argument is an instance of a System, got {system!r}.{hint}")
+    check_is_system(system)
     name = type(system).__name__
     refuse_incomplete(system, q, u)
     left_out = [c for c in system.coordinates if c not in q] if isinstance(q, Mapping) else []
     q = as_array(q, system.coordinates, f"{name}: q")
     u = as_array(u, system.speeds, f"{name}: u")
+    check_time(name, t)
     t = jnp.asarray(t, dtype=q.dtype)
     checked_values(system, inputs)
     if left_out:

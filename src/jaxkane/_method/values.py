@@ -38,7 +38,7 @@ def as_row(values: Any, names: Sequence[str], label: str) -> Row:
 def as_array(values: Any, names: Sequence[str], label: str) -> Array:
     """Numbers, in their order or by name, as a float array of shape (len(names),). Those not named are zero."""
     array = by_names(values, names, label) if isinstance(values, Mapping) else _numbers(values, names, label)
-    if jnp.issubdtype(array.dtype, jnp.complexfloating):
+    if not _is_real(array):
         raise TypeError(f"{label} must be {len(names)} real numbers ({', '.join(names)}), got {values!r}.")
     if not jnp.issubdtype(array.dtype, jnp.inexact):
         array = array.astype(float)
@@ -46,6 +46,41 @@ def as_array(values: Any, names: Sequence[str], label: str) -> Array:
         hint = " For a batch use jax.vmap." if array.ndim > 1 else ""
         raise ValueError(f"{label} must have the shape ({len(names)},): {', '.join(names)}. Got {array.shape}.{hint}")
     return array
+
+
+def _is_real(array: Any) -> bool:
+    return jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
+
+
+def is_one_number(value: Any) -> bool:
+    """Whether this is one real number, known or traced."""
+    return is_numeric(value) and not isinstance(value, (list, tuple)) and np.shape(value) == ()
+
+
+def is_numeric(value: Any) -> bool:
+    """Whether this is a real number, or an array or a sequence of such, which may be traced."""
+    leaves = jax.tree.leaves(value, is_leaf=lambda x: x is None)
+    if not any(isinstance(x, Tracer) for x in leaves):
+        leaves = [value]
+    try:
+        return all(_is_real(x if isinstance(x, jax.Array) else np.asarray(x)) for x in leaves)
+    except ValueError:  # a nested sequence of uneven lengths
+        return False
+
+
+def check_is_system(system: Any) -> None:
+    """**Raises:** `TypeError` for what is no instance of a system."""
+    if not isinstance(system, System):
+        hint = f" Make one: {system.__name__}(...)." if isinstance(system, type) else ""
+        raise TypeError(f"The first argument is an instance of a System, got {system!r}.{hint}")
+
+
+def check_time(name: str, t: Any) -> None:
+    """Refuse what is no time; `name` is that of the system."""
+    if not is_one_number(t):
+        raise TypeError(f"{name}: the time `t` is one number [s], got {t!r}.")
+    if not isinstance(t, Tracer) and not np.isfinite(np.asarray(t)):
+        raise ValueError(f"{name}: the time t = {t} is not finite.")
 
 
 def _numbers(values: Any, names: Sequence[str], label: str) -> Array:
@@ -62,6 +97,9 @@ def by_names(values: Mapping[str, Any], names: Sequence[str], label: str) -> Arr
     is_traced = any(isinstance(x, Tracer) for value in values.values() for x in jax.tree.leaves(value))
     xp: Any = jnp if is_traced else np
     dtype = jnp.result_type(float)
+    for name, value in values.items():
+        if not is_numeric(value):
+            raise TypeError(f"{label}: {name!r} must be a real number, or an array of such, got {value!r}.")
     columns = [xp.asarray(values.get(name, 0.0), dtype=dtype) for name in names]
     return jnp.asarray(xp.stack(xp.broadcast_arrays(*columns), axis=-1) if columns else np.zeros(0, dtype), dtype=dtype)
 
@@ -127,6 +165,6 @@ def _checked(system: System, values: Any, names: Sequence[str], what: str) -> di
     values = dict(values or {})
     refuse_unknown(values, names, f"{own} has no {what} named", "it has")
     for name, value in values.items():
-        if isinstance(value, str) or np.shape(value) != ():
+        if not is_one_number(value):
             raise TypeError(f"{own}: the {what} {name!r} must be one number, got {value!r}.")
     return {name: component(values.get(name, 0.0)) for name in names}

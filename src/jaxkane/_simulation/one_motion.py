@@ -7,14 +7,16 @@ from typing import Any
 import numpy as np
 
 from .._description.system import System, names_of
+from .._method.values import check_is_system
 from .trajectory import Trajectory
 
 
 def refuse_other_system(label: str, system: System, trajectory: Trajectory) -> None:
     """Every function of a system and a trajectory asks this first; `label` is the one that was called, for the message.
 
-    **Raises:** `ValueError` where the names differ, by which a motion is read.
+    **Raises:** `ValueError` where the names differ, by which a motion is read; `TypeError` for what is no system.
     """
+    check_is_system(system)
     kinds = ("coordinates", "speeds", "dependent speeds", "states")
     groups = zip(kinds, trajectory.names, names_of(system), strict=True)
     for kind, of_trajectory, own in (*groups, ("inputs", sorted(trajectory.inputs), sorted(system.inputs))):

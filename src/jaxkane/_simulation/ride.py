@@ -298,7 +298,8 @@ def _now(system: System, t: Component, state: State) -> Now:
 def inputs_at(system: System, signals: Any, t: Component, state: State, all_of_them: bool = False):
     """The inputs by name, at one time: all, or those that are given."""
     values = evaluate(signals, t, _now(system, t, state))
-    names = checked_inputs(system, values) if all_of_them else values
+    checked = checked_inputs(system, values)
+    names = checked if all_of_them else values
     return {name: jnp.asarray(values.get(name, 0.0), dtype=state.q.dtype) for name in names}
 
 

@@ -16,7 +16,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 from .._description.system import State, System
-from .._method.values import by_names, refuse_incomplete
+from .._method.values import by_names, check_is_system, refuse_incomplete
 from .signals import real_array, samples_of
 
 SCALARS_UP_TO = 64
@@ -140,7 +140,7 @@ def of_any_accuracy(settings: Settings, dtype: Any) -> Settings:
 
 def _check_number(label: str, value: Any, fits: Callable[[float], bool], what: str) -> None:
     try:
-        number = float(value)
+        number = math.nan if isinstance(value, (bool, np.bool_, str)) else float(value)
     except (TypeError, ValueError):
         number = math.nan
     if not (math.isfinite(number) and fits(number)):
@@ -164,6 +164,7 @@ def checked_times(ts: Any, dtype: Any) -> Array:
 
 def checked_state(system: System, state: Any) -> State:
     """A state of the right shape for a system."""
+    check_is_system(system)
     name = type(system).__name__
     if not isinstance(state, State):
         raise TypeError(

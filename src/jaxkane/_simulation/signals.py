@@ -14,18 +14,19 @@ from jaxtyping import Array, Float
 
 from .._common.lookup import refuse_unknown
 from .._description.prepared import naming_what_has_no_value
+from .._method.values import is_numeric
 from .._scalars.jax_internals import ClosedJaxpr, Jaxpr, Literal, bound
 from .._scalars.types import Component, Inputs
 
 
 def real_array(value: Any, label: str, dtype: Any = None) -> Array:
-    """Real numbers as a float array. **Raises:** `TypeError` for complex numbers, texts and the like; `ValueError` for
-    a masked array, whose gaps would be filled with what stands under the mask."""
+    """Real numbers as a float array. **Raises:** `TypeError` for complex numbers, truth values, texts and the like;
+    `ValueError` for a masked array, whose gaps would be filled with what stands under the mask."""
     if np.ma.is_masked(value):
         raise ValueError(f"{label}: some values are masked. Fill the gaps, or leave that stretch out.")
+    if not is_numeric(value):
+        raise TypeError(f"{label} must be real numbers, got {value!r}.")
     array = value if isinstance(value, jax.Array) else np.asarray(value)
-    if array.dtype.kind not in "iufb" and not jnp.issubdtype(array.dtype, jnp.floating):
-        raise TypeError(f"{label} must be real numbers, got {array.dtype}.")
     floating = jnp.issubdtype(array.dtype, jnp.floating)
     return jnp.asarray(array, dtype=dtype or (None if floating else float))
 
@@ -327,7 +328,7 @@ def signals_are_sound(signals: Any) -> Array:
 def without_nonsense(signals: Any, valid: Array) -> Any:
     """The signals where they are valid, else others of the same shapes that spoil no derivative."""
 
-    times: dict[int, Array] = {}  # signals that share their times go on sharing them: see `sample_times`
+    times: dict[int, Array] = {}  # signals that share their times go on sharing them: see `kinks_of`
 
     def safe(x: Any) -> Any:
         if _is_samples(x):
@@ -350,6 +351,8 @@ def evaluate(signals: Any, t: Component, state: Any) -> dict[str, Component]:
     """The inputs' values at one time."""
     if callable(signals):
         values: Any = _asked(_label_of(None), signals, t, state)
+        if not isinstance(values, Mapping):
+            raise TypeError(f"{_label_of(None)} gives a dict by name, got {values!r}.")
         return dict(values)
     return {name: _asked(_label_of(name), f, t, state) if callable(f) else f for name, f in signals.items()}
 

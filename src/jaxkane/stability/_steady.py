@@ -16,7 +16,7 @@ from .._method.checks import check_system, is_concrete
 from .._method.description_facts import configuration_residual
 from .._method.equations import dependent_speeds
 from .._method.right_hand_side import rates
-from .._method.values import as_array, checked_values
+from .._method.values import as_array, check_time, checked_values
 from .._scalars.nan import nan_where
 from .._scalars.types import Component
 from .._scalars.versions import compiled
@@ -122,6 +122,7 @@ def steady_turn(
             q = q.at[system.coordinates.index(k)].set(jnp.asarray(x, q.dtype))
         elif x is not None and k in system.speeds:
             u = u.at[system.speeds.index(k)].set(jnp.asarray(x, q.dtype))
+    check_time(name, t)
     t = jnp.asarray(t, q.dtype)
     check_system(system, t, q)
     guess = problem.unknowns(q, u, known)

@@ -10,7 +10,7 @@ from ..._description.system import System
 from ..._method.body_parts import Bodies
 from ..._method.checks import check_system
 from ..._method.equations import InputValues
-from ..._method.values import as_array, checked_values, refuse_incomplete
+from ..._method.values import as_array, check_time, checked_values, refuse_incomplete
 from .columns import Names, Regressor, chosen_of, regressor_at, values_by_name
 from .linearity import check_linear
 
@@ -60,6 +60,7 @@ def regressor(
     q = as_array(q, system.coordinates, f"{name}: q")
     u = as_array(u, system.speeds, f"{name}: u")
     u_dot = as_array(u_dot, system.speeds, f"{name}: u_dot").astype(q.dtype)
+    check_time(name, t)
     t = jnp.asarray(t, q.dtype)
     checked_values(system, inputs)
     given = {name: jnp.asarray((inputs or {}).get(name, 0.0), q.dtype) for name in values_by_name(system)}
