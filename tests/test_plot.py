@@ -164,8 +164,22 @@ def test_eigenvalues_and_the_stable_range(style):
     ax = jk.plot.eigenvalues(v, values)
     assert is_legible(ax, style)
     assert {text.get_text() for text in ax.texts} == {"4.29", "6.02"}
-    assert ax.get_xlabel() == "forward speed [m/s]"
+    assert ax.get_xlabel() == "parameter"
     assert jk.plot.eigenvalues(v, values, ax=ax) is ax
+
+
+def test_an_axis_is_called_after_what_varies():
+    """A parameter or a speed of the system with its unit, anything else by its name alone."""
+    pendulum = jk.catalog.DoublePendulum()
+    hanging = lambda length: (dataclasses.replace(pendulum, length=length), jk.State(jnp.zeros(2), jnp.zeros(2)))  # noqa: E731
+    motions = {
+        "length [m]": lambda system, length: hanging(length),
+        "theta1 dot [rad/s]": lambda system, theta1_dot: hanging(theta1_dot),
+        "arm length": lambda system, arm_length: hanging(arm_length),
+    }
+    for label, motion in motions.items():
+        found = jk.stability.eigenvalues(pendulum, jnp.array([0.5, 0.6]), motion)
+        assert jk.plot.eigenvalues(found).get_xlabel() == label
 
 
 def test_stable_ranges_end_where_the_values_end():
@@ -183,7 +197,10 @@ def test_results_of_stability_are_taken_as_they_are(style):
     assert is_legible(ax, style)
     labels = [text.get_text() for text in ax.get_legend().get_texts()]
     assert labels == ["weave", "weave, imaginary", "capsize", "castering"]
-    assert is_legible(jk.plot.root_locus(found), style)
+    assert ax.get_xlabel() == "forward speed [m/s]"
+    locus = jk.plot.root_locus(found)
+    assert is_legible(locus, style)
+    assert locus.figure.axes[-1].get_ylabel() == "forward speed [m/s]"
     axes = jk.plot.mode_shapes(found, at=5.0, only=("roll", "steer"))
     assert is_legible(axes, style)
     assert [ax.get_title().split(":")[0] for ax in axes] == ["weave", "capsize", "castering"]

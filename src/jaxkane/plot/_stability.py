@@ -16,7 +16,7 @@ def eigenvalues(
     eigenvalues: Any = None,
     *,
     modes: Sequence[str] | None = None,
-    xlabel: str = "forward speed [m/s]",
+    xlabel: str | None = None,
     ylim: tuple[float, float] | None = None,
     ax: Any = None,
 ) -> Any:
@@ -30,11 +30,13 @@ def eigenvalues(
     - `values`: what `jaxkane.stability.eigenvalues` gives; or values (m,) of a parameter and
     - `eigenvalues` (m, n) [1/s], one column for each mode, NaN where there is none.
     - `modes`: names of the columns; those of one name share a colour. By default those of the result, if any.
-    - `xlabel`: the parameter and its unit. `ylim`: by default what holds the real parts and the slower oscillations.
+    - `xlabel`: the parameter and its unit, by default as the result has it. `ylim`: by default what holds the real
+        parts and the slower oscillations.
 
     **Returns:** the axes. The borders of the shaded ranges lie on straight lines between the values.
     """
     x, lam, names = _table(values, eigenvalues, modes)
+    xlabel = getattr(values, "parameter", "parameter") if xlabel is None else xlabel
     ax = one(ax)
     low, high = _limits(lam) if ylim is None else ylim
     borders = []
@@ -61,18 +63,19 @@ def root_locus(
     values: Any,
     eigenvalues: Any = None,
     *,
-    label: str = "forward speed [m/s]",
+    label: str | None = None,
     ax: Any = None,
 ) -> Any:
     """The eigenvalues' way through the complex plane; the colour is the parameter, the decaying half is shaded.
 
-    **Arguments:** `values`, `eigenvalues`: as for `eigenvalues`. `label`: of the colour bar.
+    **Arguments:** `values`, `eigenvalues`: as for `eigenvalues`. `label`: of the colour bar, as `xlabel` there.
 
     **Returns:** the axes. A cross marks where each way starts.
     """
     from matplotlib.collections import LineCollection
 
     x, lam, _ = _table(values, eigenvalues, None)
+    label = getattr(values, "parameter", "parameter") if label is None else label
     ax = one(ax)
     for column in lam.T:
         at = np.stack([column.real, column.imag], axis=1)  # (m, 2)

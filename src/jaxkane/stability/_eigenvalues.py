@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -14,7 +15,9 @@ from jaxtyping import Array, Complex, Float
 from scipy.optimize import linear_sum_assignment
 
 from .._common.lookup import as_names, not_there
+from .._description.parameters import parameter_info
 from .._description.system import State, System
+from .._description.units import unit_of, units_of
 from .._method.checks import is_concrete
 from .._scalars.nan import nan_where
 from .._scalars.versions import compiled
@@ -40,6 +43,7 @@ class Eigenvalues(eqx.Module):
     - `condition` (m, n): of each eigenvalue, see `jaxkane.stability.linearize(...).eig`. Derivatives are NaN where it
         is above 1e6: two modes coalesce there, and have none.
     - `modes`: names of the columns; `found["weave"]` gives those of a name. `states`: names of the vectors' entries.
+    - `parameter`: what the values are of, with its unit where that is known: the label of a plot's axis.
     """
 
     values: Float[Array, " m"]
@@ -48,6 +52,7 @@ class Eigenvalues(eqx.Module):
     condition: Float[Array, "m n"]
     modes: tuple[str, ...] = eqx.field(static=True)
     states: tuple[str, ...] = eqx.field(static=True)
+    parameter: str = eqx.field(static=True, default="parameter")
 
     def __getitem__(self, mode: str) -> Complex[Array, "m n_mode"]:
         if mode not in self.modes:
@@ -91,8 +96,8 @@ def eigenvalues(
 
     - `values` (m,): of the parameter of the family, in small enough steps to follow a mode from one to the next.
     - `motion`: (system, value) -> `State`, `SteadyMotion`, or a pair of another system and one of these, where the
-        parameter belongs to the system. For a `WhippleBicycle` it is riding straight ahead at speeds [m/s] by default.
-        Or one motion, without `values`: then m is 1.
+        parameter belongs to the system; how the function calls `value` is how plots call it. For a `WhippleBicycle` it
+        is riding straight ahead at speeds [m/s] by default. Or one motion, without `values`: then m is 1.
     - `states`: as for `linearize`; for the bicycle riding straight (roll, steer, roll_rate, steer_rate), and those of
         its parts.
     - `modes`: names of the modes, one for each column. By default those of a bicycle that rides straight: weave,
@@ -113,7 +118,7 @@ def eigenvalues(
         matrix(system, values[0], at, states)  # which says why
     names, lost = names_of_modes(kept, groups, clear, modes)
     roots = found.values if is_concrete(lost) else nan_where(lost, found.values.T, (system, values)).T
-    return Eigenvalues(values, roots, found.vectors, found.condition, names, kept)
+    return Eigenvalues(values, roots, found.vectors, found.condition, names, kept, _parameter(system, at))
 
 
 def names_of_modes(
@@ -163,6 +168,17 @@ def family_of(system: System, values: Any, motion: MotionAt, states: Sequence[st
     values = jnp.atleast_1d(jnp.asarray(values, dtype=float))
     groups = _Groups(getattr(system, "mode_groups", {})) if is_straight else None
     return values, motion, None if states is None else as_names(states), groups
+
+
+def _parameter(system: System, motion: Any) -> str:
+    """What varies along a family, as a label: the name of the second argument of `motion`, and its unit."""
+    if motion is straight_ahead:
+        return "forward speed [m/s]"
+    names = [] if isinstance(motion, _Fixed) else list(inspect.signature(motion).parameters)
+    if len(names) < 2:
+        return "parameter"
+    unit = unit_of(names[1], {k: info.unit for k, info in parameter_info(system).items()} | units_of(system))
+    return names[1].replace("_", " ") + (f" [{unit}]" if unit else "")
 
 
 class _Groups(dict):
