@@ -126,6 +126,6 @@ def _advice(code: int, reason: str) -> str:
     advice = {
         Status.SINGULAR_SPEEDS: "Choose other dependent speeds: see jaxkane.best_dependent_speeds(system, t, q).",
         Status.STEP_TOO_SMALL: "Something becomes infinite or jumps: look at the last times that were reached.",
-        Status.MAX_STEPS: "Raise max_steps; or look for what is stiff or jumps.",
+        Status.MAX_STEPS: "Raise max_steps (a sample of an input takes a step); or look for what is stiff or jumps.",
     }
     return advice.get(Status(code), "") if code < Status.EVENT else ""
