@@ -4,8 +4,24 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxkane.catalog import DoublePendulum
-from jaxkane.fit import Free, Gain, Problem, Trial, read_trials
+from jaxkane.catalog import DoublePendulum, WhippleBicycle
+from jaxkane.fit import (
+    Delay,
+    Free,
+    Gain,
+    Inertia,
+    Intensity,
+    Offset,
+    Problem,
+    Sigma,
+    Simulation,
+    Trial,
+    bicycle_problem,
+    cross_validate,
+    fit_bicycle,
+    identifiability,
+    read_trials,
+)
 
 t = np.linspace(0.0, 1.0, 11)
 good = np.sin(t)
@@ -157,3 +173,148 @@ def test_windows_cover_every_sample_once():
     assert problem.places == ((0, 0, 4), (0, 4, 7), (1, 0, 2), (1, 2, 2), (1, 4, 2), (1, 6, 2), (1, 8, 3))
     assert int(jnp.sum(problem.windows.weight > 0)) == 22
     assert bool(jnp.all(jnp.diff(problem.windows.t_input, axis=1) > 0))
+
+
+ENTRIES = {
+    "Free": lambda **more: Free("mass", **more),
+    "Gain": lambda **more: Gain("shoulder_torque", **more),
+    "Offset": lambda **more: Offset("theta1", **more),
+    "Delay": lambda **more: Delay("shoulder_torque", **more),
+    "Intensity": lambda **more: Intensity("theta1_dot", **more),
+    "Sigma": lambda **more: Sigma("theta1", **more),
+}
+NAN, INF = float("nan"), float("inf")
+NO_NUMBERS = ["text", "1.0", True, 1j, [1.0, 2.0], {}]
+
+
+def pose(free="mass", trials=None, **options):
+    options = {"simulation": Simulation(step=0.1), "noise": None} | options
+    return Problem.of(pendulum, trial() if trials is None else trials, free, **options)
+
+
+def entry(kind, **more):
+    noise = {"theta1_dot": 1.0} if kind in ("Intensity", "Sigma") else None
+    return pose(ENTRIES[kind](**more), noise=noise)
+
+
+def bicycle_ride(**more):
+    return Trial(t, {"roll": good}, sigma=0.1, initial={"speed": 5.0}, **more)
+
+
+@pytest.mark.parametrize("kind", ENTRIES)
+def test_what_is_no_number_is_refused_where_something_is_freed(kind):
+    for bad in NO_NUMBERS:
+        for more in ({"start": bad}, {"scale": bad}, {"bounds": (bad, 50.0)}, {"bounds": (0.0, bad)}):
+            with pytest.raises(ValueError, match=r"(`start`|`scale`|a bound) must be a real number, got"):
+                entry(kind, **more)
+        for prior in ((1.0, bad), (bad, 1.0)):
+            with pytest.raises(ValueError, match=r"a prior is \(mean, standard deviation > 0\), got"):
+                entry(kind, prior=prior)
+    for bad in ("text", 1.0, (1.0,), (0.0, 1.0, 2.0), {}):
+        with pytest.raises(ValueError, match=r"`bounds` are \(lower, upper\)"):
+            entry(kind, bounds=bad)
+    for bad in ("text", 1.0, (1.0,), (1.0, -0.1), (1.0, 0.0), (NAN, 1.0), (1.0, NAN), (INF, 1.0)):
+        with pytest.raises(ValueError, match=r"a prior is \(mean, standard deviation > 0\), got"):
+            entry(kind, prior=bad)
+    for more in (
+        {"start": NAN},
+        {"start": INF},
+        {"scale": NAN},
+        {"scale": INF},
+        {"scale": -1.0},
+        {"bounds": (NAN, 2.0)},
+    ):
+        with pytest.raises(ValueError, match=r"starts at|the scale must be positive|nothing lies between the bounds"):
+            entry(kind, **more)
+
+
+@pytest.mark.parametrize("bad", [*NO_NUMBERS, NAN, -1.0], ids=str)
+@pytest.mark.parametrize(
+    ("ask", "named"),
+    [
+        (lambda x: trial(sigma=x), r"sigma"),
+        (lambda x: trial(sigma={"theta1": x}), r"sigma\['theta1'\]"),
+        (lambda x: Simulation(step=x), "`step`"),
+        (lambda x: Simulation(rtol=x), "`rtol`"),
+        (lambda x: Simulation(max_steps=x), "`max_steps`"),
+        (lambda x: pose(window=x), "`window`"),
+        (lambda x: pose(noise={"theta1_dot": x}), "`noise`: the intensity of theta1_dot"),
+        (lambda x: pose(unknown={"theta1": x}), "`unknown`: the standard deviation of theta1"),
+        (
+            lambda x: pose(unknown="theta1", window=0.5, continuity={"theta1": x}),
+            "`continuity`: the standard deviation",
+        ),
+        (lambda x: pose(sensor_gain={"theta1": x}), "`sensor_gain`: the standard deviation"),
+        (lambda x: pose(priors={"mass": (1.0, x)}), "mass: a prior is"),
+        (lambda x: pose(Free("mass", tied={"length": x})), "`tied`: the factor of length"),
+        (lambda x: bicycle_problem(bicycle_ride(), BICYCLE, "c", priors={"c": (1.0, x)}), "c: a prior is"),
+    ],
+)
+def test_what_is_no_number_is_refused_by_the_name_of_the_argument(ask, named, bad):
+    with pytest.raises(ValueError, match=named) as error:
+        ask(bad)
+    assert "\n" not in str(error.value)
+
+
+BICYCLE = WhippleBicycle.benchmark()
+
+
+@pytest.mark.parametrize("bad", [*NO_NUMBERS, NAN, INF], ids=str)
+@pytest.mark.parametrize("group", ["inputs", "initial"])
+def test_known_values_of_a_trial_are_real_numbers(group, bad):
+    with pytest.raises(ValueError, match=rf"swing 3: {group}\['theta1'\]"):
+        trial(**{group: {"theta1": bad}})
+
+
+@pytest.mark.parametrize(
+    ("ask", "named"),
+    [
+        (lambda x: pose(free=x), "`free`"),
+        (lambda x: pose(trials=x), "`trials`"),
+        (lambda x: pose(simulation=x), "`simulation=`"),
+        (lambda x: pose(noise=x), "`noise`"),
+        (lambda x: pose(priors=x), "`priors`"),
+        (lambda x: pose(window=0.5, continuity=x), "`continuity`"),
+        (lambda x: pose(unknown=x), "Names are strings"),
+        (lambda x: pose(hold=x), "Names are strings"),
+        (lambda x: Problem.of(x, trial(), "mass"), "`system`"),
+        (lambda x: fit_bicycle(x, BICYCLE, "c"), "`trials`"),
+        (lambda x: fit_bicycle(bicycle_ride(), x, "c"), "`bicycle`"),
+        (lambda x: identifiability(x), "identifiability takes a Problem"),
+        (lambda x: cross_validate(x), "cross_validate"),
+    ],
+)
+def test_what_is_another_kind_of_thing_is_refused_by_the_name_of_the_argument(ask, named):
+    with pytest.raises(TypeError, match=named):
+        ask(3.5)
+
+
+def test_no_trials_and_other_systems_names_are_refused():
+    for ask in (lambda: pose(trials=[]), lambda: fit_bicycle([], BICYCLE, "c")):
+        with pytest.raises(ValueError, match="There is no trial"):
+            ask()
+    with pytest.raises(ValueError, match="WhippleBicycle has no channel theta1"):
+        fit_bicycle(trial(initial={"speed": 5.0}), BICYCLE, "c")
+    with pytest.raises(ValueError, match="`moments` are three names, got 'IBxx'"):
+        bicycle_problem(bicycle_ride(), BICYCLE, Inertia("IBxx"))
+    with pytest.raises(ValueError, match="Inertia: `prior` names IHxx; did you mean"):
+        bicycle_problem(bicycle_ride(), BICYCLE, Inertia(("IBxx", "IByy", "IBzz"), prior={"IHxx": (1.0, 0.1)}))
+
+
+@pytest.mark.parametrize(
+    "twice",
+    [
+        (Gain("shoulder_torque"), Gain("shoulder_torque", name="another")),
+        (Gain("theta1"), Gain("theta1", of="sensor", name="another")),
+        (Offset("theta1"), Offset("theta1", bounds=(-1.0, 1.0))),
+        (Delay("theta1"), Delay("theta1", name="another")),
+        (Free("mass", name="a"), Free("length", name="a")),
+    ],
+)
+def test_what_is_freed_twice_is_refused(twice):
+    with pytest.raises(ValueError, match=r"`free` names .* twice"):
+        pose(twice)
+    assert pose([Gain("theta1"), Gain("theta1", of="start")]).parameters.names == (
+        "gain of theta1",
+        "gain of start of theta1",
+    )

@@ -27,7 +27,10 @@ def hint(wrong: str | Iterable[str], known: Iterable[str], have: str = "there ar
 
 def as_names(given: str | Iterable[str]) -> tuple[str, ...]:
     """Names; one alone may be given as a string."""
-    return (given,) if isinstance(given, str) else tuple(given)
+    names = (given,) if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
+    if not all(isinstance(name, str) for name in names):
+        raise TypeError(f"Names are strings, one or several; got {given!r}.")
+    return names
 
 
 def label_of(name: str) -> str:

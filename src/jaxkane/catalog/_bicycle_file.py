@@ -7,7 +7,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from .._common.decimal_numbers import decimal_number
+from .._common.real_numbers import decimal_number
 
 
 def lines_of(path: str | os.PathLike[str]) -> list[str]:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..catalog import WhippleBicycle
 from ..catalog._bicycle_file import read_bicycle_file
-from ._data.trial import Trial
+from ._data.trial import Trial, as_trials
 from ._optimize.optimizer import Optimizer
 from ._optimize.solve import solve
 from ._problem.entries import parameters_of
@@ -82,7 +82,9 @@ def bicycle_problem(
 
     **Raises:** `ValueError` for a ride without a speed, and what `fit` raises.
     """
-    rides = (rides,) if isinstance(rides, Trial) else tuple(rides)
+    rides = as_trials(rides)
+    if not isinstance(bicycle, WhippleBicycle):
+        raise TypeError(f"`bicycle` is a WhippleBicycle, got {type(bicycle).__name__}: `fit` takes other systems.")
     channels = tuple(dict.fromkeys(name for ride in rides for name in ride.measured))
     names = parameters_of(bicycle, free, options.get("noise"), channels).names
     if isinstance(priors, (str, os.PathLike)):
@@ -106,7 +108,7 @@ def bicycle_rides(rides: Sequence[Trial] | Trial, bicycle: WhippleBicycle) -> tu
 
     held_back = applied_to(fit, bicycle_rides(other_rides, bicycle))
     """
-    rides = (rides,) if isinstance(rides, Trial) else tuple(rides)
+    rides = as_trials(rides)
     return tuple(_with_wheel_rate(ride, bicycle) for ride in rides)
 
 

@@ -43,9 +43,9 @@ def mode_shapes(
     import matplotlib.pyplot as plt
 
     lam, X, labels, names, where = _one_point(eigenvalues, vectors, states, at, modes)
-    only = labels if only is None else as_names(only)
-    refuse_unknown(only, labels, "mode_shapes: there is no state")
-    rows = [i for i, state in enumerate(labels) if state in only]
+    chosen = labels if only is None else as_names(only)
+    refuse_unknown(chosen, labels, "mode_shapes: there is no state")
+    rows = [i for i, state in enumerate(labels) if state in chosen]
     drawn = [k for k in range(len(lam)) if lam[k].imag >= -1e-9 * abs(lam[k])]
     if not np.all(np.isfinite(lam)):
         raise ValueError("mode_shapes: the eigenvalues are not finite here: there is no steady motion, and no mode.")

@@ -44,7 +44,7 @@ def trajectories(
     **Raises:** `KeyError` for a name that the trajectory does not have; `ValueError` for `degrees` where nothing is
     known to be an angle.
     """
-    groups = [as_names(group) for group in (trajectory.names[0] if names is None else as_names(names))]
+    groups = [as_names(group) for group in ([names] if isinstance(names, str) else names or trajectory.names[0])]
     drawn = [name for group in groups for name in group]
     known = {name: unit_of(name, dict(trajectory.units) | dict(units or {})) for name in drawn}
     values = {name: np.asarray(trajectory[name], dtype=float) for name in drawn}

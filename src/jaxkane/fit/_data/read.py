@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from ..._common.decimal_numbers import decimal_number
 from ..._common.lookup import refuse_unknown
+from ..._common.real_numbers import decimal_number
 from .trial import Trial
 
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+
+from ..._common.real_numbers import real_number
 
 _FEEDBACK = (
     "A trial holds what was measured. Feedback, as of a controller or a rider, belongs into the system's `loads`, "
@@ -131,6 +133,7 @@ class Trial:
 
     def between(self, start: float, stop: float) -> Trial:
         """The stretch with start <= t <= stop [s]."""
+        start, stop = real_number(start, f"{self.name}: `start`"), real_number(stop, f"{self.name}: `stop`")
         inside = (self.t >= start) & (self.t <= stop)
         if inside.sum() < 2:
             raise ValueError(
@@ -154,3 +157,17 @@ class Trial:
     def __repr__(self) -> str:
         span = f"{len(self.t)} times from {self.t[0]:g} to {self.t[-1]:g} s"
         return f"Trial({self.name!r}, {span}: {', '.join(self.measured)})"
+
+
+def as_trials(given: Sequence[Trial] | Trial) -> tuple[Trial, ...]:
+    """Trials, of which one alone may be given.
+
+    **Raises:** `TypeError` for what are none, `ValueError` where there is none.
+    """
+    trials = (given,) if isinstance(given, Trial) else tuple(given) if isinstance(given, Iterable) else (given,)
+    for trial in trials:
+        if not isinstance(trial, Trial):
+            raise TypeError(f"`trials` holds jaxkane.fit.Trial, got {type(trial).__name__}.")
+    if not trials:
+        raise ValueError("There is no trial to fit.")
+    return trials

@@ -7,6 +7,7 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from ..._common.real_numbers import real_number
 from ..._description.system import System
 from .entries import as_items
 from .free import Prior
@@ -45,7 +46,12 @@ class Specification:
                 object.__setattr__(self, name, copy.copy(value))
         if self.simulation is not None:
             refuse_other(self.simulation, Simulation, "`simulation=`", "Simulation(step=0.01)")
-        if self.window is not None and not self.window > 0:
+        if not isinstance(self.system, System):
+            raise TypeError(f"`system` is a jaxkane.System, got {type(self.system).__name__}.")
+        for name in ("priors", "continuity"):
+            if not isinstance(getattr(self, name), (Mapping, type(None))):
+                raise TypeError(f"`{name}` is a dict by name, got {getattr(self, name)!r}.")
+        if self.window is not None and not real_number(self.window, "`window`") > 0:
             raise ValueError(f"`window` is a length of time [s], got {self.window}.")
         if self.continuity is not None and self.window is None:
             raise ValueError("`continuity` binds the windows of a trial together: give their length, `window` [s].")

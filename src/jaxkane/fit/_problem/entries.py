@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..._common.lookup import as_names, hint
+from ..._common.lookup import as_names, hint, refuse_unknown
+from ..._common.real_numbers import real_number
 from ..._description.parameters import declared, leaf_name, learned_part
 from ..._description.system import System
 from ..._description.units import unit_of, units_of
@@ -30,6 +31,10 @@ def as_items(free: Any) -> list[Any]:
     """What a fit takes as `free`, one by one."""
     if isinstance(free, (str, Free, Inertia, Intensity, Sigma, Gain, Offset, Delay)) or callable(free):
         return [free]
+    if not isinstance(free, Iterable):
+        raise TypeError(
+            f"`free` is what is to be found, one or a list of such, as 'mass' or Free('mass'); got {free!r}."
+        )
     return list(free)
 
 
@@ -101,11 +106,12 @@ def _of_noise(system: System, item: Intensity | Sigma, noise: Mapping[str, float
     if what not in of:
         where = "`noise`" if isinstance(item, Intensity) else "the measured channels"
         raise ValueError(f"{type(item).__name__}({what!r}): {hint(what, tuple(of), f'{where} has')}")
-    start = float(noise[what] if item.start is None else item.start)
+    given = (noise[what] if item.start is None else item.start) if isinstance(item, Intensity) else item.start
+    start = real_number(given, f"{kind} of {what}: `start`")
     if not 0 < start < math.inf:
         raise ValueError(f"{kind} of {what} starts at {start}: it is searched for among positive numbers.")
     if item.bounds is not None:
-        lower, upper = item.bounds
+        lower, upper = _checked_bounds(f"{kind} of {what}", item.bounds, positive=True)
         if lower is not None and lower < 0:
             raise ValueError(f"{kind} of {what}: nothing below zero is possible, got the bounds {item.bounds}.")
         item = dataclasses.replace(item, bounds=(lower or 0.0, upper))
@@ -152,7 +158,7 @@ def _of_leaves(system: System, item: Free):
         for place, index in enumerate(np.ndindex(leaf.shape)):
             label = item.name if item.name and not many else leaf_name(path)
             label += str(list(index)) if leaf.ndim else ""
-            start = float(leaf[index]) if item.start is None else float(item.start)
+            start = float(leaf[index]) if item.start is None else item.start
             info = declared(system, path)
             targets = ((i, place, 1.0), *followers)
             entry = Entry(label, item.unit or info.unit, targets, part=learned_part(system, path))
@@ -162,6 +168,7 @@ def _of_leaves(system: System, item: Free):
 
 def _followers(system: System, name: str, factor: float) -> list[tuple[int, int, float]]:
     """(leaf, place, factor) of every entry of what is tied."""
+    factor = real_number(factor, f"`tied`: the factor of {name}")
     chosen, leaves = find_leaves(system, name)
     for path in (leaves[i][0] for i in chosen):
         if not math.isfinite(factor) or (factor <= 0 and declared(system, path).positive):
@@ -170,17 +177,18 @@ def _followers(system: System, name: str, factor: float) -> list[tuple[int, int,
     return [(i, place, float(factor)) for i in chosen for place in range(leaves[i][1].size)]
 
 
-def _scalar(entry: Entry, item: Free | Shared | Intensity | Sigma, start: float, positive: bool):
+def _scalar(entry: Entry, item: Free | Shared | Intensity | Sigma, start: Any, positive: bool):
     name = entry.name
+    start = real_number(start, f"{name}: `start`")
     lower, upper = _checked_bounds(name, item.bounds, positive)
     if not math.isfinite(start):
         raise ValueError(f"{name} starts at {start}.")
     prior = checked_prior(name, item.prior) if item.prior is not None else None
     scale = abs(start) or (prior[1] if prior is not None and math.isfinite(prior[1]) else 1.0)
     if item.scale is not None:
-        if not 0 < item.scale < math.inf:
+        scale = real_number(item.scale, f"{name}: `scale`")
+        if not 0 < scale < math.inf:
             raise ValueError(f"{name}: the scale must be positive and finite, got {item.scale}.")
-        scale = float(item.scale)
     ends = (-math.inf if lower is None else lower, math.inf if upper is None else upper)
     begin = start
     if item.bounds is not None and start in ends:  # where the bijection has no slope
@@ -197,7 +205,10 @@ def _checked_bounds(name: str, bounds: Any, positive: bool) -> tuple[float | Non
     """(lower, upper), None where there is none; infinite ones are none."""
     if bounds is None:
         return (0.0, None) if positive else (None, None)
-    lower, upper = (end if b is None else float(b) for b, end in zip(bounds, (-math.inf, math.inf), strict=True))
+    if isinstance(bounds, str) or not hasattr(bounds, "__len__") or len(bounds) != 2:
+        raise ValueError(f"{name}: `bounds` are (lower, upper), of which either may be None; got {bounds!r}.")
+    ends = zip(bounds, (-math.inf, math.inf), strict=True)
+    lower, upper = (end if b is None else real_number(b, f"{name}: a bound") for b, end in ends)
     if not lower < upper:
         raise ValueError(
             f"{name}: nothing lies between the bounds {bounds}; they are (lower, upper), or None for none."
@@ -212,6 +223,10 @@ def _of_body(system: System, item: Inertia):
     """One `PossibleBody` and its entries. A value is found by (leaf, places)."""
     if (item.matrix is None) == (item.moments is None):
         raise ValueError("Inertia: give `moments` (and `products`), or `matrix`.")
+    for what in ("center", "moments", "products"):
+        three = getattr(item, what)
+        if three is not None and (isinstance(three, str) or len(three) != 3):
+            raise ValueError(f"Inertia: `{what}` are three names, got {three!r}.")
     names: list[str | None] = [item.mass, *item.center]
     spots: list[Any] = [None if name is None else (one_leaf(system, name), (0,)) for name in names]
     wheel = None
@@ -233,6 +248,7 @@ def _of_body(system: System, item: Inertia):
             wheel = (a, b)
         names += [*moments, *item.products]
         spots += [None if name is None else (one_leaf(system, name), (0,)) for name in (*moments, *item.products)]
+    refuse_unknown(item.prior, [name for name in names if name], "Inertia: `prior` names", "of this body are named")
     leaves = jax.tree.leaves(system)
     values = [0.0 if s is None else float(np.ravel(leaves[s[0]])[s[1][0]]) for s in spots]
     values[0] = values[0] if spots[0] is not None else 1.0

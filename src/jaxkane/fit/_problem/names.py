@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from ..._common.lookup import as_names, hint, refuse_unknown
+from ..._common.real_numbers import real_number
 from ..._description.system import System
 from ..._method.drift import has_configuration_constraints
 from ..._method.free_coordinates import euler_parameters, found_of
@@ -26,12 +27,8 @@ Names = Sequence[str] | Mapping[str, float | None]
 def checked_trials(system: System, trials: Sequence[Trial]) -> tuple[str, ...]:
     """The channels of all trials."""
     title = type(system).__name__
-    if not trials:
-        raise ValueError("There is no trial to fit.")
     named = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.states, *output_names(system))
     for trial in trials:
-        if not isinstance(trial, Trial):
-            raise TypeError(f"`trials` holds jaxkane.fit.Trial, got {type(trial).__name__}.")
         for what, given, known in (
             ("channel", trial.measured, named),
             ("input", trial.inputs, system.inputs),
@@ -55,10 +52,13 @@ def checked_names(system: System, what: str, given: Any, known: Sequence[str]) -
             f"{type(system).__name__}: `{what}` names {', '.join(wrong)}; {hint(wrong, known, 'it may name')}"
             + (" Dependent coordinates and speeds follow from the others." if what == "unknown" else "")
         )
-    bad = [name for name, deviation in given.items() if deviation is not None and not deviation > 0]
-    if bad:
-        raise ValueError(f"`{what}`: the standard deviation of {bad[0]} must be positive, or None for no prior.")
-    return {name: float("inf") if deviation is None else float(deviation) for name, deviation in given.items()}
+    numbers = {}
+    for name, deviation in given.items():
+        label = f"`{what}`: the standard deviation of {name}"
+        numbers[name] = float("inf") if deviation is None else real_number(deviation, label)
+        if not numbers[name] > 0:
+            raise ValueError(f"{label} must be positive, or None for no prior; got {deviation!r}.")
+    return numbers
 
 
 class Starts(NamedTuple):

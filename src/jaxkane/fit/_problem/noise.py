@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from ..._common.lookup import hint
+from ..._common.real_numbers import real_number
 from ..._description.system import State, System
 
 MODES = 3
@@ -92,7 +93,7 @@ def noise_of(system: System, given: Any, deviations: Any, window: Any, continuit
                 else ""
             )
             raise ValueError(f"`noise` names {name}; {hint(name, known, 'it may name')}{more}")
-        if np.shape(intensity) != () or not 0 <= float(intensity) < math.inf:
+        if not 0 <= real_number(intensity, f"`noise`: the intensity of {name}") < math.inf:
             raise ValueError(
                 f"`noise`: the intensity of {name} is a number that is not negative and finite; got {intensity!r}. To "
                 f"have it found, start from such a number and name Intensity({name!r}) among `free`."

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ..._common.real_numbers import real_number
 from ..._description.system import System
 from .bijections import Interval, PossibleBody
 from .free import Prior
@@ -127,6 +128,10 @@ class Parameters(eqx.Module):
 
 
 def checked_prior(name: str, prior: Any) -> Prior:
-    if np.shape(prior) != (2,) or not (math.isfinite(prior[0]) and prior[1] > 0):
-        raise ValueError(f"{name}: a prior is (mean, standard deviation > 0), got {prior}.")
-    return float(prior[0]), float(prior[1])
+    try:
+        mean, deviation = (real_number(x, f"{name}: in a prior, what is given") for x in prior)
+    except (TypeError, ValueError):
+        mean = deviation = math.nan
+    if not (math.isfinite(mean) and deviation > 0):
+        raise ValueError(f"{name}: a prior is (mean, standard deviation > 0), got {prior!r}.")
+    return mean, deviation

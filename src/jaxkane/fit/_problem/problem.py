@@ -16,7 +16,7 @@ from jaxtyping import Array
 from ..._description.system import System
 from ..._method.assembly import NoConfiguration
 from ..._simulation.trajectory import Trajectory
-from .._data.trial import Trial
+from .._data.trial import Trial, as_trials
 from .._data.windows import Place, Windows, cut
 from . import step_halving
 from .arguments import Specification
@@ -62,7 +62,7 @@ class Problem:
     def posed(cls, asked: Specification, trials: Sequence[Trial] | Trial) -> Problem:
         """What is asked, of these trials."""
         system, window, simulation = asked.system, asked.window, asked.simulation or Simulation()
-        trials = (trials,) if isinstance(trials, Trial) else tuple(trials)
+        trials = as_trials(trials)
         channels = checked_trials(system, trials)
         driven = tuple(name for name in system.inputs if any(name in trial.inputs for trial in trials))
         nuisance = nuisance_of(asked, channels, driven)

@@ -7,6 +7,7 @@ from typing import Any
 
 import diffrax
 
+from ..._common.real_numbers import real_number
 from ..._simulation.settings import Settings, settings_for
 
 
@@ -38,7 +39,7 @@ class Simulation:
     def __post_init__(self) -> None:
         for name in ("rtol", "atol", "step", "max_steps"):
             value = getattr(self, name)
-            if value is not None and not 0 < value < float("inf"):
+            if value is not None and not 0 < real_number(value, f"`{name}`") < float("inf"):
                 raise ValueError(f"`{name}` must be positive and finite, got {value}.")
         if self.step is not None and (self.rtol is not None or self.atol is not None):
             raise ValueError(
