@@ -278,7 +278,7 @@ def test_what_cannot_be_noise():
     for noise, said in (
         ({"x_dot": -0.1}, "not negative and finite; got -0.1"),
         ({"x_dot": np.nan}, "not negative"),
-        ({"x_dot": [0.1, 0.2]}, "not negative"),
+        ({"x_dot": [0.1, 0.2]}, "the intensity of x_dot must be a real number"),
         ({"x": 0.1}, "A coordinate follows"),
         ({"xdot": 0.1}, "x_dot"),
     ):

@@ -6,11 +6,13 @@ import pytest
 
 from jaxkane.catalog import DoublePendulum, WhippleBicycle
 from jaxkane.fit import (
+    BFGS,
     Delay,
     Free,
     Gain,
     Inertia,
     Intensity,
+    LeastSquares,
     Offset,
     Problem,
     Sigma,
@@ -22,6 +24,7 @@ from jaxkane.fit import (
     identifiability,
     read_trials,
 )
+from jaxkane.fit._result.covariance import check_level
 
 t = np.linspace(0.0, 1.0, 11)
 good = np.sin(t)
@@ -238,6 +241,11 @@ def test_what_is_no_number_is_refused_where_something_is_freed(kind):
         (lambda x: Simulation(rtol=x), "`rtol`"),
         (lambda x: Simulation(max_steps=x), "`max_steps`"),
         (lambda x: pose(window=x), "`window`"),
+        (lambda x: LeastSquares(rtol=x), "LeastSquares: `rtol`"),
+        (lambda x: LeastSquares(damping=x), "LeastSquares: `damping`"),
+        (lambda x: LeastSquares(horizons=(x,)), "LeastSquares: .*`horizons`"),
+        (lambda x: BFGS(rtol=x), "BFGS: `rtol`"),
+        (lambda x: check_level(x), "`level`"),
         (lambda x: pose(noise={"theta1_dot": x}), "`noise`: the intensity of theta1_dot"),
         (lambda x: pose(unknown={"theta1": x}), "`unknown`: the standard deviation of theta1"),
         (

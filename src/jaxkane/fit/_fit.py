@@ -53,7 +53,7 @@ def fit(
     - `free`: what to find: names, paths, functions to leaves, `Free`, `Gain`, `Delay` and `Inertia`.
     - `unknown`: coordinates, independent speeds and states of the first order whose value at the start of every window
         is to be found too; dependent ones follow from them (`assemble`). What is measured and not among them starts at
-        its first sample, with the error of that.
+        its first sample, with the error of that. Four unknown Euler parameters are three degrees of freedom.
     - `sensor_bias`, `sensor_gain`: channels with an unknown constant offset and factor in every trial. `input_bias`,
         `input_gain`, `input_delay` [s]: inputs with an offset, a factor and a delay of every trial's own.
     - These are names, or a dict from names to the standard deviation of a Gaussian prior around the initial guess
@@ -63,7 +63,7 @@ def fit(
     - `hold`: inputs under a zero-order hold, which keep each sample until the next; the others are linear
         between their samples.
     - `window` [s]: cut the trials into windows of this length, each with its own unknown start (multiple shooting), as
-        unstable motions need. By default a trial is one window (single shooting).
+        unstable motions need, and of two samples at least. By default a trial is one window (single shooting).
     - `continuity`: by name, the standard deviation of the jump from a window's end to the next one's start, for what is
         `unknown`; names left out jump freely. Small ones ask for one motion through all windows; with windows as short
         as the samples they are a process noise, and the sum of squares is that of a Kalman filter's prediction errors.

@@ -38,8 +38,8 @@ def read_trials(
         trial.
     - `sigma`: as `Trial` takes it.
 
-    An empty cell, or one that says NaN, is a gap. The file is UTF-8, with or without a byte-order mark; compressed by
-    gzip where its name ends in `.gz`.
+    Numbers are decimal (-1.5e-3); an empty cell, or one that says NaN, is a gap. The file is UTF-8, with or without a
+    byte-order mark; compressed by gzip where its name ends in `.gz`.
 
     **Returns:** trials in the order of the file, named after the file and the value of `by`.
 

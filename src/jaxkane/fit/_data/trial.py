@@ -32,7 +32,8 @@ class Trial:
         by it. One number serves all channels.
     - `initial`: by name, what is known of coordinates, speeds and states: a number, or samples (n_t,) from which every
         window takes its start. What is neither known nor measured starts at zero, of four Euler parameters the last at
-        one, and what the constraints ask of it is found from there as by `assemble`.
+        one, and what the constraints ask of it is found from there as by `assemble`. Four Euler parameters of which
+        all are known, measured or unknown are brought to unit norm.
     - `name`: for messages, tables and pictures.
 
     **Raises:** `ValueError` that names the trial and the channel, for wrong shapes, text, times that do not increase,

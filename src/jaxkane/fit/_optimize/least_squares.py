@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..._common.real_numbers import real_number
 from .._problem.blocks import eliminate
 from .._problem.linearization import Linearization, linearize
 from .._problem.model import Unknowns
@@ -43,6 +44,12 @@ class LeastSquares(Optimizer):
     rtol: float = 1e-6
     damping: float = 1e-3
     horizons: Sequence[float] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for share in self.horizons:
+            if not 0 < real_number(share, "LeastSquares: each of `horizons`") < 1:
+                raise ValueError(f"LeastSquares: `horizons` are shares of a window, between 0 and 1; got {share}.")
 
     @property
     def name(self) -> str:
@@ -99,6 +106,4 @@ def _is_refined(problem: Problem, at: Linearization) -> bool:
 
 def _part(problem: Problem, share: float) -> Problem:
     """The first part of every window."""
-    if not 0 < share < 1:
-        raise ValueError(f"`horizons` are shares of a window, between 0 and 1; got {share}.")
     return problem.shortened(np.array([max(2, round(share * n)) for _, _, n in problem.places]))

@@ -6,6 +6,7 @@ import abc
 import dataclasses
 from typing import Any, ClassVar
 
+from ..._common.real_numbers import real_number
 from .._problem.linearization import Linearization
 from .._problem.model import Unknowns
 from .._problem.problem import Problem
@@ -36,9 +37,10 @@ class Optimizer(abc.ABC):
 
     def __post_init__(self) -> None:
         for name in ("rtol", "damping"):
-            value = getattr(self, name, 0.0)
+            label = f"{type(self).__name__}: `{name}`"
+            value = real_number(getattr(self, name, 0.0), label)
             if not 0 <= value < float("inf"):
-                raise ValueError(f"{type(self).__name__}: `{name}` is a number that is not negative, got {value}.")
+                raise ValueError(f"{label} is a number that is not negative, got {value}.")
 
     @property
     @abc.abstractmethod

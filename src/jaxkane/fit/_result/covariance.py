@@ -11,6 +11,7 @@ import scipy.linalg
 from jaxtyping import Array
 from scipy import stats
 
+from ..._common.real_numbers import real_number
 from ..._scalars.versions import compiled
 from .._problem.blocks import Blocks, Eliminated, eliminate
 from .._problem.linearization import Linearization
@@ -188,7 +189,7 @@ def intervals(parameters: Parameters, x: Array, half: np.ndarray) -> list[tuple[
 
 def check_level(level: float) -> None:
     """**Raises:** `ValueError` for what is no probability between 0 and 1."""
-    if not 0 < level < 1:
+    if not 0 < real_number(level, "`level`") < 1:
         raise ValueError(f"`level` is a probability between 0 and 1, such as 0.95 or 0.05; got {level}.")
 
 
