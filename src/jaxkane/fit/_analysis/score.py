@@ -131,13 +131,13 @@ def is_clustered(rows: Rows, parameters: int, correlation: float) -> bool:
 
 
 def beside_zero(step: np.ndarray, covariance: np.ndarray, trials: int) -> float:
-    """The probability that numbers (q,) which are zero are found as far from it, with a covariance from so many trials
-    (Wald's test; Hotelling 1931; of one number, Student's t). Of several numbers it is too small, by up to two, where
-    few trials tell most."""
-    q = len(step)
-    size = np.sqrt(np.diagonal(covariance))
-    squared = float((step / size) @ np.linalg.pinv(covariance / np.outer(size, size), rcond=1e-12) @ (step / size))
-    return float(stats.f.sf(squared * (trials - q) / (q * (trials - 1)), q, trials - q))
+    """The probability that one of some numbers (q,) which are all zero is found as far from it, with a covariance from
+    so many trials: Student's t of each, and Bonferroni's bound over them.
+
+    Hotelling's test of all of them together rejects too often, up to 12 % at 5 %, where few trials tell most.
+    """
+    p = 2 * stats.t.sf(np.abs(step) / np.sqrt(np.diagonal(covariance)), trials - 1)
+    return float(min(1.0, len(step) * p.min()))
 
 
 def _inverse(A: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ class Suspect:
         where `cost` is a number, else as the linearization has them.
     - `promised`, `cost`: the sum of squares by the linearization, and fitted (NaN where it was not). `p`: the
         probability that chance promises as much, of what is nested. `criterion`: what decides beside the trials left
-        out: "score test" before it is fitted, "F test" or "Wald test" after; of what is not nested "trials left out"
+        out: "score test" before it is fitted, "F test" or "t test" after; of what is not nested "trials left out"
         alone, or "BIC" where none can be left out.
     - `predicted`: the sum of squares of trials that are left out in turn; unknowns of the trials' own, which those that
         are left out find too, count twice the variance of a residual each.

@@ -144,7 +144,7 @@ class Trying:
             p, criterion = chance(was.cost - after.cost, k, after.cost, after.freedom, after.correlation), "F test"
             if not count and is_clustered(rows, len(found.names), after.correlation):
                 p = beside_zero(np.asarray(found.point.x - start.x)[n:], now.covariance, len(rows.data))
-                criterion = "Wald test"
+                criterion = "t test"
         elif self.folds is None:
             change, criterion = bic_change(was.cost, after.cost, k, self.fit.problem.size[0], after.correlation), "BIC"
             verdict = "" if change < 0 else f"its BIC is higher by {change:.3g}"
