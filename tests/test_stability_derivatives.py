@@ -108,8 +108,8 @@ def test_one_that_is_separated_does_not_mind_that_others_coalesce(mode):
 
 @pytest.mark.slow
 def test_in_reverse_mode_what_is_not_read_says_nothing():
-    hessian_of_third = jax.jit(jax.hessian(lambda A: eigvals(A).real[2]))
-    assert all(np.isfinite(hessian_of_third(A)).all() for A in COALESCING)
+    hessian_of_first = jax.jit(jax.hessian(lambda A: eigvals(A).real[0]))
+    assert all(np.isfinite(hessian_of_first(A)).all() for A in COALESCING)
 
 
 def test_in_single_precision_and_in_batches_of_none():
