@@ -11,7 +11,7 @@ import pytest
 
 import jaxkane as jk
 from jaxkane._description.units import units_of
-from jaxkane.joints import Actuator, Link, Loop, Site, hinge, mechanism
+from jaxkane.joints import Actuator, Coupling, Link, Loop, Site, hinge, mechanism
 
 TS = jnp.linspace(0.0, 0.2, 3)
 BAR = {"mass": 1.0, "center": (0.5, 0.0, 0.0), "inertia": (0.01, 0.1, 0.1)}
@@ -372,3 +372,69 @@ def test_what_is_no_number_is_refused_in_a_simulation(wrong):
         with pytest.raises((TypeError, ValueError), match=label) as caught:
             call()
         assert "\n" not in str(caught.value).split("\n-----")[0]
+
+
+# Text for numbers, wrong shapes and wrong ranges: words of the field, and what is asked for.
+
+
+def parts():
+    N, O = jk.inertial()
+    P = O.moving(0.5 * N.x, 0.1 * N.x)
+    return N, O, P, N.rotate(3, 0.1, 0.2, "B")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "words"),
+    [
+        (lambda N, O, P, B: N.rotate(3.0, 0.1, 0.2), r"the axis is the whole number 1, 2 or 3, .* got 3\.0"),
+        (lambda N, O, P, B: N.rotate(jnp.ones(3), 0.1, 0.2), "the axis is the whole number 1, 2 or 3"),
+        (lambda N, O, P, B: N.vector("u3", 0, 0), r"must be one number, got 'u3': by name it is q\['u3'\], u\['u3'\]"),
+        (lambda N, O, P, B: N.x * jnp.ones(3), r"shape \(3,\): take one entry"),
+        (lambda N, O, P, B: N.vector(jnp.array(1j), 0, 0), "must be one number"),
+        (lambda N, O, P, B: N.rotate_sequence("1-2", (1.0, 2.0), (1.0,)), "'1-2' takes 2 rates, got 1"),
+        (lambda N, O, P, B: N.rotate_sequence("1-2-3", 1.0, (1.0,)), r"'1-2-3' takes 3 angles, got 1\.0"),
+        (lambda N, O, P, B: N.rotate_euler(1.0), r"Euler parameters are four numbers, the scalar last, got 1\.0"),
+        (lambda N, O, P, B: N.rotate_fixed(0.3), r"A rotation vector has three components, got 0\.3"),
+        (lambda N, O, P, B: N.rotate_by(3.0, 0, 0, 0), "the orientation is a function"),
+        (lambda N, O, P, B: O.located(3.0, 0, 0, 0), "the position is a function"),
+        (lambda N, O, P, B: jk.rotations.euler_parameter_norm(jnp.ones(7)), "Euler parameters are four numbers"),
+        (lambda N, O, P, B: jk.rotations.of_rotation_vector((1.0, 2.0)), "three components, got 2"),
+        (lambda N, O, P, B: jk.rotations.angle_rates("1-2", (1.0, 2.0), (1.0, 2.0, 3.0)), "a sequence of three axes"),
+        (lambda N, O, P, B: jk.Body("m", 0.0, O), "must be one number, got 'm'"),
+        (lambda N, O, P, B: jk.Body(1.0, "abc", O, N), "three principal moments or a .* matrix, got 'abc'"),
+        (lambda N, O, P, B: jk.Body(1.0, 0.0, O, name=3), "the name is a text, got 3"),
+        (lambda N, O, P, B: jk.Motion(3.0), r"the bodies are a list, got 3\.0"),
+        (lambda N, O, P, B: jk.Motion([jk.Body(1.0, 0.0, O)], None), "the constraints are a list, got None"),
+        (lambda N, O, P, B: jk.Motion([jk.Body(1.0, 0.0, O)], points=[O]), "the points are a dict by name"),
+        (lambda N, O, P, B: jk.weight(3.0, N.x), r"is a Motion, got 3\.0"),
+        (lambda N, O, P, B: jk.parameter(shape=3), "a shape is a tuple"),
+        (lambda N, O, P, B: jk.loads.spring(3.0, P, 1.0), r"A Point or a Body is asked for, got 3\.0"),
+        (lambda N, O, P, B: jk.loads.damper(O, P, "c"), "must be one number, got 'c'"),
+        (lambda N, O, P, B: jk.loads.actuator(O, P, "F"), "must be one number, got 'F'"),
+        (lambda N, O, P, B: jk.loads.torsional_damper(O, None, N.z, 1.0), "a Frame or a Body, got Point"),
+        (lambda N, O, P, B: jk.loads.torsional_damper(B, None, 3, 1.0), "takes a Vector such as .* got 3"),
+        (lambda N, O, P, B: jk.loads.drag(P, "c"), "must be one number, got 'c'"),
+        (lambda N, O, P, B: jk.loads.stribeck(1.0, 1.0, 2.0, -0.1), r"`falloff` is -0\.1: it is positive"),
+        (lambda N, O, P, B: jk.loads.dc_motor(1.0, 1.0, 1.0, 0.0), r"the resistance is 0\.0: it is positive"),
+        (lambda N, O, P, B: jk.sensors.gyroscope(O), "along the axes of a Frame, got Point"),
+        (lambda N, O, P, B: jk.sensors.marker(3.0, O, N), "A Point or a Body is asked for"),
+        (lambda N, O, P, B: jk.sensors.low_pass(1.0, 1.0, -0.1), r"the time constant is -0\.1: it is positive"),
+        (lambda N, O, P, B: jk.sensors.delayed(1.0, (1.0, 2.0), -1.0), r"the delay is -1\.0: it is positive"),
+        (lambda N, O, P, B: jk.sensors.encoder(1.0, resolution=0.0), r"the resolution is 0\.0: it is positive"),
+        (lambda N, O, P, B: hinge("h", "z"), "The axis of 'h': finite numbers are asked for, got 'z'"),
+        (lambda N, O, P, B: hinge("h", reference=np.nan), "The reference of 'h': finite numbers"),
+        (lambda N, O, P, B: mechanism([Link("a", joints=3, **BAR)]), "a Joint or a list of them, got 3"),
+        (lambda N, O, P, B: mechanism([Link("a", joints=hinge("h"), **BAR)], name=3), "`name` is a text, got 3"),
+        (
+            lambda N, O, P, B: mechanism([Link("a", joints=hinge("h"), **BAR | {"mass": "m"})]),
+            "a real number .* got 'm'",
+        ),
+        (
+            lambda N, O, P, B: mechanism([Link("a", joints=hinge("h"), **BAR)], loops=[Coupling("h", None, ())]),
+            "one number at least, got none",
+        ),
+    ],
+)
+def test_what_is_no_number_of_its_kind_is_refused_in_words(wrong, words):
+    with pytest.raises((TypeError, ValueError), match=words):
+        wrong(*parts())

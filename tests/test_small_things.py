@@ -86,8 +86,14 @@ def test_values_by_name_and_their_arithmetic():
         lambda a: a % 3.0,
         lambda a: a // 2.0,
         lambda a: a > 2,
+        lambda a: a == 2.0,
+        lambda a: 2.0 != a,
+        lambda a: a == jnp.array([1.0, 0.0, 3.0, 0.0]),
     ):
         np.testing.assert_array_equal(f(q), f(array))
+    for compare in (lambda: q == "e1", lambda: q < "e1", lambda: q == None):  # noqa: E711
+        with pytest.raises(TypeError, match="meet numbers and arrays alone"):
+            compare()
     with pytest.raises(KeyError, match="did you mean 'e1'"):
         q["e11":]
     with pytest.raises(AttributeError, match=r"no `\.sum`: jnp\.asarray\(q\) is an array"):

@@ -68,7 +68,7 @@ def test_a_hinge_in_any_direction():
     np.testing.assert_allclose(
         N.rotate(axis, 0.6, 1.5).angular_velocity.to(N), [skew[2, 1], skew[0, 2], skew[1, 0]], atol=1e-14
     )
-    with pytest.raises(ValueError, match="axis is 1, 2, 3"):
+    with pytest.raises(ValueError, match="axis is the whole number 1, 2 or 3"):
         N.rotate(0, 0.1, 0.0)
 
 

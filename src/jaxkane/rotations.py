@@ -13,11 +13,12 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from ._scalars.components import add, cross, dot, is_exact, matvec, mul, sub
+from ._scalars.components import add, cross, dot, is_exact, matvec, mul, several, sub
 from ._scalars.types import Component, Triple
 
 Matrix = tuple[Triple, Triple, Triple]
 
+_FOUR = "Euler parameters are four numbers, the scalar last"
 IDENTITY: Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
 
 
@@ -63,8 +64,8 @@ def sequence_matrix(sequence: str, angles: Sequence[Component]) -> Matrix:
 
     **Arguments:** `sequence`, such as "3-1-2"; `angles` [rad], one for each axis.
     """
-    rotation = IDENTITY
-    for axis, angle in zip(axes_of(sequence), angles, strict=True):
+    rotation, axes = IDENTITY, axes_of(sequence)
+    for axis, angle in zip(axes, several(angles, len(axes), f"{sequence!r} takes {len(axes)} angles"), strict=True):
         rotation = matmul(simple_rotation(axis, angle), rotation)
     return rotation
 
@@ -73,7 +74,9 @@ def _rate_directions(sequence: str, angles: Sequence[Component]) -> list[Triple]
     # The column of each angle's rate in the rotated frame's components of the angular velocity.
     rest = IDENTITY
     columns: list[Triple] = []
-    for axis, angle in reversed(list(zip(axes_of(sequence), angles, strict=True))):
+    axes = axes_of(sequence)
+    angles = several(angles, len(axes), f"{sequence!r} takes {len(axes)} angles")
+    for axis, angle in reversed(list(zip(axes, angles, strict=True))):
         columns.append((rest[0][axis], rest[1][axis], rest[2][axis]))
         rest = matmul(rest, simple_rotation(axis, angle))
     return columns[::-1]
@@ -85,6 +88,7 @@ def angular_velocity(sequence: str, angles: Sequence[Component], rates: Sequence
     **Arguments:** `sequence`, such as "3-1-3"; `angles` [rad] and their `rates` [rad/s], three each.
     """
     columns = _rate_directions(sequence, angles)
+    rates = several(rates, len(columns), f"{sequence!r} takes {len(columns)} rates")
     return matvec(list(zip(*columns, strict=True)), rates)  # type: ignore[return-value]
 
 
@@ -96,7 +100,8 @@ def angle_rates(sequence: str, angles: Sequence[Component], omega: Sequence[Comp
 
     **Arguments:** `sequence` of three axes; `angles` [rad], `omega` [rad/s], three each.
     """
-    a, b, c = _rate_directions(sequence, angles)
+    a, b, c = several(_rate_directions(sequence, angles), 3, "angle_rates takes a sequence of three axes")
+    omega = several(omega, 3, "An angular velocity has three components")
     bc, ca, ab = cross(b, c), cross(c, a), cross(a, b)  # the reciprocal basis of the three directions
     det = dot(a, bc)
     return tuple(_divide(dot(x, omega), det) for x in (bc, ca, ab))  # type: ignore[return-value]
@@ -111,7 +116,7 @@ def euler_parameters_matrix(parameters: Sequence[Component]) -> Matrix:
 
     Scalar last, as in the textbook (Example 2); jaxlie and MuJoCo put it first.
     """
-    e1, e2, e3, e4 = parameters
+    e1, e2, e3, e4 = several(parameters, 4, _FOUR)
     return (
         (e1 * e1 - e2 * e2 - e3 * e3 + e4 * e4, 2.0 * (e1 * e2 + e3 * e4), 2.0 * (e1 * e3 - e2 * e4)),
         (2.0 * (e1 * e2 - e3 * e4), e2 * e2 - e1 * e1 - e3 * e3 + e4 * e4, 2.0 * (e2 * e3 + e1 * e4)),
@@ -124,6 +129,7 @@ def normalized(parameters: Sequence[Component]) -> tuple[Component, ...]:
 
     **Raises:** `ValueError` where all are exactly zero.
     """
+    parameters = several(parameters, 4, _FOUR)
     square = dot(parameters, parameters)
     if not is_exact(square):
         norm = jnp.sqrt(square)
@@ -138,20 +144,22 @@ def euler_parameter_rates(parameters: Sequence[Component], omega: Sequence[Compo
 
     {e_dot} = 1/2 [E']^T {w1, w2, w3, 0}        (Example 2)
     """
-    e1, e2, e3, e4 = parameters
-    half = [mul(0.5, w) for w in omega]
+    e1, e2, e3, e4 = several(parameters, 4, _FOUR)
+    half = [mul(0.5, w) for w in several(omega, 3, "An angular velocity has three components")]
     rows = ((e4, -e3, e2), (e3, e4, -e1), (-e2, e1, e4), (-e1, -e2, -e3))
     return tuple(dot(row, half) for row in rows)  # type: ignore[return-value]
 
 
 def euler_parameter_norm(parameters: Sequence[Component]) -> Component:
     """e1^2 + e2^2 + e3^2 + e4^2 - 1: zero, the configuration constraint of Euler parameters."""
-    return sub(dot(parameters, parameters), 1.0)
+    e = several(parameters, 4, _FOUR)
+    return sub(dot(e, e), 1.0)
 
 
 def of_rotation_vector(vector: Sequence[Component]) -> tuple[Component, Component, Component, Component]:
     """Euler parameters (scalar last) of a rotation vector [rad]: (r sin(a / 2) / a, cos(a / 2)), a = |r|; smooth at
     zero."""
+    vector = several(vector, 3, "A rotation vector has three components")
     square = dot(vector, vector)
     if is_exact(square):
         angle = math.sqrt(square)

@@ -21,10 +21,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from ._description.bodies import Body
+from ._description.bodies import Body, point_of
 from ._description.frames import Frame
 from ._description.points import Point
 from ._description.vectors import Vector
+from ._scalars.components import positive
 from ._scalars.types import Component
 
 Named = dict[str, Component]
@@ -35,7 +36,7 @@ def gyroscope(frame: Frame) -> Named:
 
     **Arguments:** `frame`: the instrument's, such as `body_frame.rotate_fixed(self.mounting)`.
     """
-    return _along(frame.angular_velocity, frame)
+    return _along(_checked(frame).angular_velocity, frame)
 
 
 def accelerometer(now: Any, point: Point | Body, frame: Frame, gravity: Vector) -> Named:
@@ -48,7 +49,7 @@ def accelerometer(now: Any, point: Point | Body, frame: Frame, gravity: Vector) 
     **Arguments:** `now`, as `outputs` receives it; `point`: where the instrument sits, a Point that is fixed in the
     body that carries it; `frame`: the instrument's; `gravity` [m/s^2]: the Vector that `weight` is given.
     """
-    return _along(now.acceleration(_point(point)) - gravity, frame)
+    return _along(now.acceleration(point_of(point)) - gravity, frame)
 
 
 def imu(now: Any, point: Point | Body, frame: Frame, gravity: Vector) -> Named:
@@ -74,7 +75,7 @@ def encoder(
     reading = ratio * (angle - zero)
     if resolution is None:
         return reading
-    steps = reading / resolution
+    steps = reading / positive(resolution, "encoder: the resolution")
     return reading + resolution * jax.lax.stop_gradient(jnp.round(steps) - steps)
 
 
@@ -83,7 +84,7 @@ def marker(point: Point | Body, origin: Point, frame: Frame) -> Named:
 
     **Arguments:** `origin`, `frame`: of the tracking system, from which and along whose axes the place is measured.
     """
-    return _along(_point(point).position_from(origin), frame)
+    return _along(point_of(point).position_from(origin), frame)
 
 
 def camera(
@@ -101,7 +102,7 @@ def camera(
     **Arguments:** `center`: the camera's projection centre; `frame`: the camera's, z along the optical axis away from
     it, x to the right and y downwards in the picture. What is behind the camera is NaN.
     """
-    x, y, z = _point(point).position_from(center).components_in(frame)
+    x, y, z = point_of(point).position_from(center).components_in(frame)
     is_seen = jnp.asarray(z) > 0
     depth = jnp.where(is_seen, z, jnp.ones_like(z))
     lost = jnp.where(is_seen, jnp.zeros_like(depth), jnp.full_like(depth, jnp.nan))
@@ -137,6 +138,7 @@ def low_pass(signal: Component, x: Any, time_constant: Component) -> tuple[tuple
     **Returns:** the rates of its states, for `state_rates`, and its output, for `outputs` or `loads`.
     """
     (x,) = _states(x, (1,), "low_pass")
+    positive(time_constant, "low_pass: the time constant")
     return ((signal - x) / time_constant,), x
 
 
@@ -151,7 +153,7 @@ def low_pass_second_order(
     `low_pass`.
     """
     x1, x2 = _states(x, (2,), "low_pass_second_order")
-    w = 2.0 * jnp.pi * frequency
+    w = 2.0 * jnp.pi * positive(frequency, "low_pass_second_order: the frequency")
     return (x2, w * w * (signal - x1) - 2.0 * damping * w * x2), x1
 
 
@@ -167,6 +169,7 @@ def delayed(signal: Component, x: Any, delay: Component) -> tuple[tuple[Componen
     **Arguments:** `x`: its state or states; `delay` [s], positive. **Returns:** as `low_pass`.
     """
     x = _states(x, (1, 2), "delayed")
+    positive(delay, "delayed: the delay")
     if len(x) == 1:
         return (2.0 / delay * (signal - x[0]),), 2.0 * x[0] - signal
     rate = 12.0 / delay**2 * (signal - x[0] - 0.5 * delay * x[1])
@@ -181,10 +184,10 @@ def _states(x: Any, sizes: tuple[int, ...], name: str) -> tuple[Component, ...]:
 
 
 def _along(vector: Vector, frame: Frame) -> Named:
+    return dict(zip("xyz", vector.components_in(_checked(frame)), strict=True))
+
+
+def _checked(frame: Frame) -> Frame:
     if not isinstance(frame, Frame):
         raise TypeError(f"A sensor measures along the axes of a Frame, got {frame!r}.")
-    return dict(zip("xyz", vector.components_in(frame), strict=True))
-
-
-def _point(part: Point | Body) -> Point:
-    return part.center if isinstance(part, Body) else part
+    return frame

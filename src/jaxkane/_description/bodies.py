@@ -58,6 +58,8 @@ class Body:
             raise TypeError(f"Body: the angular velocity of {name!r} is a Vector, got {angular_velocity!r}.")
         if not isinstance(about, (Point, type(None))):
             raise TypeError(f"Body(..., about=P): the inertia of {name!r} is about a Point, got {about!r}.")
+        if not isinstance(name, str):
+            raise TypeError(f"Body(..., name=...): the name is a text, got {name!r}.")
         self.mass = component(mass)
         self.inertia = _inertia(inertia, name)
         self.is_particle = frame is None and angular_velocity is None
@@ -79,7 +81,17 @@ class Body:
         return f"Body({self.name})"
 
 
+def point_of(part: Point | Body) -> Point:
+    """A point, or the mass centre of a body. **Raises:** `TypeError` for what is neither."""
+    point = part.center if isinstance(part, Body) else part
+    if not isinstance(point, Point):
+        raise TypeError(f"A Point or a Body is asked for, got {part!r}.")
+    return point
+
+
 def _inertia(given: Any, name: str) -> tuple[Triple, Triple, Triple]:
+    if isinstance(given, str) or given is None:
+        raise TypeError(f"{name}: the inertia is three principal moments or a (3, 3) matrix, got {given!r}.")
     inertia: Any = (0.0, 0.0, 0.0) if isinstance(given, (int, float)) and given == 0 else given
     has_length = not hasattr(inertia, "shape") and isinstance(inertia, Sequence)
     shape = (len(inertia), *_inner(inertia)) if has_length else np.shape(inertia)

@@ -7,10 +7,11 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from .. import rotations
-from .._scalars.components import ZERO3, add3, component, cross, matvec, scale3
+from .._scalars.components import ZERO3, add3, component, components, cross, matvec, scale3
 from .._scalars.linear import stack
 from .._scalars.types import Component, Triple
 from ..rotations import Matrix
@@ -117,8 +118,11 @@ class Frame:
             c, s = jnp.cos(angle), jnp.sin(angle)
             rotation = rotations.rodrigues_matrix(direction, c, s)
         else:
-            if axis not in (1, 2, 3):
-                raise ValueError(f"{self.name}.rotate: the axis is 1, 2, 3 or a unit Vector, got {axis!r}.")
+            if isinstance(axis, bool) or not isinstance(axis, (int, np.integer)) or axis not in (1, 2, 3):
+                raise ValueError(
+                    f"{self.name}.rotate(axis, angle, rate): the axis is the whole number 1, 2 or 3, or a Vector as "
+                    f"{self.name}.vector(0, 1, 1); got {axis!r}."
+                )
             direction = rotations.IDENTITY[axis - 1]
             rotation = rotations.simple_rotation(axis - 1, angle)
         return Frame(name or f"{self.name}'", self, rotation, scale3(rate, direction))
@@ -142,13 +146,13 @@ class Frame:
         - `angular_velocity`: relative to this frame [rad/s]: three components in the new frame, or a Vector.
         """
         axes = rotations.axes_of(sequence)
-        if len(angles) != len(axes):
-            raise ValueError(f"The sequence {sequence!r} takes {len(axes)} angles, got {len(angles)}.")
+        angles = components(angles, len(axes), f"The sequence {sequence!r} takes {len(axes)} angles")
         if (rates is None) == (angular_velocity is None):
             raise ValueError("rotate_sequence takes either the `rates` of the angles or the `angular_velocity`.")
         if rates is None:
-            rotation = rotations.sequence_matrix(sequence, [component(a) for a in angles])
+            rotation = rotations.sequence_matrix(sequence, angles)
             return self._oriented(rotation, angular_velocity, name)  # type: ignore[arg-type]
+        rates = components(rates, len(axes), f"The sequence {sequence!r} takes {len(axes)} rates")
         frame = self
         for axis, angle, rate in zip(axes, angles, rates, strict=True):
             frame = frame.rotate(axis + 1, angle, rate)
@@ -169,9 +173,7 @@ class Frame:
         - `angular_velocity`: relative to this frame [rad/s]: three components in the new frame, or a Vector. None for a
             fixed rotation, as of a sensor on its body; the norm of its parameters is of no account.
         """
-        if len(parameters) != 4:
-            raise ValueError(f"Euler parameters are four numbers, the scalar last; got {len(parameters)}.")
-        e = [component(x) for x in parameters]
+        e = components(parameters, 4, "Euler parameters are four numbers, the scalar last")
         if angular_velocity is None:
             e = rotations.normalized(e)
         return self._oriented(
@@ -184,9 +186,7 @@ class Frame:
         **Arguments:** `rotation_vector`: three components in this frame [rad], its length the angle, right-hand about
         its direction; smooth at zero, so that a fit can start there.
         """
-        if len(rotation_vector) != 3:
-            raise ValueError(f"A rotation vector has three components, got {len(rotation_vector)}.")
-        e = rotations.of_rotation_vector([component(x) for x in rotation_vector])
+        e = rotations.of_rotation_vector(components(rotation_vector, 3, "A rotation vector has three components"))
         return self._oriented(rotations.euler_parameters_matrix(e), ZERO3, name)
 
     def rotate_by(
@@ -200,6 +200,8 @@ class Frame:
             the new one. `q` is any pytree of floats.
         - `t`, `q`, `q_dot`: time [s], the function's variables, and their rates.
         """
+        if not callable(orientation):
+            raise TypeError(f"rotate_by: the orientation is a function (t, q) -> (3, 3), got {orientation!r}.")
         R, R_dot = value_and_rate(lambda t, q: jnp.asarray(orientation(t, q)), t, q, q_dot)  # (3,3) (3,3)
         if R.shape != (3, 3):
             raise ValueError(f"rotate_by: the orientation must be a (3, 3) matrix, got {R.shape}.")
@@ -213,9 +215,7 @@ class Frame:
         if isinstance(omega, Vector):
             frame._spin = omega.components_in(frame)
         else:
-            if len(omega) != 3:
-                raise ValueError(f"An angular velocity has three components, got {len(omega)}.")
-            frame._spin = tuple(component(w) for w in omega)  # type: ignore[assignment]
+            frame._spin = components(omega, 3, "An angular velocity has three components")  # type: ignore[assignment]
         return frame
 
     def matrix(self, other: Frame) -> Float[Array, "3 3"]:

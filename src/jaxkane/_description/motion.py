@@ -70,6 +70,12 @@ class Motion:
         points: Mapping[str, Point] | None = None,
         frames: Mapping[str, Frame] | None = None,
     ):
+        for what, given, kind in (("bodies", bodies, Body), ("constraints", constraints, (float, int, Vector))):
+            if not isinstance(given, (kind, Iterable)) or isinstance(given, str):
+                raise TypeError(f"Motion(bodies, constraints): the {what} are a list, got {given!r}.")
+        for what, given in (("points", points), ("frames", frames)):
+            if not isinstance(given, (Mapping, type(None))):
+                raise TypeError(f"Motion: the {what} are a dict by name, as {{'P': P}}; got {given!r}.")
         self.bodies: tuple[Body, ...] = (bodies,) if isinstance(bodies, Body) else tuple(bodies)
         if not self.bodies:
             raise ValueError("A Motion needs at least one Body.")
@@ -152,6 +158,8 @@ def _kind_of(part: Body | Point | Frame) -> str:
 
 def weight(motion: Motion, gravity: Vector) -> tuple[Force, ...]:
     """The weight of every body of a motion; `gravity` [m/s^2] is a Vector such as `9.81 * N.z`."""
+    if not isinstance(motion, Motion):
+        raise TypeError(f"weight(motion, gravity): the first argument is a Motion, got {motion!r}.")
     return tuple(Force(body.mass * gravity, body.center) for body in motion.bodies)
 
 

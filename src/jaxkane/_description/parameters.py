@@ -44,6 +44,8 @@ def parameter(
     """
     if not isinstance(unit, str):
         raise TypeError(f'parameter(unit="N m"): a unit is a text for tables, got {unit!r}.')
+    if not isinstance(shape, (tuple, type(None))):
+        raise TypeError(f"parameter(shape=(3,)): a shape is a tuple of whole numbers, got {shape!r}.")
     if default is dataclasses.MISSING:
         return eqx.field(converter=to_float, metadata={"jaxkane": ParameterInfo(positive, shape or (), unit, within)})
     # A copy, as NumPy: a list that is changed later must not change the default, and JAX must not start yet.

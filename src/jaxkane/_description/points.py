@@ -101,6 +101,8 @@ class Point:
         - `t`, `q`, `q_dot`: time [s], the function's variables, and their rates.
         - `frame`: by default the inertial frame. This point must be fixed in it.
         """
+        if not callable(position):
+            raise TypeError(f"Point.located: the position is a function (t, q) -> three components, got {position!r}.")
         frame = frame or self.velocity.frame.root
         r, r_dot = value_and_rate(lambda t, q: jnp.stack([jnp.asarray(x, float) for x in position(t, q)]), t, q, q_dot)
         return self.moving(frame.vector(*r), frame.vector(*r_dot), frame, name)

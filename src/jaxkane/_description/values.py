@@ -18,11 +18,12 @@ class Values(Sequence[Component]):
 
         q[0], q["roll"]; q["e1":"e4"], of which both ends are meant; q["x", "y"]; q[3:7]; a, b = q; "roll" in q
 
-    Arithmetic gives arrays; `jnp.asarray(q)` is one, for all else. The items may be exact Python floats, which is how a
-    structural zero reaches a description.
+    Arithmetic and comparisons, `==` too, go number by number and give arrays; `jnp.asarray(q)` is one, for all else.
+    The items may be exact Python floats, which is how a structural zero reaches a description.
     """
 
     __slots__ = ("_items", "names")
+    __hash__ = None  # type: ignore[assignment]  # as of arrays, which are compared number by number
 
     def __init__(self, items: Iterable[Component], names: Sequence[str] = ()):
         self._items = tuple(items)
@@ -81,7 +82,13 @@ class Values(Sequence[Component]):
 
 def _elementwise(name: str) -> Callable[..., Array]:
     def operator(self: Values, other: Any) -> Array:
-        return getattr(self.__jax_array__(), name)(jnp.asarray(other))
+        try:
+            array = jnp.asarray(other)
+        except (TypeError, ValueError):
+            raise TypeError(
+                f"Values are numbers, and meet numbers and arrays alone; got {other!r}. One of them is q['name']."
+            ) from None
+        return getattr(self.__jax_array__(), name)(array)
 
     return operator
 
@@ -89,5 +96,5 @@ def _elementwise(name: str) -> Callable[..., Array]:
 for _name in ("add", "sub", "mul", "truediv", "floordiv", "mod", "pow", "matmul"):
     setattr(Values, f"__{_name}__", _elementwise(f"__{_name}__"))
     setattr(Values, f"__r{_name}__", _elementwise(f"__r{_name}__"))
-for _name in ("lt", "le", "gt", "ge"):
+for _name in ("eq", "ne", "lt", "le", "gt", "ge"):
     setattr(Values, f"__{_name}__", _elementwise(f"__{_name}__"))

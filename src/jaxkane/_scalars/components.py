@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -24,17 +25,40 @@ def component(value: Component) -> Component:
         return value
     if isinstance(value, (int, np.number)) and not isinstance(value, bool):
         return float(value)
-    if isinstance(value, np.ndarray):
-        value = jnp.asarray(value)
-    shape = getattr(value, "shape", None)
-    if shape != ():
-        raise TypeError(f"A vector's component must be one number, got {_describe(value)}.")
+    shape, kind = getattr(value, "shape", None), getattr(getattr(value, "dtype", None), "kind", "")
+    if shape != () or kind in tuple("cUSOmM"):
+        raise TypeError(f"A component, an angle, a rate or a mass must be one number, got {_described(value, shape)}")
+    return jnp.asarray(value) if isinstance(value, np.ndarray) else value
+
+
+def components(values: Any, n: int, what: str) -> tuple[Component, ...]:
+    """`n` numbers in a sequence as components; `what` stands before what is there instead."""
+    return tuple(component(x) for x in several(values, n, what))
+
+
+def several(values: Any, n: int, what: str) -> tuple[Any, ...]:
+    """`n` items of a sequence; `what` stands before what is there instead."""
+    if isinstance(values, str) or not hasattr(values, "__iter__") or getattr(values, "shape", None) == ():
+        raise TypeError(f"{what}, got {values!r}.")
+    items = tuple(values)
+    if len(items) != n:
+        raise ValueError(f"{what}, got {len(items)}.")
+    return items
+
+
+def positive(value: Component, what: str) -> Component:
+    """`value`, refused where it is a number that is not positive."""
+    if is_exact(component(value)) and not value > 0:
+        raise ValueError(f"{what} is {value}: it is positive.")
     return value
 
 
-def _describe(value) -> str:
-    shape = getattr(value, "shape", None)
-    return repr(value) if shape is None else f"an array of shape {shape}"
+def _described(value: Any, shape: Any) -> str:
+    if shape:
+        return f"an array of shape {shape}: take one entry, as a[0]."
+    if isinstance(value, str):
+        return f"{value!r}: by name it is q[{value!r}], u[{value!r}] or inputs[{value!r}]."
+    return f"{value!r}."
 
 
 def is_exact(a: Component) -> bool:

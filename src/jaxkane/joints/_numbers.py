@@ -14,8 +14,8 @@ from .._scalars.types import Triple
 def unit_vector(axis: Any, name: str) -> Triple:
     """A direction as three floats of length 1; what is zero or one but for rounding is made so."""
     a = exact_numbers(axis, f"The axis of {name!r}")
-    length = float(np.linalg.norm(a)) if a.shape == (3,) else np.nan
-    if not (np.isfinite(length) and length > 0.0):
+    length = float(np.linalg.norm(a)) if a.shape == (3,) else 0.0
+    if not length > 0.0:
         raise ValueError(f"The axis of {name!r} is three numbers that are not all zero, got {axis!r}.")
     return tuple(exact(x) for x in a / length)  # type: ignore[return-value]
 
@@ -23,14 +23,20 @@ def unit_vector(axis: Any, name: str) -> Triple:
 def exact_numbers(values: Any, what: str) -> np.ndarray:
     """Numbers of a structure, by which programs are kept: nothing is differentiated by them.
 
-    **Raises:** `TypeError` for what is traced.
+    **Raises:** `TypeError` for what is traced; `ValueError` for what is no finite number.
     """
     if any(isinstance(x, Tracer) for x in jax.tree.leaves(values)):
         raise TypeError(
             f"{what} is part of the structure, of exact numbers: it cannot be traced, as by jax.jit, jax.grad or "
             "jax.vmap. Places, masses, inertias, gains, dampers and springs can."
         )
-    return np.asarray(values, float)
+    try:
+        numbers = np.asarray(values, float)
+    except (TypeError, ValueError):
+        numbers = np.array(np.nan)
+    if not np.all(np.isfinite(numbers)):
+        raise ValueError(f"{what}: finite numbers are asked for, got {values!r}.")
+    return numbers
 
 
 def exact(x: float) -> float:

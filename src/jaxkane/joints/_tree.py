@@ -65,6 +65,8 @@ def mechanism(
             )
     if isinstance(dependent, str):
         raise TypeError(f"mechanism: `dependent` is a list of names, such as [{dependent!r}]; got {dependent!r}.")
+    if not isinstance(name, str):
+        raise TypeError(f"mechanism: `name` is a text, got {name!r}.")
     values: dict[str, Any] = components("gravity", gravity)
     links = _in_order([_checked(link, Link) for link in links])
     shapes = tuple(_link(link, values) for link in links)
@@ -129,6 +131,8 @@ def _check_name(name: Any, what: str) -> None:
 
 
 def _link(link: Link, values: dict[str, Any]) -> LinkShape:
+    if not isinstance(link.joints, (Joint, list, tuple)):
+        raise TypeError(f"The joints of the link {link.name!r} are a Joint or a list of them, got {link.joints!r}.")
     given = (link.joints,) if isinstance(link.joints, Joint) else tuple(link.joints)
     shapes: list[Shape] = []
     for joint in given:
@@ -213,7 +217,11 @@ def _loop(loop: Any, structure: Structure, joints: Mapping[str, Shape]) -> LoopS
     for end in [loop.first, *([] if loop.second is None else [loop.second])]:
         if not isinstance(joints.get(end), (Hinge, Slide)):
             raise ValueError(f"A coupling is of hinges and sliders; {end!r} is none.")
-    return CouplingShape(loop.first, loop.second, tuple(float(a) for a in loop.coefficients), True)
+    what = f"The coefficients of the coupling of {loop.first!r}"
+    coefficients = tuple(float(a) for a in np.atleast_1d(exact_numbers(loop.coefficients, what)))
+    if not coefficients:
+        raise ValueError(f"{what} are one number at least, got none.")
+    return CouplingShape(loop.first, loop.second, coefficients, True)
 
 
 def _check_names(structure: Structure) -> None:

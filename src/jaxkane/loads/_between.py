@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from .._description.bodies import Body
+from .._description.bodies import Body, point_of
 from .._description.frames import Frame
 from .._description.loads import Force, Torque
 from .._description.points import Point
-from .._description.vectors import Vector
+from .._description.vectors import Vector, check_vector
 from .._scalars.components import component, is_zero
 from .._scalars.types import Component
 from ._laws import coulomb, smooth_abs
@@ -24,7 +24,7 @@ def spring(P: Point | Body, Q: Point | Body, stiffness: Law, length: Component =
     **Arguments:** `stiffness` [N/m], or a function extension [m] -> tension [N]; `length` at rest [m]. A linear spring
     of zero length may shrink to a point, any other may not: its direction is lost there.
     """
-    P, Q, length = _point(P), _point(Q), component(length)
+    P, Q, length = point_of(P), point_of(Q), component(length)
     r = Q.position_from(P)
     if is_zero(length) and not callable(stiffness):
         return _pair(stiffness * r, P, Q)
@@ -38,7 +38,7 @@ def damper(P: Point | Body, Q: Point | Body, damping: Law) -> tuple[Force, Force
 
     **Arguments:** `damping` [N s/m], or a function rate [m/s] -> tension [N].
     """
-    P, Q = _point(P), _point(Q)
+    P, Q = point_of(P), point_of(Q)
     direction = Q.position_from(P).normalize()
     rate = (Q.velocity - P.velocity).dot(direction)
     return _pair(_law(damping, rate) * direction, P, Q)
@@ -46,8 +46,8 @@ def damper(P: Point | Body, Q: Point | Body, damping: Law) -> tuple[Force, Force
 
 def actuator(P: Point | Body, Q: Point | Body, force: Component) -> tuple[Force, Force]:
     """A strut that pushes two points apart with `force` [N], and pulls where it is negative."""
-    P, Q = _point(P), _point(Q)
-    return _pair(-force * Q.position_from(P).normalize(), P, Q)
+    P, Q = point_of(P), point_of(Q)
+    return _pair(-component(force) * Q.position_from(P).normalize(), P, Q)
 
 
 def torsional_spring(
@@ -60,7 +60,7 @@ def torsional_spring(
     **Arguments:** `axis`: a Vector along the hinge, of any length; `angle` of `on` about it from rest, relative to
     `reaction_on` (None: the ground) [rad]; `stiffness` [N m/rad], or a function angle -> torque [N m].
     """
-    return (Torque(-_law(stiffness, angle) * axis.normalize(), on, reaction_on),)
+    return (Torque(-_law(stiffness, angle) * _direction(axis), on, reaction_on),)
 
 
 def torsional_damper(on: Frame | Body, reaction_on: Frame | Body | None, axis: Vector, damping: Law) -> tuple[Torque]:
@@ -70,7 +70,7 @@ def torsional_damper(on: Frame | Body, reaction_on: Frame | Body | None, axis: V
 
     **Arguments:** as `torsional_spring`; `damping` [N m s/rad], or a function rate [rad/s] -> torque [N m].
     """
-    axis = axis.normalize()
+    axis = _direction(axis)
     return (Torque(-_law(damping, _rate(on, reaction_on).dot(axis)) * axis, on, reaction_on),)
 
 
@@ -97,15 +97,15 @@ def friction(
     - `speed` [m/s]: well above it friction is Coulomb's, from which it differs by speed^2 / (2 v^2) of itself; below it
         is viscous, so that nothing sticks: it creeps. The equations become stiff as it falls.
     """
-    P = _point(P)
-    v = P.velocity if Q is None else P.velocity - _point(Q).velocity
+    P = point_of(P)
+    v = P.velocity if Q is None else P.velocity - point_of(Q).velocity
     if normal is not None:
         normal = normal.normalize()
         v = v - v.dot(normal) * normal
     sliding = smooth_abs(v, speed)
     mu = coefficient(sliding) if callable(coefficient) else coefficient
     F = -(mu * normal_force) * (v / sliding)
-    return (Force(F, P),) if Q is None else (Force(F, P), Force(-F, _point(Q)))
+    return (Force(F, P),) if Q is None else (Force(F, P), Force(-F, point_of(Q)))
 
 
 def torsional_friction(
@@ -136,17 +136,18 @@ def drag(
     **Arguments:** `wind`: the fluid's velocity [m/s], a Vector, None for still air; `speed` [m/s]: |v| stands for
     sqrt(v . v + speed^2), whose derivative is finite at rest too: there it is linear + coefficient * speed.
     """
-    P = _point(P)
+    P = point_of(P)
     v = P.velocity if wind is None else P.velocity - wind
-    return (Force(-(linear + coefficient * smooth_abs(v, speed)) * v, P),)
+    return (Force(-(linear + component(coefficient) * smooth_abs(v, speed)) * v, P),)
+
+
+def _direction(axis: Vector) -> Vector:
+    check_vector(axis, "The axis of a hinge")
+    return axis.normalize()
 
 
 def _law(law: Law, x: Component) -> Component:
-    return law(x) if callable(law) else law * x
-
-
-def _point(part: Point | Body) -> Point:
-    return part.center if isinstance(part, Body) else part
+    return law(x) if callable(law) else component(law) * x
 
 
 def _pair(pull: Vector, P: Point, Q: Point) -> tuple[Force, Force]:
@@ -155,4 +156,7 @@ def _pair(pull: Vector, P: Point, Q: Point) -> tuple[Force, Force]:
 
 
 def _rate(on: Frame | Body, reaction_on: Frame | Body | None) -> Vector:
+    for part in (on, reaction_on):
+        if not isinstance(part, (Frame, Body, type(None))) or on is None:
+            raise TypeError(f"What turns in a hinge is a Frame or a Body, got {part!r}.")
     return on.angular_velocity if reaction_on is None else on.angular_velocity - reaction_on.angular_velocity

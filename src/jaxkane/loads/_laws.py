@@ -16,14 +16,13 @@ from typing import Any
 import jax.numpy as jnp
 
 from .._description.vectors import Vector
-from .._scalars.components import component, is_exact
+from .._scalars.components import positive
 from .._scalars.types import Component
 
 
 def smooth_abs(x: Component | Vector, width: Component) -> Component:
     """sqrt(x^2 + width^2), of a number or a Vector's length: |x| without its corner, too large by `width` at most."""
-    if is_exact(component(width)) and not width > 0:
-        raise ValueError(f"The width of the smoothing is {width}: it is positive, or there is no slope at rest.")
+    positive(width, "The width of the smoothing")  # or there is no slope at rest
     square = x.dot(x) if isinstance(x, Vector) else x * x
     return jnp.sqrt(square + width * width)
 
@@ -65,6 +64,7 @@ def stribeck(
     it falls, the unit of v; `exponent`; `width` of the smoothing, a tenth of `falloff` at most, since the peak is lost
     otherwise.
     """
+    positive(falloff, "stribeck: the rate `falloff`")
     rate = smooth_abs(v, width)
     return (kinetic + (static - kinetic) * jnp.exp(-((rate / falloff) ** exponent))) * v / rate
 

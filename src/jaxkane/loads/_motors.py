@@ -6,7 +6,7 @@ from .._description.bodies import Body
 from .._description.frames import Frame
 from .._description.points import Point
 from .._description.vectors import Vector
-from .._scalars.components import mul
+from .._scalars.components import mul, positive
 from .._scalars.types import Component
 
 
@@ -66,4 +66,5 @@ def dc_motor(voltage: Component, rate: Component, constant: Component, resistanc
     **Arguments:** `voltage` [V]; `rate` of the rotor [rad/s]; `constant` [N m/A], which is that of its voltage too
     [V s/rad]; `resistance` [ohm].
     """
+    positive(resistance, "dc_motor: the resistance")
     return constant * (voltage - constant * rate) / resistance
