@@ -1,7 +1,8 @@
 """Checks of a description and of a state, with errors that name what is wrong. Knows the method; changes nothing.
 
 A description is checked once for each class and structure, at trial states, whether its numbers are known or traced;
-numbers are checked where they are numbers. Under a trace, and in a batch, a bad member gets a status instead.
+numbers are checked where they are numbers, at every call. Under a trace, and in a batch, a bad member gets a status
+instead.
 """
 
 from __future__ import annotations
