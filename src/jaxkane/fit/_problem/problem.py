@@ -97,10 +97,17 @@ class Problem:
         if asked.processes:
             check_same(model, windows)
         problem = cls(model, windows, windows.by_trial, trials, places, asked)
-        with contextlib.suppress(NoConfiguration):  # a fit says of which windows
-            first = jax.tree.map(lambda x: x[0], windows)
-            model.consistent(first, problem.start.z[0], problem.start.x)  # which checks the system there
+        problem.check_system(problem.start)
         return problem.finer(problem.start) if problem.chooses_steps else problem
+
+    def check_system(self, point: Unknowns) -> None:
+        """Refuse a description that contradicts itself, and bodies that cannot be, where the first window starts.
+
+        Where the constraints cannot be met there is nothing to check: a fit says of which windows.
+        """
+        first = jax.tree.map(lambda x: x[0], self.windows)
+        with contextlib.suppress(NoConfiguration):
+            self.model.consistent(first, point.z[0], point.x)  # which checks the system there
 
     @property
     def cost_name(self) -> str:

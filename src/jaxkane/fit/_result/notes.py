@@ -5,10 +5,8 @@ from __future__ import annotations
 import warnings
 from typing import TYPE_CHECKING
 
-import jax
 import numpy as np
 
-from ..._method.checks import check_system
 from .._data.windows import state_names
 from .._problem.bijections import PossibleBody
 from .._problem.problem import Problem
@@ -214,13 +212,11 @@ def doubled_trials(problem: Problem) -> list[str]:
 
 def impossible_bodies(fit: Fit) -> list[str]:
     """Bodies of the fitted system that no body can be."""
-    window = jax.tree.map(lambda x: x[0], fit.problem.windows)
-    n_q = len(fit.problem.system.coordinates)
     notes = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         try:
-            check_system(fit.system, window.t[0], window.start[:n_q])
+            fit.problem.check_system(fit.point)
         except ValueError as error:
             notes.append(f"Not a possible body: {error}")
     return notes + [f"Not a possible body: {warning.message}" for warning in caught]
