@@ -155,7 +155,7 @@ def test_where_constraints_do_not_determine_a_coordinate_there_is_no_linear_mode
     ring = RodOnPin(length=0.6)
     model = lambda q, dependent: linearize(ring, jk.State(q, jnp.zeros(1)), dependent=dependent, steady=False)  # noqa: E731
     for q, dependent in (([0.6, y], "x"), ([y, 0.6], "y")):
-        with pytest.raises(ValueError, match=f"RodOnPin: .* do not determine {dependent} to first order"):
+        with pytest.raises(ValueError, match=f"do not determine {dependent} to|cannot be solved for {dependent}_dot"):
             model(jnp.array(q), (dependent,))
         assert np.isnan(jax.jit(lambda q: model(q, (dependent,)).A)(jnp.array(q))).all()  # noqa: B023
 

@@ -93,6 +93,8 @@ def exact(value: float | bool, dtype: str) -> Any:
 def table() -> dict[str, Any]:
     """SymPy's functions for the operations of graphs, for real and finite numbers."""
     sp = imported()
+    # What is divided by zero is in no order with anything; SymPy raises there.
+    ordered = lambda f: lambda x, y: sp.false if sp.nan in (x, y) else f(x, y)  # noqa: E731
     own = "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp log erf sqrt floor".split()
     return {name: getattr(sp, name) for name in own} | {
         **OPERATORS,
@@ -107,10 +109,10 @@ def table() -> dict[str, Any]:
         "min": sp.Min,
         "eq": sp.Eq,
         "ne": sp.Ne,
-        "lt": sp.Lt,
-        "le": sp.Le,
-        "gt": sp.Gt,
-        "ge": sp.Ge,
+        "lt": ordered(sp.Lt),
+        "le": ordered(sp.Le),
+        "gt": ordered(sp.Gt),
+        "ge": ordered(sp.Ge),
         "and": sp.And,
         "or": sp.Or,
         "xor": sp.Xor,
