@@ -216,3 +216,18 @@ def test_grids_that_are_refused():
         jk.sweep.grid(lam=[[1.0], [2.0]])
     with pytest.raises(ValueError, match="elbow_torque is a column"):
         jk.sweep.sweep(PENDULUM, REST, TS, lambda t, state: {"elbow_torque": t}, table={"elbow_torque": [1.0, 2.0]})
+
+
+def test_a_column_that_a_function_reads_takes_no_place_by_its_name():
+    table = {"theta1": [0.1, 0.2], "mass": [1.0, 2.0]}
+    twice = jk.sweep.sweep(
+        lambda row: dataclasses.replace(PENDULUM, mass=2.0 * row["mass"]),
+        lambda system, row: jk.State(jnp.stack([2.0 * row["theta1"], jnp.zeros(())]), jnp.zeros(2)),
+        TS,
+        table=table,
+        **STEPS,
+    )
+    state = jk.State(np.array([0.4, 0.0]), np.zeros(2))
+    alone = jk.simulate(dataclasses.replace(PENDULUM, mass=4.0), state, TS, **STEPS)
+    np.testing.assert_allclose(twice["theta1"][:, 0], [0.2, 0.4])
+    np.testing.assert_allclose(twice.q[1], alone.q, atol=1e-12)

@@ -95,6 +95,7 @@ def critical_speeds(
     motion; under a trace all are NaN then.
     """
     values, at, states, groups = family_of(system, _default_grid(system, values, motion), motion, states)
+    values = (np.sort if is_concrete(values) else jnp.sort)(values)  # directions are those of a rising parameter
     if len(values) < 2:
         names = eigenvalues(system, values, motion, states=states, modes=modes).modes
         empty, none = jnp.zeros(0, values.dtype), jnp.full((), jnp.nan, values.dtype)

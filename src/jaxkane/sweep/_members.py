@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -49,9 +49,16 @@ class Row(Mapping[str, Any]):
     def __repr__(self) -> str:
         return f"Row({', '.join(self.columns)})"
 
-    def of(self, names: Iterable[str]) -> dict[str, Any]:
-        """The numbers that take their place by name, which no function need read."""
-        return {name: self.columns[name] for name in names if name in self.columns}
+    def of(self, names: Iterable[str], but: Collection[str] = ()) -> dict[str, Any]:
+        """The numbers that take their place by name, which no function need read: `but` those that one did read."""
+        return {name: self.columns[name] for name in names if name in self.columns and name not in but}
+
+    def given_to(self, function: Callable[..., Any], *arguments: Any) -> tuple[Any, set[str]]:
+        """What a function makes of this row, and the names that it read: what these mean is its own affair."""
+        row = Row(self.columns)
+        made = function(*arguments, row)
+        self.read |= row.read
+        return made, row.read
 
 
 class _Leaf:
@@ -112,17 +119,21 @@ def start_of(own: Tree, shared: Tree, t: Any) -> State:
 
 def _system(system: Any, row: Row) -> tuple[System, dict[str, Any]]:
     """The system of a row, and the parameters that were set by name."""
+    read: set[str] = set()
     if not isinstance(system, System):
-        system = system(row)
-    given = row.of(name for name, _, _ in parameters_in(system))
+        system, read = row.given_to(system)
+    given = row.of((name for name, _, _ in parameters_in(system)), but=read)
     return with_parameters(system, given), given
 
 
 def _start(system: Any, state: Any, row: Row, t: Any) -> State:
     system, parameters = _system(system, row)
-    state = as_state(system, state if isinstance(state, State) else state(system, row))
+    read: set[str] = set()
+    if not isinstance(state, State):
+        state, read = row.given_to(state, system)
+    state = as_state(system, state)
     groups = (system.coordinates, system.speeds, system.states)
-    q, u, x = map(row.of, groups)
+    q, u, x = (row.of(names, but=read) for names in groups)
     parts = zip((state.q, state.u, state.x), (q, u, x), groups, strict=True)
     state = State(*(_set(values, given, names) for values, given, names in parts))
     if system.dependent_coordinates and (q or parameters):  # they follow from the others

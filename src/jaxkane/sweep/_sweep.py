@@ -62,7 +62,8 @@ def sweep(
         depend on the others are found anew (`assemble`). Columns of text are labels, which have names of their own.
     - `state` may be a function (system, row) -> State, and `system` a function (row) -> System, for columns with
         other names: `lambda bicycle, row: assemble(bicycle, {}, {"rear_wheel_rate": -row["speed"] / bicycle.rR})`. They
-        are compiled, with `system` as this member has it.
+        are compiled, with `system` as this member has it. What a function makes stands as it is: a column that it reads
+        takes no place there by its name.
     - `reduce`: a function of one member's `Trajectory` that gives the few arrays to keep, such as
         `lambda ride: {"largest": jnp.max(jnp.abs(ride["roll"]))}`; it is compiled too. A million motions need not be
         kept to look at a million numbers.
