@@ -208,6 +208,34 @@ def test_a_critical_value_among_those_given_and_one_beside_none():
     assert critical_speeds(Pushed(), jnp.zeros(0), at).values.shape == (0,)
 
 
+def sprung(system, spring):
+    return dataclasses.replace(system, spring=spring), jk.State(jnp.zeros(1), jnp.zeros(1))
+
+
+def test_critical_values_do_not_depend_on_the_order_of_those_given():
+    up = critical_speeds(Pushed(), jnp.array([-20.0, -3.0, 5.0]), sprung)
+    np.testing.assert_allclose(up.values, [-LIMIT], rtol=1e-12)
+    for values in ([5.0, -3.0, -20.0], [-3.0, 5.0, -20.0]):
+        found = critical_speeds(Pushed(), jnp.array(values), sprung)
+        np.testing.assert_array_equal(found.values, up.values)
+        np.testing.assert_array_equal(found.direction, [-1])
+    for function in (critical_speeds, eigenvalues):
+        with pytest.raises(TypeError, match="must be real numbers, got 'fast'"):
+            function(Pushed(), "fast", sprung)
+        with pytest.raises(ValueError, match=r"a row \(m,\), got the shape \(1, 3\)"):
+            function(Pushed(), jnp.zeros((1, 3)), sprung)
+
+
+def test_eigenvalues_that_cease_to_grow_without_passing_the_axis_are_told():
+    """Without a damper it becomes neutral; with a spring that passes its limit flatly, the crossing is too flat."""
+    with pytest.warns(UserWarning, match="falls by 1 more than pass"):
+        found = critical_speeds(Pushed(damper=0.0), jnp.array([-20.0, -3.0, 5.0]), sprung)
+    assert not found.values.size
+    flat = lambda system, x: sprung(system, (x - 0.3) ** 3 - LIMIT)  # noqa: E731
+    with pytest.warns(UserWarning, match="falls by 1 more than pass"):
+        critical_speeds(Pushed(), jnp.array([-1.0, 0.0, 1.0]), flat)
+
+
 def test_a_motion_that_is_not_steady_has_no_linear_model_under_a_trace():
     """It was the model of an instant, without a word: now NaN in its row, as it is an error alone."""
     tilts = jnp.array([0.0, 0.4, np.pi])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ _GRID = np.linspace(0.0, 20.0, 201)  # [m/s]
 _HALVINGS = 32  # of a step between two values
 _TRIALS = 200  # between two values
 _NEUTRAL = 1e-10  # of the largest eigenvalue: what neither grows nor decays has a real part of rounding errors
+_NOISE = 1e-13  # the same where they stand alone
 _MOST_NEUTRAL = 1e-7  # the same where eigenvalues coalesce, which magnifies rounding errors
 
 
@@ -79,9 +81,9 @@ def critical_speeds(
     pair) passes it once, which is bisected to rounding. How far eigenvalues move while A changes by dA is told by
     Gershgorin's discs of X^-1 dA X about them, X being the eigenvectors.
 
-    **Arguments:** as `eigenvalues`, and there must be a steady motion between the `values` too; for the bicycle they
-    are 0 to 20 m/s by 0.1 by default. `most`: how many are kept under a trace, where their number cannot be known; the
-    rest are NaN.
+    **Arguments:** as `eigenvalues`; the `values` in any order, and there must be a steady motion between them too; for
+    the bicycle they are 0 to 20 m/s by 0.1 by default. `most`: how many are kept under a trace, where their number
+    cannot be known; the rest are NaN.
 
     **Returns:** `CriticalSpeeds`. They are differentiable in the parameters of the system by the implicit function
     theorem,
@@ -91,11 +93,14 @@ def critical_speeds(
     with NaN where the mode has no derivative because it coalesces with another. Names are those of `eigenvalues`; under
     a trace a value is NaN where the name of its mode is not clear.
 
+    **Warns:** where more eigenvalues come to grow, or cease to, than pass the axis: a motion without damping becomes
+    neutral, and crosses nothing. Under a trace there is no warning.
+
     **Raises:** `ValueError` as `eigenvalues`, and where some of `values`, or something between them, has no steady
     motion; under a trace all are NaN then.
     """
     values, at, states, groups = family_of(system, _default_grid(system, values, motion), motion, states)
-    values = (np.sort if is_concrete(values) else jnp.sort)(values)  # directions are those of a rising parameter
+    values = jnp.sort(values)  # directions are those of a rising parameter
     if len(values) < 2:
         names = eigenvalues(system, values, motion, states=states, modes=modes).modes
         empty, none = jnp.zeros(0, values.dtype), jnp.full((), jnp.nan, values.dtype)
@@ -118,6 +123,15 @@ def critical_speeds(
             )
         if known.count > most:
             return critical_speeds(system, values, motion, states=states, modes=modes, most=2 * int(known.count))
+        if known.unexplained:
+            n = int(known.unexplained)
+            warnings.warn(
+                f"critical_speeds({type(system).__name__}): between {float(values[0]):.6g} and {float(values[-1]):.6g} "
+                f"the number of eigenvalues that grow {'rises' if n > 0 else 'falls'} by {abs(n)} more than pass the "
+                "imaginary axis: some only reach it, as where nothing damps, or at an end of the values, or pass it "
+                "too flatly to be found. jaxkane.stability.eigenvalues shows where.",
+                stacklevel=2,
+            )
         rows = np.flatnonzero(known.there)
         order: Any = rows[np.argsort(np.asarray(known.values)[rows])]
     else:
@@ -147,6 +161,7 @@ class _Crossings(NamedTuple):
     is_missing: Any
     missing: Any
     clear: Any
+    unexplained: Any
 
 
 class _Brackets(NamedTuple):
@@ -202,7 +217,21 @@ def _crossings(system, values, motion, states, groups, most: int):
     there = is_one & inside
     direction = jnp.where(brackets.rises, 1, -1)
     counted = brackets.count, brackets.is_missing, brackets.missing
-    return _Crossings(roots, frequency, direction, column, there, *counted, clear), kept[0]
+    passed = jnp.sum(jnp.where(there, direction * jnp.where(frequency > 0, 2, 1), 0))
+    unexplained = _unexplained(spectra.values[0], spectra.values[-1], passed)
+    return _Crossings(roots, frequency, direction, column, there, *counted, clear, unexplained), kept[0]
+
+
+def _unexplained(first, last, passed):
+    """How many more eigenvalues grow at the last value than at the first one, less those that passed the axis."""
+
+    def growing(x):
+        size = x.real / jnp.max(jnp.abs(x))
+        return jnp.sum(size > _MOST_NEUTRAL), jnp.sum(size > _NOISE)  # between them, it may be rounding errors
+
+    (few, many), (few_last, many_last) = growing(first), growing(last)
+    least, most = few_last - many, many_last - few
+    return jnp.clip(0, least - passed, most - passed)
 
 
 def _bracketed(at, p, A, x, most: int) -> _Brackets:

@@ -19,6 +19,7 @@ from .._description.parameters import parameter_info
 from .._description.system import State, System
 from .._description.units import unit_of, units_of
 from .._method.checks import is_concrete
+from .._method.values import is_numeric
 from .._scalars.nan import nan_where
 from .._scalars.versions import compiled
 from ..catalog import WhippleBicycle
@@ -165,7 +166,11 @@ def family_of(system: System, values: Any, motion: MotionAt, states: Sequence[st
         motion = _Fixed(fixed)
     if values is None:
         raise ValueError("Give the values of the parameter, e.g. speeds jnp.linspace(0.0, 10.0, 201).")
+    if not is_numeric(values):
+        raise TypeError(f"The values of the parameter must be real numbers, got {values!r}.")
     values = jnp.atleast_1d(jnp.asarray(values, dtype=float))
+    if values.ndim > 1:
+        raise ValueError(f"The values of the parameter are a row (m,), got the shape {values.shape}.")
     groups = _Groups(getattr(system, "mode_groups", {})) if is_straight else None
     return values, motion, None if states is None else as_names(states), groups
 
