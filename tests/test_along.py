@@ -14,6 +14,7 @@ import jaxkane as jk
 from jaxkane import fit
 from jaxkane._simulation.one_motion import refuse_other_system
 from jaxkane.catalog import DoublePendulum
+from jaxkane.joints import Link, hinge, mechanism
 
 TS = jnp.linspace(0.0, 2.0, 5)
 
@@ -118,6 +119,20 @@ def test_forces_of_constraint_along_a_trajectory_that_ended():
     slope = jax.jit(jax.grad(first))
     np.testing.assert_allclose(slope(1.0, cut), slope(1.0, ride), rtol=1e-13)
     assert np.isfinite(slope(1.0, cut))
+
+
+def test_equations_without_a_solution_are_an_error_at_one_time():
+    """Three hinges that lock: every function that solves for accelerations says so, and is NaN under a trace."""
+    hinges = [hinge("x", (1.0, 0.0, 0.0)), hinge("y", (0.0, 1.0, 0.0)), hinge("z")]
+    system = mechanism([Link("a", None, hinges, mass=1.0, inertia=(0.1, 0.1, 0.1))], name="Gimbals")
+    locked, still = [0.0, 0.5 * np.pi, 0.0], [0.0, 0.0, 0.0]
+    for f in (jk.accelerations, jk.speed_rates, jk.constraint_forces):
+        with pytest.raises(ValueError, match="a combination of x_rate, z_rate moves no mass"):
+            f(system, 0.0, locked, still)
+    under_jit = jax.jit(lambda q: jk.speed_rates(system, 0.0, q, still)["x_rate"])
+    assert np.isnan(under_jit(jnp.array(locked)))
+    with pytest.raises(ValueError, match="a combination of x_rate, z_rate moves no mass"):
+        jk.stability.linearize(system, jk.State(jnp.array(locked), jnp.array(still)))
 
 
 class Coupled(jk.System):

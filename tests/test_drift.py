@@ -142,6 +142,13 @@ def spatial_pendulum(**parameters):
     return system, jnp.array(entry.q), jnp.array(entry.u)
 
 
+def test_the_best_dependent_speeds_are_asked_for_at_numbers():
+    """NaN in a residual's rows would pass for a good choice, or for singular values that do not converge."""
+    bicycle = jk.catalog.WhippleBicycle.benchmark()
+    with pytest.raises(ValueError, match="WhippleBicycle: q is not finite: steer"):
+        jk.best_dependent_speeds(bicycle, 0.0, jnp.zeros(8).at[2].set(jnp.nan))
+
+
 @pytest.mark.slow
 def test_a_massless_speed_is_refused_by_name():
     # Kamman, Unit 5, Example 6, note 2: a line has no moment of inertia about itself

@@ -251,6 +251,20 @@ def test_a_coupling_is_a_gear():
     np.testing.assert_allclose(alpha, [2.0 / (0.2 + 9 * 0.03)], rtol=1e-13)
 
 
+def test_a_coupling_is_of_two_joints_and_exact_numbers():
+    """Text that reads as a number is none, here and in a gear; `dependent` is refused where nothing is solved."""
+    gears = [Link(n, None, hinge(n), mass=1.0, inertia=(0, 0, I)) for n, I in (("g", 0.2), ("p", 0.03))]
+    for coefficients in ("12", ("0", "2"), (0.0, np.nan), ()):
+        with pytest.raises(ValueError, match="The coefficients of the coupling of 'p'"):
+            mechanism(gears, loops=[Coupling("p", "g", coefficients)])
+    with pytest.raises(ValueError, match="a joint cannot follow itself"):
+        mechanism(gears, loops=[Coupling("p", "p", (0.0, -3.0))])
+    with pytest.raises(ValueError, match="The gear of 'T': finite numbers are asked for, got '2'"):
+        mechanism(gears, actuators=[Actuator("T", "g", gear="2")])
+    with pytest.raises(ValueError, match="names p, and nothing closes a loop"):
+        mechanism(gears, dependent=("p",))
+
+
 # Structure and parameters
 
 

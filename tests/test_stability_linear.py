@@ -177,6 +177,15 @@ def test_singular_equations_and_derivatives_are_errors():
         linearize(ring, below, outputs={"distance": lambda t, q, u: jnp.sqrt(q["y"])})
 
 
+def test_names_of_a_linear_model_are_known_and_stand_once():
+    ring, below = RodOnPin(length=0.6), jk.State(jnp.array([0.0, 0.6]), jnp.zeros(1))
+    with pytest.raises(ValueError, match="`dependent` names coordinates; it has no z; it has y, x"):
+        linearize(ring, below, dependent=("z",))
+    speed = ring.speeds[0]
+    with pytest.raises(ValueError, match=f"{speed} stands twice in `states`"):
+        linearize(ring, below, states=(speed, speed))
+
+
 def test_transfer_function_and_bode_agree(at_four):
     rtol = 1e-9
     w = np.logspace(-1, 2, 40)

@@ -108,7 +108,7 @@ def best_dependent_speeds(system: System, t: Component, q: Any) -> DependentSpee
 
     **Returns:** `DependentSpeeds`.
 
-    **Raises:** `ValueError` for a system without dependent speeds.
+    **Raises:** `ValueError` for a system without dependent speeds, and coordinates that are not finite.
     """
     check_is_system(system)
     name = type(system).__name__
@@ -117,6 +117,9 @@ def best_dependent_speeds(system: System, t: Component, q: Any) -> DependentSpee
     refuse_incomplete(system, q, {})
     q = as_array(q, system.coordinates, f"{name}: q")
     check_time(name, t)
+    wrong = [c for c, x in zip(system.coordinates, np.asarray(q), strict=True) if not np.isfinite(x)]
+    if wrong:
+        raise ValueError(f"{name}: q is not finite: {', '.join(wrong)}.")
     C, c0 = (np.asarray(x, dtype=float) for x in constraint_rows(system, jnp.asarray(t, q.dtype), q))
     return dependent_speeds_from(C, c0, (*system.speeds, *system.dependent_speeds), system.dependent_speeds, name)
 

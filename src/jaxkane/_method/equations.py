@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -73,12 +74,20 @@ def accelerations(system: System, t: Component, q: Any, u: Any, inputs: InputVal
     cannot be solved for the dependent speeds; under a trace these are NaN or infinite.
     """
     arrays = _arrays(system, t, q, u, inputs)
-    _, u_dot = motion_rates(*arrays)
-    if is_concrete(u_dot) and not np.all(np.isfinite(u_dot)):
+    return finite_or_explained(motion_rates(*arrays)[1], arrays)
+
+
+def finite_or_explained(result: Any, arrays: Any) -> Any:
+    """`result` of the checked arguments `arrays`, as it is under a trace, and where nothing explains that it is NaN.
+
+    **Raises:** `ValueError` where it is not finite and the equations of motion have no solution.
+    """
+    numbers = jax.tree.leaves(result)
+    if is_concrete(*numbers) and not all(np.all(np.isfinite(x)) for x in numbers):
         wrong = diagnosis(*arrays)
         if wrong:
             raise ValueError(wrong)
-    return u_dot
+    return result
 
 
 def mass_matrix(system: System, t: Component, q: Any, u: Any, inputs: InputValues = None) -> Float[Array, "n n"]:
@@ -177,7 +186,7 @@ def dependent_accelerations(
 ) -> Float[Array, " k"]:
     """u_dep_dot (k,) = J u_dot - C_dep^-1 (dc/dt at frozen speeds). Arguments as `equations_of_motion`."""
     arrays = _arrays(system, t, q, u, inputs)
-    return _dependent_accelerations(*arrays, motion_rates(*arrays)[1])
+    return finite_or_explained(_dependent_accelerations(*arrays, motion_rates(*arrays)[1]), arrays)
 
 
 @fused

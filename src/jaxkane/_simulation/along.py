@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from .._description.frames import Frame
 from .._description.points import Point
 from .._description.system import System
-from .._method.equations import InputValues, _arrays, _dependent_accelerations
+from .._method.equations import InputValues, _arrays, _dependent_accelerations, finite_or_explained
 from .._method.kane import Instant
 from .._method.outputs import outputs_at
 from .._method.rates import motion_rates
@@ -35,10 +35,12 @@ def along(f: Callable[..., Any], system: System, t: Any, q: Any, u: Any, inputs:
     NaN, with its derivatives, where a trajectory has ended. There `f` never sees the NaN of the trajectory, which would
     spoil the derivatives of all other times.
 
-    **Raises:** `ValueError` for the trajectory of another system; `TypeError` for one beside `q`, `u` or `inputs`.
+    **Raises:** `ValueError` for the trajectory of another system, and at one time where equations without a solution
+    make the result NaN; `TypeError` for a trajectory beside `q`, `u` or `inputs`.
     """
     if not isinstance(t, Trajectory):
-        return f(*_arrays(system, t, q, u, inputs))
+        arrays = _arrays(system, t, q, u, inputs)
+        return finite_or_explained(f(*arrays), arrays)
     if not (q is None and u is None and inputs is None):
         raise TypeError("A Trajectory holds coordinates, speeds and inputs already: give the system and it alone.")
     refuse_other_system(type(system).__name__, system, t)

@@ -13,7 +13,7 @@ import numpy as np
 import scipy.linalg
 from jax.core import Tracer
 
-from .._common.lookup import not_there
+from .._common.lookup import as_names, not_there
 from ._mechanism import Field, Mechanism, class_of
 from ._shapes import Shape
 from ._structure import Structure
@@ -23,7 +23,10 @@ def with_dependent(
     structure: Structure, fields: tuple[Field, ...], values: dict[str, Any], dependent: Sequence[str] | None
 ) -> Structure:
     norms = [joint.name + joint.coordinates[-1][0] for joint in structure.joints if len(joint.coordinates) > 1]
+    dependent = None if dependent is None else as_names(dependent)
     if not (structure.loops or structure.couplings):
+        if dependent:
+            raise ValueError(f"`dependent` names {', '.join(dependent)}, and nothing closes a loop: leave it out.")
         return structure._replace(dependent_coordinates=tuple(norms))
     with jax.ensure_compile_time_eval():  # trial numbers are numbers under `jax.jit` too
         return _with_dependent(structure, fields, values, dependent, norms)

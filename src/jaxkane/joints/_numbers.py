@@ -31,12 +31,12 @@ def exact_numbers(values: Any, what: str) -> np.ndarray:
             "jax.vmap. Places, masses, inertias, gains, dampers and springs can."
         )
     try:
-        numbers = np.asarray(values, float)
+        numbers = np.asarray(values)
     except (TypeError, ValueError):
-        numbers = np.array(np.nan)
-    if not np.all(np.isfinite(numbers)):
+        numbers = np.array(None)
+    if numbers.dtype.kind not in "iuf" or not np.all(np.isfinite(numbers)):  # text that reads as a number is none
         raise ValueError(f"{what}: finite numbers are asked for, got {values!r}.")
-    return numbers
+    return numbers.astype(float)
 
 
 def exact(x: float) -> float:

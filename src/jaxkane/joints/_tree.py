@@ -217,6 +217,8 @@ def _loop(loop: Any, structure: Structure, joints: Mapping[str, Shape]) -> LoopS
     for end in [loop.first, *([] if loop.second is None else [loop.second])]:
         if not isinstance(joints.get(end), (Hinge, Slide)):
             raise ValueError(f"A coupling is of hinges and sliders; {end!r} is none.")
+    if loop.first == loop.second:
+        raise ValueError(f"Coupling({loop.first!r}, {loop.second!r}): a joint cannot follow itself; name two.")
     what = f"The coefficients of the coupling of {loop.first!r}"
     coefficients = tuple(float(a) for a in np.atleast_1d(exact_numbers(loop.coefficients, what)))
     if not coefficients:

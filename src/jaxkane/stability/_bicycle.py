@@ -40,8 +40,9 @@ def straight_ahead(bicycle: WhippleBicycle, speed: Component) -> State | SteadyM
         )
     if "rear_wheel_rate" not in bicycle.speeds:
         raise ValueError(
-            f"{type(bicycle).__name__}: a part holds its speed, so that there is no family over speeds. Leave it out, "
-            "as in bicycle.with_parts(drive=None): the torque that straight riding takes is found."
+            f"{type(bicycle).__name__}: riding straight on at a speed needs rear_wheel_rate among the independent "
+            f"speeds, which are {', '.join(bicycle.speeds)}. Where a part holds its speed, leave it out, as in "
+            "bicycle.with_parts(drive=None): the torque that straight riding takes is found."
         )
     v = jnp.asarray(speed, dtype=jnp.result_type(bicycle.rR))
     wheel = bicycle.speeds.index("rear_wheel_rate")

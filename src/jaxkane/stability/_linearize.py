@@ -122,17 +122,15 @@ def linearize(
     n_h = jax.eval_shape(lambda q: configuration_residual(system, t, q), q).shape[0]
     dependent = system.dependent_coordinates if dependent is None else as_names(dependent)
     check_dependent(system, dependent, n_h)
+    if is_concrete(*origin):
+        check_state(*origin, steady)
     kept = _states(system, states, dependent)
     rows = tuple(kept) if outputs is None else as_names(outputs)
     functions = dict(outputs) if isinstance(outputs, Mapping) else {}
     own = output_names(system) if outputs is not None else ()
     known = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.states, *own)
     refuse_unknown(rows, (*known, *functions), f"{name}: outputs are functions, or by name; it has no output", "it has")
-    if is_concrete(*origin):
-        check_state(*origin, steady)
-        wrong = jnp.array(False)
-    else:
-        wrong = is_wrong(*origin, steady)
+    wrong = jnp.array(False) if is_concrete(*origin) else is_wrong(*origin, steady)
     # Numbers in the place of NaN, which would spoil the gradients of callers who do not use it (0 * NaN).
     at = tuple(jnp.where(jnp.all(jnp.isfinite(y)), y, 0.1) for y in (t, q, u, x, w))
     model, follows = _derivatives((system, *at), _Choice(dependent, kept, rows), functions)
@@ -170,6 +168,9 @@ def _states(system: System, states: Sequence[str] | None, dependent: tuple[str, 
             f"{type(system).__name__}: {', '.join(unknown)} cannot be a state; "
             f"{hint(unknown, known, 'independent coordinates, speeds and states of the first order are')}"
         )
+    twice = [k for k in known if states.count(k) > 1]
+    if twice:
+        raise ValueError(f"{type(system).__name__}: {', '.join(twice)} stands twice in `states`.")
     return states
 
 

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._common.lookup import refuse_unknown
 from .._description.system import System
 from .._method.description_facts import configuration_residual
 from .._method.diagnose import diagnosis
@@ -41,10 +42,12 @@ def _still(system: System) -> np.ndarray:
 
 def check_dependent(system: System, dependent: Sequence[str], n_h: int) -> None:
     """**Raises:** `ValueError` where not as many coordinates are named as `n_h` configuration constraints determine."""
-    if len(dependent) != n_h:
+    name = type(system).__name__
+    refuse_unknown(dependent, system.coordinates, f"{name}: `dependent` names coordinates; it has no", "it has")
+    if len(set(dependent)) != n_h:
         raise ValueError(
-            f"{type(system).__name__}: {n_h} configuration constraints determine as many coordinates, but "
-            f"{len(dependent)} are named ({', '.join(dependent) or 'none'}). Give linearize(..., dependent=(...)) "
+            f"{name}: {n_h} configuration constraints determine as many coordinates, but "
+            f"{len(set(dependent))} are named ({', '.join(dependent) or 'none'}). Give linearize(..., dependent=(...)) "
             f"{n_h} of {', '.join(system.coordinates)}."
         )
 
