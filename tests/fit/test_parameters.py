@@ -7,7 +7,7 @@ import pytest
 from systems import POSED, TRIAL, Track
 
 import jaxkane as jk
-from jaxkane.fit import Free, Gain, Intensity, LeastSquares, Problem, Sigma, fit
+from jaxkane.fit import Free, Gain, Intensity, LeastSquares, Problem, Sigma, Trial, fit, profile
 from jaxkane.fit._analysis.plausible import plausible_of
 from jaxkane.fit._problem.bijections import Interval, log_gaussian_mass
 from jaxkane.fit._problem.entries import parameters_of
@@ -19,6 +19,9 @@ class Springs(eqx.Module):
     others: jk.Scalar = jk.parameter(positive=True)  # [N/m], three of them
     matrix: jk.Scalar = jk.parameter()  # [N/m]
     stiffness: jk.Scalar = jk.parameter(4.0, positive=True)  # [N/m]
+    tilt: jk.Scalar = jk.parameter(0.5, within=(-1.5, 1.5))  # [rad]
+    grip: jk.Scalar = jk.parameter(1.0, positive=True, within=(-1.0, 2.0))
+    dry: jk.Scalar = jk.parameter(0.0, within=(0.0, np.inf))  # [N]
     offset: jk.Scalar = jk.parameter(0.0)  # [m]
     inputs = ("push",)
 
@@ -144,3 +147,54 @@ def test_a_specification_does_not_follow_what_its_caller_changes():
     again = problem.with_trials(TRIAL).parameters
     assert again.names == ("gain",)
     assert float(again.prior_deviation[0]) == 0.1
+
+
+@pytest.mark.parametrize(
+    ("free", "bounds"),
+    [
+        ("tilt", (-1.5, 1.5)),
+        ("grip", (0.0, 2.0)),
+        (Free("tilt", bounds=(-9.0, None)), (-1.5, 1.5)),
+        (Free("tilt", bounds=(0.1, 9.0)), (0.1, 1.5)),
+        (Free("tilt", bounds=(None, None)), (-np.inf, np.inf)),
+        (Free("stiffness", bounds=(-1.0, 9.0)), (0.0, 9.0)),
+        (Free("offset", start=0.2, tied={"tilt": -3.0}), (-0.5, 0.5)),
+        (Free("offset", start=0.2, tied={"stiffness": 1.0}), (0.0, np.inf)),
+    ],
+)
+def test_a_search_stays_inside_what_was_declared(free, bounds):
+    interval = parameters_of(SYSTEM, free).bijections[0]
+    assert (float(interval.lower), float(interval.upper)) == pytest.approx(bounds)
+    # What was declared is no prior: only two bounds that were given are.
+    given = isinstance(free, Free) and free.bounds is not None and None not in free.bounds
+    assert np.isfinite(interval.log_prior_constants(np.zeros(1), np.full(1, np.inf))[0]) == given
+
+
+def test_a_start_outside_what_was_declared_is_refused():
+    with pytest.raises(ValueError, match=r"tilt starts at 3, which is not inside its bounds \(-1.5, 1.5\)"):
+        parameters_of(SYSTEM, Free("tilt", start=3.0))
+    with pytest.raises(ValueError, match="what is tied to it"):
+        parameters_of(SYSTEM, Free("offset", start=3.0, tied={"tilt": 1.0}))
+
+
+def test_a_start_on_what_was_declared_is_searched_from_inside():
+    assert float(parameters_of(SYSTEM, "dry").values(jnp.zeros(1))[0]) == pytest.approx(0.1)
+
+
+class Limited(Track):
+    """The gain is at most 0.7."""
+
+    gain: jk.Scalar = jk.parameter(0.5, within=(0.0, 0.7))  # [1/kg]
+
+
+def test_a_fit_whose_data_want_more_ends_at_what_was_declared():
+    T = np.linspace(0.0, 1.0, 11)
+    of_drift, of_gain = T**2 / 2, T**3 / 6  # x, of a drift and of a push that grows by one a second
+    trial = Trial(T, {"x": 0.3 * of_drift + of_gain}, {"push": T}, sigma=0.001, initial={"x": 0.0, "x_dot": 0.0})
+    found = fit(Limited(), trial, ("gain", "drift"), optimizer=LeastSquares(), simulation=POSED["simulation"])
+    assert found.status == "converged"
+    assert found.identifiability.at_bound == ("gain",)
+    best = 0.3 + 0.3 * (of_drift @ of_gain) / (of_drift @ of_drift)  # with a gain of 0.7
+    assert found.estimates == pytest.approx({"gain": 0.7, "drift": best}, abs=1e-4)
+    with pytest.raises(ValueError, match="do not determine gain"):
+        profile(found, "gain")

@@ -13,7 +13,7 @@ from ..._common.lookup import refuse_unknown
 from ..._description.system import System
 from .._problem.arguments import Specification
 from .._problem.entries import as_items, parameters_of
-from .._problem.free import Delay
+from .._problem.free import Delay, Free, Shared
 from .._problem.names import Names, deviations_by_name
 from .._result.result import Fit
 
@@ -105,14 +105,14 @@ def _candidate(fit: Fit, each: Any) -> Candidate:
 
 def _without_bounds_at_start(system: System, item: Any) -> tuple[Any, dict[str, Bounds]]:
     """The same to be searched for on both sides, where it starts on a bound; and that bound."""
-    bounds = getattr(item, "bounds", None)
-    if bounds is None:
+    named = Free(item) if isinstance(item, str) or callable(item) else item
+    if not isinstance(named, (Free, Shared)):
         return item, {}
-    free = parameters_of(system, dataclasses.replace(item, bounds=(None, None)))
-    start = np.asarray(free.start)
-    if not any(np.any(start == end) for end in bounds if end is not None):
+    free = parameters_of(system, named)
+    ends = [(float(one.lower), float(one.upper)) for one in free.bijections]
+    if not any(start in pair for start, pair in zip(np.asarray(free.start), ends, strict=True)):
         return item, {}
-    return dataclasses.replace(item, bounds=(None, None)), dict.fromkeys(free.names, tuple(bounds))
+    return dataclasses.replace(named, bounds=(None, None)), dict(zip(free.names, ends, strict=True))
 
 
 def _named(system: System, item: Any) -> tuple[str, ...]:

@@ -50,7 +50,7 @@ def laplace(fit: Fit) -> Laplace:
     `Free.scale` nor the choice of bounds for the search's sake changes it (MacKay, Bayesian interpolation, Neural
     Computation 4, 1992). Exact where the motion is linear in all unknowns.
 
-    What a parameter's prior is: the Gaussian it was given, cut off at its bounds; without one, with two bounds, the
+    What a parameter's prior is: the Gaussian it was given, cut off at its bounds; without one, with two `bounds`, the
     uniform density between them; else it is improper, and the evidence is NaN. Starts and biases without a standard
     deviation have a density of one per unit: compare only models that have the same of these, or give deviations.
 

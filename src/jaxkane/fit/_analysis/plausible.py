@@ -45,7 +45,7 @@ def plausible_of(parameters: Parameters, said: Mapping[str, Any]) -> Plausible:
                 ranges[name] = checked_range(name, said[name], start)
             elif math.isfinite(deviation):
                 ranges[name] = mean - DEVIATIONS * deviation, mean + DEVIATIONS * deviation
-            elif isinstance(bijection, Interval) and all(bijection.bounded):
+            elif isinstance(bijection, Interval) and all(bijection.bounded) and bijection.uniform:
                 low, high = float(bijection.lower), float(bijection.upper)
                 ranges[name] = low + 1e-3 * (high - low), high - 1e-3 * (high - low)
         first += size

@@ -67,6 +67,8 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
             pin = (there.estimates[name] - value) / (1e-4 * error)
             cost = there.cost - pin**2 + ((there.estimates[name] - prior[0]) / prior[1]) ** 2
             found[float(value)], point = (cost, there.estimates), there.point
+    if not found:
+        raise ValueError(f"{name}: no fit converges with it held at {best:.6g} or near: {fit.message}.")
     values = np.array(sorted(found))
     costs = np.array([found[v][0] for v in values])
     # The cost rises by one at the error that `sigma` as it was given would leave.

@@ -61,8 +61,8 @@ def suspects(
     - `depth`: how many may be taken, one after the other. `refits`: how many that are nested are fitted in each round;
         None for all that the data can distinguish, 0 for none at all. `level`: of the test.
     - `plausible`: by name, (lower, upper), or a share of the start such as 0.2. Else what `Candidate.plausible` says,
-        three deviations of a prior, and two bounds, of which it must stay away. A `Free` with bounds that starts on one
-        of them, as friction at zero, is searched for on both sides and believed on one.
+        three deviations of a prior, and two bounds, of which it must stay away. What starts on a bound, given
+        or declared, as friction at zero, is searched for on both sides and believed on one.
     - `folds`: trials that are left out together, as in `cross_validate`. `progress`: a bar.
 
     **Returns:** `Suspects`: print it for the table.

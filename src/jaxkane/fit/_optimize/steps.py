@@ -121,9 +121,9 @@ def refined(
         tried = moved(point, still, eliminate(at.blocks, damping))
         there = linearize(problem, tried)
         after = np.full_like(before, np.inf) if there is None else _by_owner(there, owner, len(before))
-        better = after <= before
+        better = (after <= before) & (after < np.inf)
         damping = np.where(better, damping / 10, np.maximum(10 * damping, 1e-2))
-        gained = float(np.sum((before - after)[better]))
+        gained = float(np.sum(before[better] - after[better]))
         if there is not None and better.any():
             point, at = _chosen(better, owner, (tried, there), (point, at))
             before = np.where(better, after, before)

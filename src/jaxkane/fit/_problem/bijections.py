@@ -20,7 +20,9 @@ class Interval(eqx.Module):
 
         start + s x,   lower + (start - lower) exp(c x),   lower + (upper - lower) logistic(c x + d)
 
-    with c such that the slope at the start is `scale`: a positive parameter moves as start exp(x).
+    with c such that the slope at the start is `scale`: a positive parameter moves as start exp(x). `uniform`: whether
+    both bounds were given for this search, and so, without a prior, a uniform density between them. What a parameter
+    was declared to be at least and at most keeps a search inside, and is no prior.
     """
 
     start: Float[Array, ""]
@@ -28,6 +30,7 @@ class Interval(eqx.Module):
     upper: Float[Array, ""]
     scale: Float[Array, ""]
     bounded: tuple[bool, bool] = eqx.field(static=True)
+    uniform: bool = eqx.field(static=True, default=True)
 
     def __call__(self, x: Float[Array, " 1"]) -> Float[Array, " 1"]:
         start, scale = self.start, self.scale
@@ -53,13 +56,13 @@ class Interval(eqx.Module):
 
     def log_prior_constants(self, mean: np.ndarray, deviation: np.ndarray) -> np.ndarray:
         """log p(value) + (value - mean)^2 / (2 deviation^2), (1,): the Gaussian is cut off at the bounds; without one
-        (an infinite deviation) the density is uniform between both bounds, or NaN where one is open."""
+        (an infinite deviation) the density is uniform between both bounds that were given, else NaN."""
         lower, upper = float(self.lower), float(self.upper)
         if np.all(np.isfinite(deviation)):
             return _gaussian_constant(deviation) - log_gaussian_mass(
                 (lower - mean) / deviation, (upper - mean) / deviation
             )
-        return np.array([-np.log(upper - lower) if all(self.bounded) else np.nan])
+        return np.array([-np.log(upper - lower) if all(self.bounded) and self.uniform else np.nan])
 
     def _share(self, value: Array) -> tuple[Array, Array]:
         width = self.upper - self.lower

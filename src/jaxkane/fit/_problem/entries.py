@@ -13,7 +13,7 @@ import numpy as np
 
 from ..._common.lookup import as_names, hint, refuse_unknown
 from ..._common.real_numbers import real_number
-from ..._description.parameters import declared, leaf_name, learned_part
+from ..._description.parameters import ANY, ParameterInfo, declared, leaf_name, learned_part
 from ..._description.system import System
 from ..._description.units import unit_of, units_of
 from ..._method.outputs import output_names
@@ -25,6 +25,9 @@ from .parameters import Entry, Parameters, checked_prior
 START_INSIDE = 0.1
 """How far inside a bound that was given a search begins which would start on it, in scales (or of the bounds' width,
 where that is less)."""
+
+
+POSITIVE = ParameterInfo(True, ())
 
 
 def as_items(free: Any) -> list[Any]:
@@ -92,7 +95,7 @@ def _of_all_trials(system: System, item: Shared, noise: Mapping[str, float] | No
     label = f"{kind} of {'start of ' if where == 'start' else ''}{item.what}"
     unit = item.unit or (units_of(system).get(item.what, "") if isinstance(item, Offset) else "")
     entry = Entry(item.name or label, unit, role=(f"{kind} of {where}", item.what))
-    return _scalar(entry, item, item.start, positive=False)
+    return _scalar(entry, item, item.start, ANY)
 
 
 def _of_noise(system: System, item: Intensity | Sigma, noise: Mapping[str, float] | None, channels: Sequence[str]):
@@ -111,15 +114,15 @@ def _of_noise(system: System, item: Intensity | Sigma, noise: Mapping[str, float
     if not 0 < start < math.inf:
         raise ValueError(f"{kind} of {what} starts at {start}: it is searched for among positive numbers.")
     if item.bounds is not None:
-        lower, upper = _checked_bounds(f"{kind} of {what}", item.bounds, positive=True)
-        if lower is not None and lower < 0:
+        lower, upper = _checked_bounds(f"{kind} of {what}", item.bounds)
+        if -math.inf < lower < 0:
             raise ValueError(f"{kind} of {what}: nothing below zero is possible, got the bounds {item.bounds}.")
-        item = dataclasses.replace(item, bounds=(lower or 0.0, upper))
+        item = dataclasses.replace(item, bounds=(max(lower, 0.0), upper))
     known = unit_of(what, units_of(system)) if kind == "intensity" else ""
     known = f"({known})" if set(known) & set(" /^") else known
     unit = (f"{known}^2 s" if what in system.inputs else f"{known}^2/s") if known else ""
     entry = Entry(item.name or f"{kind} of {what}", item.unit or unit, role=(kind, what))
-    return _scalar(entry, item, start, positive=True)
+    return _scalar(entry, item, start, POSITIVE)
 
 
 def where_of(system: System, item: Shared) -> Where:
@@ -149,6 +152,7 @@ def where_of(system: System, item: Shared) -> Where:
 def _of_leaves(system: System, item: Free):
     chosen, leaves = find_leaves(system, item.where)
     followers = [follower for name, factor in item.tied.items() for follower in _followers(system, name, factor)]
+    tied = [(declared(system, leaves[i][0]), factor) for i, _, factor in followers]
     parts = []
     for i in chosen:
         path, leaf = leaves[i]
@@ -162,7 +166,7 @@ def _of_leaves(system: System, item: Free):
             info = declared(system, path)
             targets = ((i, place, 1.0), *followers)
             entry = Entry(label, item.unit or info.unit, targets, part=learned_part(system, path))
-            parts.append(_scalar(entry, item, start, info.positive))
+            parts.append(_scalar(entry, item, start, info, tied))
     return parts
 
 
@@ -177,34 +181,57 @@ def _followers(system: System, name: str, factor: float) -> list[tuple[int, int,
     return [(i, place, float(factor)) for i in chosen for place in range(leaves[i][1].size)]
 
 
-def _scalar(entry: Entry, item: Free | Shared | Intensity | Sigma, start: Any, positive: bool):
+def _scalar(
+    entry: Entry,
+    item: Free | Shared | Intensity | Sigma,
+    start: Any,
+    info: ParameterInfo,
+    tied: Sequence[tuple[ParameterInfo, float]] = (),
+):
+    """Of one number: its declaration, and those of what follows it with a factor."""
     name = entry.name
     start = real_number(start, f"{name}: `start`")
-    lower, upper = _checked_bounds(name, item.bounds, positive)
     if not math.isfinite(start):
         raise ValueError(f"{name} starts at {start}.")
+    given = _checked_bounds(name, item.bounds)
+    lower, upper = given
+    if item.bounds is None or given != (-math.inf, math.inf):  # (None, None) asks for a search without bounds
+        limits = [_limits(what, factor) for what, factor in ((info, 1.0), *tied)]
+        lower, upper = max(lower, *(least for least, _ in limits)), min(upper, *(most for _, most in limits))
     prior = checked_prior(name, item.prior) if item.prior is not None else None
     scale = abs(start) or (prior[1] if prior is not None and math.isfinite(prior[1]) else 1.0)
     if item.scale is not None:
         scale = real_number(item.scale, f"{name}: `scale`")
         if not 0 < scale < math.inf:
             raise ValueError(f"{name}: the scale must be positive and finite, got {item.scale}.")
-    ends = (-math.inf if lower is None else lower, math.inf if upper is None else upper)
     begin = start
-    if item.bounds is not None and start in ends:  # where the bijection has no slope
-        begin += (1 if start == ends[0] else -1) * START_INSIDE * min(scale, ends[1] - ends[0])
-    if not ends[0] < begin < ends[1]:
+    if start in (lower, upper) and info.allows(start):  # where the bijection has no slope
+        begin += (1 if start == lower else -1) * START_INSIDE * min(scale, upper - lower)
+    if not lower < begin < upper:
         raise ValueError(
-            f"{name} starts at {start:.6g}, which is not inside its bounds ({lower}, {upper}): give it another `start`."
+            f"{name} starts at {start:.6g}, which is not inside its bounds ({lower:g}, {upper:g}), those that it and "
+            "what is tied to it were declared with among them: give it another `start`."
         )
-    numbers = [jnp.asarray(float(x), jnp.result_type(float)) for x in (begin, *ends, scale)]
-    return [entry], Interval(*numbers, bounded=(lower is not None, upper is not None)), [start], [scale], [prior]
+    numbers = [jnp.asarray(float(x), jnp.result_type(float)) for x in (begin, lower, upper, scale)]
+    bounded = (lower > -math.inf, upper < math.inf)
+    bijection = Interval(*numbers, bounded=bounded, uniform=bool(np.all(np.isfinite(given))))
+    return [entry], bijection, [start], [scale], [prior]
 
 
-def _checked_bounds(name: str, bounds: Any, positive: bool) -> tuple[float | None, float | None]:
-    """(lower, upper), None where there is none; infinite ones are none."""
+def _limits(info: ParameterInfo, factor: float) -> tuple[float, float]:
+    """Between which numbers x the parameter factor * x can be."""
+    least, most = info.within
+    least = max(least, 0.0) if info.positive else least
+    if not factor:
+        return -math.inf, math.inf
+    ends = least / factor, most / factor
+    return min(ends), max(ends)
+
+
+def _checked_bounds(name: str, bounds: Any) -> tuple[float, float]:
+    """(lower, upper), infinite where there is none."""
     if bounds is None:
-        return (0.0, None) if positive else (None, None)
+        return -math.inf, math.inf
     if isinstance(bounds, str) or not hasattr(bounds, "__len__") or len(bounds) != 2:
         raise ValueError(f"{name}: `bounds` are (lower, upper), of which either may be None; got {bounds!r}.")
     ends = zip(bounds, (-math.inf, math.inf), strict=True)
@@ -213,7 +240,7 @@ def _checked_bounds(name: str, bounds: Any, positive: bool) -> tuple[float | Non
         raise ValueError(
             f"{name}: nothing lies between the bounds {bounds}; they are (lower, upper), or None for none."
         )
-    return (None if lower == -math.inf else lower), (None if upper == math.inf else upper)
+    return lower, upper
 
 
 _PRODUCTS = ((0, 1), (0, 2), (1, 2))

@@ -21,9 +21,10 @@ class Free:
     - `where`: a name ("IBxx"), a path ("body.mass"), or a function from the system to a leaf as in `eqx.tree_at`. A
         leaf with axes counts as its entries.
     - `start`: the initial guess; by default the system's value.
-    - `bounds`: (lower, upper) of which either may be None; it never leaves them. By default (0, None), a logarithmic
-        scale, where the parameter is declared positive, and none elsewhere. A start on one of the bounds that are given
-        is where the search begins a tenth of the scale inside: `Free("dry", bounds=(0.0, None), scale=0.5)` at 0.05.
+    - `bounds`: (lower, upper) of which either may be None; it never leaves them, nor what it and those tied to it were
+        declared to be, `positive` (on a logarithmic scale) and `within`. (None, None) searches without any bounds. A
+        start on one of them is where the search begins a tenth of the scale inside: `Free("dry", bounds=(0.0, None),
+        scale=0.5)` at 0.05.
     - `scale`: how much is a lot, in the parameter's unit; by default the start's magnitude; for a start at
         zero the prior's deviation, or 1: give it there, since what is called undetermined is counted in it.
     - `prior`: (mean, standard deviation) of what was measured elsewhere.
