@@ -446,6 +446,23 @@ def test_an_event_that_asks_for_the_value_of_what_is_traced():
         dropped(1.0, system=Deciding())
 
 
+@pytest.mark.parametrize(
+    ("events", "message"),
+    [
+        (lambda q: {"low": q["h"] < 0.5}, "The event 'low' is a truth value"),
+        (lambda q: {"low": jk.falling(q["h"] < 0.5)}, "The event 'low' is a truth value"),
+        (lambda q: [q["h"]], "events returns quantities by name, a dict"),
+    ],
+)
+def test_events_that_are_no_quantities_by_name(events, message):
+    class Watching(Particle):
+        def events(self, t, q, u):
+            return events(q)
+
+    with pytest.raises(TypeError, match=message):
+        dropped(1.0, system=Watching())
+
+
 def test_samples_that_are_none():
     times = np.array([0.0, 1.0, 2.0])
     for ts, values, error in (

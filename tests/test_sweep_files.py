@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 import threading
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -222,6 +223,15 @@ def damaged(data, how):
         middle = len(data) // 2
         return data[:middle] + bytes(x ^ 255 for x in data[middle : middle + 64]) + data[middle + 64 :]
     return {"empty": b"", "zeros": bytes(len(data)), "cut": data[:-30], "text": b"thesis"}[how]
+
+
+def test_a_folder_is_known_again_whatever_the_order_of_the_columns(tmp_path):
+    columns = {"mass": [1.0, 2.0], "x": [0.1, 0.2]}
+    first = run(tmp_path / "sweep", table=columns)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        again = run(tmp_path / "sweep", table=dict(reversed(columns.items())))
+    np.testing.assert_array_equal(again.q, first.q)
 
 
 def test_damaged_chunks_are_computed_again_with_one_warning(copy, finished, rides):

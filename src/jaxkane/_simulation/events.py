@@ -5,6 +5,7 @@ Knows descriptions and their rates; knows no integrator.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -51,14 +52,22 @@ def _is_read(program: Any, variable: Any) -> bool:
 
 
 def _events(system: System, t: Component, q: Any, u_all: Any, dtype: Any) -> dict[str, Any]:
-    found = dict(system.events(t, q, u_all))
-    return {name: _as_float(found[name], dtype) for name in sorted(found)}
+    found = system.events(t, q, u_all)
+    if not isinstance(found, Mapping):
+        raise TypeError(f"{type(system).__name__}.events returns quantities by name, a dict; got {found!r}.")
+    return {name: _as_float(name, found[name], dtype) for name in sorted(found)}
 
 
-def _as_float(event: Any, dtype: Any) -> Any:
+def _as_float(name: str, event: Any, dtype: Any) -> Any:
     if isinstance(event, Crossing):
-        return Crossing(jnp.asarray(event.value, dtype=dtype), event.direction)
-    return jnp.asarray(event, dtype=dtype)
+        return Crossing(_as_float(name, event.value, dtype), event.direction)
+    value = jnp.asarray(event)
+    if value.dtype == bool:
+        raise TypeError(
+            f"The event {name!r} is a truth value, which passes no zero: give the signed, smooth quantity that "
+            "vanishes, as q['h'] for q['h'] < 0; jaxkane.falling and jaxkane.rising say in which direction it counts."
+        )
+    return value.astype(dtype)
 
 
 class Watched(NamedTuple):

@@ -30,7 +30,7 @@ class Folder:
 
     def __init__(self, path: str | os.PathLike[str], manifest: Mapping[str, Any]):
         self.path = Path(path).expanduser()
-        self.sweep = digest(json.dumps(manifest))
+        self.sweep = digest(json.dumps(manifest, sort_keys=True))  # columns have no order
         self.damaged: list[str] = []
         if self.path.exists() and not self.path.is_dir():
             raise ValueError(f"{self.path} is a file: `folder` is the name of a folder.")
