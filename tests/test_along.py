@@ -184,7 +184,7 @@ OTHERS = {
 @pytest.mark.parametrize("kind", OTHERS)
 def test_the_motion_of_another_system_has_other_names(ride, kind):
     other = type("Other", (Disc,), OTHERS[kind])()
-    with pytest.raises(ValueError, match=f"f: the trajectory has the {kind}: .*: it is the motion of another system"):
+    with pytest.raises(ValueError, match=f"f: the motion has the {kind}: .*: it is the motion of another system"):
         refuse_other_system("f", other, ride)
 
 

@@ -249,3 +249,39 @@ def test_linear_model_of_a_steady_turn_is_the_return_map():
     columns = [(after(h * e) - after(-h * e)) / (2 * h) for e in np.eye(5)]
     exact = scipy.linalg.expm(np.asarray(model.A) * 0.5)
     np.testing.assert_allclose(np.stack(columns, axis=1), exact, atol=atol * np.abs(exact).max())
+
+
+CASES = {
+    "a class for a system": (lambda: linearize(type(BIKE), AHEAD), TypeError, "instance of a System"),
+    "text for a motion": (lambda: linearize(BIKE, "ahead"), TypeError, "a motion is a State"),
+    "another system's steady motion": (lambda: linearize(BIKE, AT_REST), ValueError, "motion of another system"),
+    "a state named twice": (lambda: linearize(BIKE, AHEAD, states=("roll", "roll")), ValueError, "roll stands twice"),
+    "an output that is two numbers": (
+        lambda: linearize(BIKE, AHEAD, outputs={"both": lambda t, q, u: jnp.stack([q["roll"], q["steer"]])}),
+        TypeError,
+        "output 'both' must be one number",
+    ),
+    "text for a speed": (lambda: straight_ahead(BIKE, "4"), TypeError, "speed is one number"),
+    "texts for values": (lambda: stability.eigenvalues(BIKE, ["4", "5"]), TypeError, "values of the parameter must be real"),
+    "values in two axes": (lambda: stability.eigenvalues(BIKE, np.ones((2, 2))), ValueError, "are a row"),
+    "none are kept": (lambda: stability.critical_speeds(BIKE, most=0), ValueError, "at least one; got 0"),
+    "a state for a steady motion": (lambda: stability.family(BIKE, AHEAD, towards={}), TypeError, "is a SteadyMotion"),
+    "a family of another system": (
+        lambda: stability.family(BIKE, AT_REST, towards={"roll": 1.0}),
+        ValueError,
+        "motion of another system",
+    ),
+    "text for a system": (lambda: stability.equilibrium("bicycle"), TypeError, "instance of a System"),
+    "no system": (lambda: stability.cyclic_coordinates(None), TypeError, "instance of a System"),
+}
+AHEAD = straight_ahead(BIKE, 4.0)
+AT_REST = stability.SteadyMotion(
+    *(jnp.zeros(n) for n in (2, 2, 0, 0)), {}, 0.0, 0.0, (("theta1", "theta2"), ("theta1_dot", "theta2_dot"), (), ())
+)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_is_no_argument_is_refused_in_words(case):
+    call, error, words = CASES[case]
+    with pytest.raises(error, match=words):
+        call()

@@ -11,8 +11,9 @@ from .._method.values import check_is_system
 from .trajectory import Trajectory
 
 
-def refuse_other_system(label: str, system: System, trajectory: Trajectory) -> None:
-    """Every function of a system and a trajectory asks this first; `label` is the one that was called, for the message.
+def refuse_other_system(label: str, system: System, trajectory: Any) -> None:
+    """Every function of a system and a trajectory, or a steady motion, asks this first; `label` is the one that was
+    called, for the message.
 
     **Raises:** `ValueError` where the names differ, by which a motion is read; `TypeError` for what is no system.
     """
@@ -22,7 +23,7 @@ def refuse_other_system(label: str, system: System, trajectory: Trajectory) -> N
     for kind, of_trajectory, own in (*groups, ("inputs", sorted(trajectory.inputs), sorted(system.inputs))):
         if tuple(of_trajectory) != tuple(own):
             raise ValueError(
-                f"{label}: the trajectory has the {kind}: {', '.join(of_trajectory) or 'none'}, the system has: "
+                f"{label}: the motion has the {kind}: {', '.join(of_trajectory) or 'none'}, the system has: "
                 f"{', '.join(own) or 'none'}: it is the motion of another system."
             )
 

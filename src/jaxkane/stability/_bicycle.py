@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 from .._description.system import State
 from .._method.checks import is_concrete
 from .._method.equations import equations_of_motion
+from .._method.values import is_one_number
 from .._scalars.nan import nan_where
 from .._scalars.types import Component
 from ..catalog import WhippleBicycle
@@ -44,6 +45,8 @@ def straight_ahead(bicycle: WhippleBicycle, speed: Component) -> State | SteadyM
             f"speeds, which are {', '.join(bicycle.speeds)}. Where a part holds its speed, leave it out, as in "
             "bicycle.with_parts(drive=None): the torque that straight riding takes is found."
         )
+    if not is_one_number(speed):
+        raise TypeError(f"straight_ahead({type(bicycle).__name__}): the speed is one number [m/s], got {speed!r}.")
     v = jnp.asarray(speed, dtype=jnp.result_type(bicycle.rR))
     wheel = bicycle.speeds.index("rear_wheel_rate")
     u = jnp.zeros(len(bicycle.speeds), v.dtype).at[wheel].set(-v / bicycle.rR)

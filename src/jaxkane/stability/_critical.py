@@ -99,6 +99,8 @@ def critical_speeds(
     **Raises:** `ValueError` as `eigenvalues`, and where some of `values`, or something between them, has no steady
     motion; under a trace all are NaN then.
     """
+    if isinstance(most, bool) or not isinstance(most, int) or most < 1:
+        raise ValueError(f"critical_speeds: `most` is how many are kept, at least one; got {most!r}.")
     values, at, states, groups = family_of(system, _default_grid(system, values, motion), motion, states)
     values = jnp.sort(values)  # directions are those of a rising parameter
     if len(values) < 2:

@@ -10,6 +10,7 @@ from .._description.system import System
 from .._method.checks import is_concrete
 from .._method.description_facts import configuration_residual
 from .._method.right_hand_side import rates as rates_of
+from .._method.values import check_is_system
 from .._scalars.jax_internals import concretely
 from .._scalars.versions import on_forget, version_of
 
@@ -34,6 +35,7 @@ def cyclic_coordinates(system: System) -> tuple[str, ...]:
 
     **Raises:** `ValueError` where no trial has finite accelerations.
     """
+    check_is_system(system)
     leaves, treedef = jax.tree.flatten(system)
     shapes = tuple((jnp.shape(x), str(jnp.result_type(x))) for x in leaves)
     key = (type(system), str(treedef), shapes, version_of(system))

@@ -19,7 +19,7 @@ from .._description.parameters import parameter_info
 from .._description.system import State, System
 from .._description.units import unit_of, units_of
 from .._method.checks import is_concrete
-from .._method.values import is_numeric
+from .._method.values import check_is_system, is_numeric
 from .._scalars.nan import nan_where
 from .._scalars.versions import compiled
 from ..catalog import WhippleBicycle
@@ -149,6 +149,7 @@ def names_of_modes(
 def family_of(system: System, values: Any, motion: MotionAt, states: Sequence[str] | None):
     """Values, (system, value) -> motion, states, and the groups of states whose modes have names; None: none has."""
     is_straight = False
+    check_is_system(system)
     if motion is None and isinstance(system, WhippleBicycle):
         is_straight, motion = True, straight_ahead
         more = len(system.speeds) > len(WhippleBicycle.speeds) or system.states

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float
 from .._common.lookup import by_name, hint
 from .._description.system import System, names_of
 from .._scalars.versions import compiled
+from .._simulation.one_motion import refuse_other_system
 from ._solve import jacobian
 from ._steady import Problem, SteadyMotion, as_motion
 
@@ -85,6 +86,10 @@ def family(
 
     **Raises:** `ValueError` where the start is not isolated on one curve: it names what moves.
     """
+    label = f"family({type(system).__name__})"
+    if not isinstance(start, SteadyMotion):
+        raise TypeError(f"{label}: the start is a SteadyMotion, as from steady_turn; got {start!r}.")
+    refuse_other_system(label, system, start)
     q, t = start.q, jnp.asarray(start.t, start.q.dtype)
     inputs = {**start.inputs, **{name: start.x[i] for i, name in enumerate(system.states)}}
     find = (*find, *system.states)

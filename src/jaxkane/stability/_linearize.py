@@ -20,12 +20,13 @@ from .._method.diagnose import ROUNDING, diagnosis
 from .._method.equations import dependent_speeds
 from .._method.outputs import output_names, outputs_at
 from .._method.right_hand_side import rates, values_of
-from .._method.values import as_array, checked_inputs, refuse_incomplete
+from .._method.values import as_array, check_is_system, checked_inputs, is_one_number, refuse_incomplete
 from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, solve, stack
 from .._scalars.nan import nan_where
 from .._scalars.types import Component
 from .._scalars.versions import compiled
+from .._simulation.one_motion import refuse_other_system
 from ._cyclic import cyclic_coordinates
 from ._eig import Eig, eig, eigvals
 from ._solve import jacobian
@@ -107,9 +108,13 @@ def linearize(
     NaN there, with their derivatives.
     """
     name = type(system).__name__
+    check_is_system(system)
     if isinstance(motion, SteadyMotion):
+        refuse_other_system(f"linearize({name})", system, motion)
         inputs = motion.inputs if inputs is None else inputs
         t = motion.t if t is None else t
+    elif not isinstance(motion, State):
+        raise TypeError(f"linearize({name}): a motion is a State, as from assemble, or a SteadyMotion; got {motion!r}.")
     refuse_incomplete(system, motion.q, motion.u)
     q = as_array(motion.q, system.coordinates, f"{name}: q")
     u = as_array(motion.u, system.speeds, f"{name}: u")
@@ -217,6 +222,8 @@ def _at_deviation(x, w, at, T, choice: _Choice, functions: dict[str, Callable[..
     for k in choice.outputs:
         if k in functions:
             value = functions[k](t, Values(q, names), Values([known[s] for s in speeds], speeds))
+            if not is_one_number(value):
+                raise TypeError(f"{type(system).__name__}: the output {k!r} must be one number, got {value!r}.")
             y.append(jnp.asarray(value, q.dtype))
         else:
             y.append(known[k])

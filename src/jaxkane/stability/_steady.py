@@ -16,7 +16,7 @@ from .._method.checks import check_system, is_concrete
 from .._method.description_facts import configuration_residual
 from .._method.equations import dependent_speeds
 from .._method.right_hand_side import rates
-from .._method.values import as_array, check_time, checked_values
+from .._method.values import as_array, check_is_system, check_time, checked_values
 from .._scalars.nan import nan_where
 from .._scalars.types import Component
 from .._scalars.versions import compiled
@@ -70,6 +70,7 @@ def equilibrium(
     **Raises:** `ValueError` as `steady_turn`.
     """
     held = hold if isinstance(hold, Mapping) else dict.fromkeys(as_names(hold))
+    check_is_system(system)
     at_rest = dict.fromkeys(system.speeds, 0.0)
     return steady_turn(system, q, None, inputs, hold={**at_rest, **held}, find=find, t=t)
 
@@ -108,6 +109,7 @@ def steady_turn(
     Under a trace the motion is NaN instead.
     """
     name = type(system).__name__
+    check_is_system(system)
     values = dict(hold) if isinstance(hold, Mapping) else dict.fromkeys(as_names(hold))
     q = as_array({} if q is None else q, system.coordinates, f"{name}: q")
     u = as_array({} if u is None else u, system.speeds, f"{name}: u").astype(q.dtype)
