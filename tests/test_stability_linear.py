@@ -262,7 +262,11 @@ CASES = {
         "output 'both' must be one number",
     ),
     "text for a speed": (lambda: straight_ahead(BIKE, "4"), TypeError, "speed is one number"),
-    "texts for values": (lambda: stability.eigenvalues(BIKE, ["4", "5"]), TypeError, "values of the parameter must be real"),
+    "texts for values": (
+        lambda: stability.eigenvalues(BIKE, ["4", "5"]),
+        TypeError,
+        "values of the parameter must be real",
+    ),
     "values in two axes": (lambda: stability.eigenvalues(BIKE, np.ones((2, 2))), ValueError, "are a row"),
     "none are kept": (lambda: stability.critical_speeds(BIKE, most=0), ValueError, "at least one; got 0"),
     "a state for a steady motion": (lambda: stability.family(BIKE, AHEAD, towards={}), TypeError, "is a SteadyMotion"),
