@@ -319,6 +319,8 @@ def test_a_wider_prior_pays_for_itself(evidence):
     assert np.isnan(none.log_evidence)
     assert "any value of gain is as likely" in none.message
     assert none.sample(3)["gain"].shape == (3,)
+    with pytest.raises(ValueError, match="`n` is how many are drawn"):
+        none.sample(-1)
 
 
 def test_what_has_no_influence_takes_no_error_from_the_others():

@@ -83,6 +83,8 @@ def test_options_that_are_none():
     for n in (0, -1):
         with pytest.raises(ValueError, match=rf"`n` is how many initial guesses are tried, one at least; got {n}"):
             multi_start(problem, n)
+    with pytest.raises(ValueError, match="`spread` is how far guesses lie from the first"):
+        multi_start(problem, 2, spread=-1.0)
     with pytest.raises(TypeError, match="save_report takes a Fit, as in save_report"):
         save_report(problem, "fit.html")
     with pytest.raises(TypeError, match=r"`start=` takes a Unknowns, as in start=fit.point"):

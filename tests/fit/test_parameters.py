@@ -7,7 +7,7 @@ import pytest
 from systems import POSED, TRIAL, Track
 
 import jaxkane as jk
-from jaxkane.fit import Free, Gain, Intensity, LeastSquares, Problem, Sigma, Trial, fit, profile
+from jaxkane.fit import Delay, Free, Gain, Intensity, LeastSquares, Offset, Problem, Sigma, Trial, fit, profile
 from jaxkane.fit._analysis.plausible import plausible_of
 from jaxkane.fit._problem.bijections import Interval, log_gaussian_mass
 from jaxkane.fit._problem.entries import parameters_of
@@ -175,6 +175,23 @@ def test_a_start_outside_what_was_declared_is_refused():
         parameters_of(SYSTEM, Free("tilt", start=3.0))
     with pytest.raises(ValueError, match="what is tied to it"):
         parameters_of(SYSTEM, Free("offset", start=3.0, tied={"tilt": 1.0}))
+
+
+@pytest.mark.parametrize(
+    ("free", "message"),
+    [
+        (Free("offset", tied=["tilt"]), "`tied` is a dict from names to factors"),
+        (Gain("push", name=3), "is text, got 3"),
+    ],
+)
+def test_what_is_no_dict_and_no_name_is_refused(free, message):
+    with pytest.raises(TypeError, match=message):
+        parameters_of(SYSTEM, free)
+
+
+def test_the_start_of_what_has_no_zero_of_its_own_says_nothing_of_its_size():
+    entries = parameters_of(Track(), ("gain", Gain("push"), Offset("push"), Delay("push"))).entries
+    assert [entry.start_means_something for entry in entries] == [True, True, False, False]
 
 
 def test_a_start_on_what_was_declared_is_searched_from_inside():

@@ -332,6 +332,8 @@ class _Page(html.parser.HTMLParser):
 
 def test_the_report_is_one_page_that_says_it_all(result, tmp_path):
     left_out, likelihood = cross_validate(result, folds=2), profile(result, "mass", n=3)
+    with pytest.raises(TypeError, match="`cross_validation=` takes a CrossValidation"):
+        save_report(result, tmp_path / "none.html", cross_validation="yes")
     path = save_report(
         result, tmp_path / "a" / "report.html", truth=TRUTH, cross_validation=left_out, profiles=[likelihood], trials=2
     )

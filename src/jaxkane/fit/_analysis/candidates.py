@@ -12,6 +12,7 @@ import numpy as np
 from ..._common.lookup import refuse_unknown
 from ..._description.system import System
 from .._problem.arguments import Specification
+from .._problem.bijections import Interval
 from .._problem.entries import as_items, parameters_of
 from .._problem.free import Delay, Free, Shared
 from .._problem.names import Names, deviations_by_name
@@ -109,7 +110,7 @@ def _without_bounds_at_start(system: System, item: Any) -> tuple[Any, dict[str, 
     if not isinstance(named, (Free, Shared)):
         return item, {}
     free = parameters_of(system, named)
-    ends = [(float(one.lower), float(one.upper)) for one in free.bijections]
+    ends = [(float(one.lower), float(one.upper)) for one in free.bijections if isinstance(one, Interval)]
     if not any(start in pair for start, pair in zip(np.asarray(free.start), ends, strict=True)):
         return item, {}
     return dataclasses.replace(named, bounds=(None, None)), dict(zip(free.names, ends, strict=True))

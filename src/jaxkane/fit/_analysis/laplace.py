@@ -35,6 +35,8 @@ class Laplace:
 
     def sample(self, n: int, seed: int = 0) -> dict[str, np.ndarray]:
         """Parameters (n,) by name, in their units: never outside their bounds."""
+        if not isinstance(n, (int, np.integer)) or n < 0:
+            raise ValueError(f"`n` is how many are drawn, a whole number that is not negative; got {n!r}.")
         rng = np.random.default_rng(seed)
         x = jnp.asarray(rng.multivariate_normal(self.mean, self.covariance, size=n), self.fit.point.x.dtype)
         values = np.asarray(jax.vmap(self.fit.parameters.values)(x))

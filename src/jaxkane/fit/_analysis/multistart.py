@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from ..._common.real_numbers import real_number
 from .._optimize.least_squares import LeastSquares
 from .._optimize.minimize import minimize
 from .._optimize.optimizer import Optimizer
@@ -105,6 +107,8 @@ def multi_start(
     refuse_other(problem, Problem, "multi_start", "multi_start(fit.problem)")
     if n < 1:
         raise ValueError(f"`n` is how many initial guesses are tried, one at least; got {n}.")
+    if not 0 <= real_number(spread, "`spread`") < math.inf:
+        raise ValueError(f"`spread` is how far guesses lie from the first, in scales, not negative; got {spread}.")
     optimizer = LeastSquares() if optimizer is None else optimizer
     rng = np.random.default_rng(seed)
     p = len(problem.parameters.names)

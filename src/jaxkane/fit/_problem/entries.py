@@ -53,6 +53,11 @@ def parameters_of(
     twice, starts outside its bounds, or as a body that cannot be.
     """
     free = as_items(free)
+    for item in free:
+        if isinstance(item, Free) and not isinstance(item.tied, Mapping):
+            raise TypeError(f"`tied` is a dict from names to factors, as {{'rF': 1.0}}; got {item.tied!r}.")
+        if not isinstance(getattr(item, "name", None), (str, type(None))):
+            raise TypeError(f"`name` of what is free is text, got {item.name!r}.")
     parts: list[tuple[list[Entry], Any, list[float], list[float], list[Prior | None]]] = []
     for item in free:
         if isinstance(item, Shared):

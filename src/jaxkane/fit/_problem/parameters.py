@@ -31,8 +31,10 @@ class Entry:
 
     @property
     def start_means_something(self) -> bool:
-        """Whether its initial guess says of what size it is: not of a learned number, nor of the size of noise."""
-        return not self.part and (self.role is None or self.role[0] not in ("intensity", "sigma"))
+        """Whether its initial guess says of what size it is: not of a learned number, of the size of noise, nor of what
+        has no zero of its own, as a delay."""
+        kind = self.role[0].split()[0] if self.role else ""
+        return not self.part and kind not in ("intensity", "sigma", "offset", "delay")
 
 
 class Parameters(eqx.Module):

@@ -114,6 +114,9 @@ def _sections(
     if profiles:
         sections.append(("Profiles of the likelihood", picture(pictures.draw_profiles(fit, profiles))))
     if cross_validation:
+        refuse_other(
+            cross_validation, CrossValidation, "`cross_validation=`", "save_report(fit, path, cross_validation=True)"
+        )
         rows = [line.rsplit(maxsplit=5) for line in str(cross_validation).splitlines()[1:-1]]
         head = ("trial left out", "residuals", "spread", "start", "fitted", "held out")
         verdict = cross_validation.verdict[0].upper() + cross_validation.verdict[1:]
