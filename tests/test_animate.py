@@ -251,8 +251,16 @@ def test_what_cannot_be_animated_is_refused(ride, swing, tmp_path):
         jk.animate(system, trajectory, up="north")
     with pytest.raises(ValueError, match="`theme` is one of"):
         jk.animate(system, trajectory, theme="blue")
-    with pytest.raises(ValueError, match="must be positive"):
-        jk.animate(system, trajectory, speed=0.0)
+    for wrong in ({"speed": 0.0}, {"speed": np.inf}, {"height": -4}):
+        with pytest.raises(ValueError, match="must be positive"):
+            jk.animate(system, trajectory, **wrong)
+    with pytest.raises(ValueError, match="`azimuth` must be finite, got nan"):
+        jk.animate(system, trajectory, azimuth=np.nan)
+    with pytest.raises(ValueError, match="`elevation` must be a real number, got '18'"):
+        jk.animate(system, trajectory, elevation="18")
+    for name in ("seconds", "fps"):
+        with pytest.raises(ValueError, match=f"`{name}` must be positive, got -1"):
+            animation.save(tmp_path / "swing.gif", **{name: -1.0})
     with pytest.raises(ValueError, match=r"\.html .* or \.gif"):
         animation.save(tmp_path / "swing.mp4")
     with pytest.raises(ValueError, match="reached only 0"):

@@ -248,6 +248,8 @@ def test_audits(style, audited):
     assert axes.shape == (2, 2)
     assert is_legible(axes, style)
     np.testing.assert_allclose(axes[0, 0].lines[0].get_ydata(), audited.kinetic_energy)
+    with pytest.raises(TypeError, match=r"draws an Audit, jk.audit\(system, ride\); got a str"):
+        jk.plot.audit("ride")
 
 
 BIKE = jk.catalog.WhippleBicycle.benchmark()

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from .._common.real_numbers import positive_number
 from .._description.system import System
 from .._simulation.trajectory import Trajectory
 from ._builder import Builder, turned_by
@@ -76,13 +77,11 @@ def animate(
         raise ValueError(f"animate: `up` is one of {', '.join(UPRIGHT)}, got {up!r}.")
     if theme not in THEMES:
         raise ValueError(f"animate: `theme` is one of {', '.join(THEMES)}, got {theme!r}.")
-    if not speed > 0:
-        raise ValueError(f"animate: `speed` must be positive, got {speed!r}.")
+    positive_number(speed, "animate: `speed`")
+    positive_number(height, "animate: `height`")
     drawn = figure or figure_of(system)
     scene = _scene(record(system, trajectory, drawn), drawn, speed, up, follow, ground, title, type(system).__name__)
-    angles = {"azimuth": azimuth, "elevation": elevation}
-    angles = {key: float(np.deg2rad(x)) for key, x in angles.items() if x is not None}
-    scene = dataclasses.replace(scene, view=dataclasses.replace(scene.view, **angles))
+    scene = dataclasses.replace(scene, view=scene.view.seen_from(azimuth, elevation))
     return Animation(scene, speed, theme, height)
 
 
@@ -178,7 +177,7 @@ class Animation:
 
         **Returns:** the path.
 
-        **Raises:** `ValueError` for any other ending.
+        **Raises:** `ValueError` for any other ending, and for numbers that no picture has.
         """
         path = Path(path)
         if path.suffix == ".html" and not options:

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import os
 from typing import Any
 
 import numpy as np
 
+from .._common.real_numbers import positive_number
 from ._scene import Scene
 from ._sketch import COLORS
 from ._view import project
@@ -31,10 +31,11 @@ def write_gif(
     """Writes the file; see `Animation.save`."""
     from PIL import Image, ImageDraw
 
-    angles = {"azimuth": azimuth, "elevation": elevation}
-    angles = {key: float(np.deg2rad(x)) for key, x in angles.items() if x is not None}
-    view = dataclasses.replace(scene.view, **angles)
-    hundredths = max(2, round(100.0 / fps))  # a GIF counts hundredths of a second, and browsers no fewer than two
+    view = scene.view.seen_from(azimuth, elevation)
+    seconds = None if seconds is None else positive_number(seconds, "Animation.save: `seconds`")
+    hundredths = max(
+        2, round(100.0 / positive_number(fps, "Animation.save: `fps`"))
+    )  # a GIF counts hundredths of a second, and browsers no fewer than two
     start = scene.t[0]
     length = scene.t[-1] - start if seconds is None else min(seconds, scene.t[-1] - start)
     times = start + np.arange(0.0, length, 0.01 * hundredths * speed)

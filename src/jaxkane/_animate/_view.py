@@ -6,6 +6,8 @@ import dataclasses
 
 import numpy as np
 
+from .._common.real_numbers import real_number
+
 
 @dataclasses.dataclass(frozen=True)
 class View:
@@ -20,6 +22,18 @@ class View:
     elevation: float
     follow: bool
     span_following: float
+
+    def seen_from(self, azimuth: float | None, elevation: float | None) -> View:
+        """The view from other angles [degrees], where these are given.
+
+        **Raises:** `ValueError` for what is no finite number.
+        """
+        angles = {"azimuth": azimuth, "elevation": elevation}
+        angles = {key: real_number(x, f"`{key}`") for key, x in angles.items() if x is not None}
+        wrong = [key for key, x in angles.items() if not np.isfinite(x)]
+        if wrong:
+            raise ValueError(f"`{wrong[0]}` must be finite, got {angles[wrong[0]]}.")
+        return dataclasses.replace(self, **{key: float(np.deg2rad(x)) for key, x in angles.items()})
 
 
 UPRIGHT = {

@@ -31,3 +31,14 @@ def real_number(value: Any, what: str) -> float:
     if array is None or array.dtype.kind not in "iuf":
         raise ValueError(f"{what} must be a real number, got {value!r}.")
     return float(array)
+
+
+def positive_number(value: Any, what: str) -> float:
+    """One positive finite number that was given, as a float.
+
+    **Raises:** `ValueError` for anything else.
+    """
+    number = real_number(value, what)
+    if not 0.0 < number < float("inf"):
+        raise ValueError(f"{what} must be positive, got {value!r}.")
+    return number

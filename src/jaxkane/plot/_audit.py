@@ -19,6 +19,8 @@ def audit(audit: Audit, *, axes: Any = None) -> np.ndarray:
 
     **Returns:** the axes (2, 2).
     """
+    if not isinstance(audit, Audit):
+        raise TypeError(f"plot.audit draws an Audit, jk.audit(system, ride); got a {type(audit).__name__}.")
     found = panels(axes, 2, 2, size=(4.75, 2.75), sharex=True)
     audit.plot(found)
     return found
