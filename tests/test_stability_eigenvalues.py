@@ -148,6 +148,17 @@ def test_weave_and_capsize_speeds():
     assert repr(found).startswith("CriticalSpeeds(weave stable from 4.292382536 (3.435 rad/s), capsize unstable")
 
 
+def test_riding_backwards_is_riding_forwards_with_time_reversed():
+    """Each mode keeps its name: it was castering that capsized."""
+    speeds = jnp.linspace(1.0, 10.0, 19)
+    forwards, backwards = eigenvalues(BIKE, speeds), eigenvalues(BIKE, -speeds)
+    assert forwards.modes == backwards.modes
+    np.testing.assert_allclose(backwards.eigenvalues.real, -forwards.eigenvalues.real, rtol=1e-9)
+    found = critical_speeds(BIKE, -speeds)
+    assert [found.modes[i] for i in found.mode] == ["capsize", "weave"]
+    np.testing.assert_allclose(found.values, [-CAPSIZE, -WEAVE], rtol=1e-12)
+
+
 @pytest.mark.slow
 def test_derivatives_of_critical_speeds_with_respect_to_all_parameters():
     rtol = 1e-7

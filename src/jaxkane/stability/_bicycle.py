@@ -120,9 +120,12 @@ def mode_order(values: Any) -> np.ndarray:
     """Columns of tracked eigenvalues (m, 4) along the speed in the order of `MODES`.
 
     The pair that oscillates is the weave, and of the others castering decays faster. At the lowest speeds nothing
-    oscillates: where nothing ever does, the two largest are those that would become the weave.
+    oscillates: where nothing ever does, the two largest are those that would become the weave. Riding backwards is
+    riding forwards with time reversed: all decay is growth, that of castering the fastest.
     """
     oscillating = np.abs(values.imag) > 1e-9
     pairs = oscillating.sum(axis=1)
     i = int(np.argmax(pairs == 2)) if (pairs == 2).any() else 0
-    return np.lexsort((-values[i].imag, -values[i].real, ~oscillating[i]))
+    row = values[i]
+    backwards = row.real.sum() > 1e-9 * np.abs(row).max()
+    return np.lexsort((-row.imag, row.real if backwards else -row.real, ~oscillating[i]))
