@@ -179,7 +179,10 @@ def test_a_load_beyond_a_measured_tyre_is_told_with_the_tyre(ask):
             {"rider": RIDER, "extra": [RIDER]},
             r"extra\[0\], a RigidRider: .* point of the name 'left_shoulder'.*a Part of your own",
         ),
-        ({"extra": [TRAILER, TRAILER]}, r"'trailer_angle' stands twice in `coordinates`: of extra\[0\], a Trailer"),
+        (
+            {"extra": [TRAILER, TRAILER]},
+            r"'trailer_angle' stands twice in `coordinates`: of extra\[0\], a Trailer and of extra\[1\], a T",
+        ),
         (
             {"control": (LeanSteerGains(), LeanSteerGains())},
             r"'desired_roll' .* of control\[0\], a LeanSteerGains and",

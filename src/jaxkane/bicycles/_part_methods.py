@@ -60,13 +60,14 @@ def refuse_misfits(bicycle: Bicycle) -> None:
 def _refuse_names_twice(bicycle: Bicycle) -> None:
     """Parts of one kind have the same names: values could not be told apart."""
     owners: dict[str, int] = {}
+    places = _places(bicycle)
     for i, part in enumerate(bicycle.parts):
         for kind in NAMES:
             for name in getattr(part, kind):
                 if owners.setdefault(name, i) != i:
                     raise ValueError(
                         f"{type(bicycle).__name__}: the name {name!r} stands twice in `{kind}`: of "
-                        f"{place_of(bicycle, bicycle.parts[owners[name]])} and of {place_of(bicycle, part)}. {_APART}"
+                        f"{places[owners[name]]} and of {places[i]}. {_APART}"
                     )
 
 
@@ -74,14 +75,21 @@ _APART = "Values are read by name: for a second part of a kind write a Part of y
 
 
 def place_of(bicycle: Bicycle, part: Part) -> str:
-    """Where a part stands, and what it is: "extra[0], a Trailer"."""
+    """Where a part stands first, and what it is: "extra[0], a Trailer"."""
+    places = zip(bicycle.parts, _places(bicycle), strict=True)
+    return next((place for each, place in places if each is part), called(part))
+
+
+def _places(bicycle: Bicycle) -> list[str]:
+    """Where the parts stand, in their order: one may stand in two places."""
+    places = []
     for field in dataclasses.fields(bicycle):
-        held = getattr(bicycle, field.name)
-        for i, each in enumerate(as_tuple(held)):
-            if each is part:
-                place = f"{field.name}[{i}]" if isinstance(held, (tuple, list)) else field.name
-                return f"{place}, {called(part)}"
-    return called(part)
+        value = getattr(bicycle, field.name)
+        for i, part in enumerate(as_tuple(value)):
+            if isinstance(part, Part):
+                place = f"{field.name}[{i}]" if isinstance(value, (tuple, list)) else field.name
+                places.append(f"{place}, {called(part)}")
+    return places
 
 
 def label_of(part: Part, method: str) -> str:
