@@ -143,6 +143,21 @@ def test_samples_of_a_description_have_derivatives_by_their_times():
     np.testing.assert_allclose(found, (place(1.0, 0.03), slope), rtol=rtol)
 
 
+class Late(Cart):
+    delay: jk.Scalar = jk.parameter(0.0)  # [s]
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force(samples_held(t - self.delay) * motion.N.x, motion["cart"])
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Late")
+def test_samples_that_a_description_reads_from_outside_are_met():
+    rtol, h = 1e-8, 1e-6
+    slope = (place(1.0, 0.03 + h) - place(1.0, 0.03 - h)) / (2 * h)
+    np.testing.assert_allclose(by_delay(lambda d: end_with(Late(d), None)), (place(1.0, 0.03), slope), rtol=rtol)
+
+
 @pytest.mark.parametrize(
     ("push", "options", "message"),
     [

@@ -107,6 +107,11 @@ def captured(*values: Any) -> tuple[Tracer, ...]:
     return tuple(filter(is_under_way, found.values()))
 
 
+def reads_any(kind: type, *values: Any) -> bool:
+    """Whether code in these values reads an object of a kind from outside: a global, or one in a closure."""
+    return any(isinstance(x, kind) for root in _roots(values, []) for _, x in _reads_of(root).kept.values())
+
+
 class Key(NamedTuple):
     """On what a program depends that is traced of these arguments."""
 

@@ -23,11 +23,20 @@ from .._scalars.fuse import fused
 from .._scalars.linear import as_vector
 from .._scalars.nan import derivative_free_where_not_finite, flat, nan_derivative_where, nan_where
 from .._scalars.types import Component
-from .._scalars.versions import captured, compiled
+from .._scalars.versions import captured, compiled, reads_any
 from .events import Events, at_zero, events_of
 from .loops import keeping
 from .settings import Settings, refuse_held
-from .signals import Kinks, evaluate, for_fixed_steps, kinks_of, samples_of, with_own_times, without_nonsense
+from .signals import (
+    Kinks,
+    Samples,
+    evaluate,
+    for_fixed_steps,
+    kinks_of,
+    samples_of,
+    with_own_times,
+    without_nonsense,
+)
 from .stages import WrittenOut
 from .steps import Times, controller_of, times_of
 from .trajectory import Sides, Status, Trajectory
@@ -138,12 +147,13 @@ def solve(
 
 
 def _calling_samples(system: System) -> dict[str, Callable[..., Any]]:
-    """The right-hand side (t, state) of a system that has samples among its parameters, by the system's name."""
+    """The right-hand side (t, state) of a system that has samples among its parameters, or whose code reads some from
+    outside, by the system's name."""
 
     def rates(t: Array, now: Now) -> Array:
         return packed_rates(system, t, packed(State(now.q, now.u, now.x)), {})
 
-    return {type(system).__name__: rates} if samples_of(system) else {}
+    return {type(system).__name__: rates} if samples_of(system) or reads_any(Samples, system) else {}
 
 
 def refuse_captured(system: System) -> None:
