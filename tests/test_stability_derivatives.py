@@ -236,6 +236,16 @@ def test_eigenvalues_that_cease_to_grow_without_passing_the_axis_are_told():
         critical_speeds(Pushed(), jnp.array([-1.0, 0.0, 1.0]), flat)
 
 
+def test_a_parameter_that_cannot_be_has_no_linear_model_under_a_trace():
+    """A length that passes zero is no way to become stable: alone that is an error."""
+    hanging = jk.State(jnp.zeros(1), jnp.zeros(1))
+    at = lambda system, length: (dataclasses.replace(system, length=length), hanging)  # noqa: E731
+    found = eigenvalues(Pushed(), jnp.array([-0.5, 0.5]), at)
+    np.testing.assert_array_equal(np.isnan(found.eigenvalues), [[True] * 2, [False] * 2])
+    with pytest.raises(ValueError, match=r"there is no steady motion at -0\.5"):
+        critical_speeds(Pushed(), jnp.array([-0.5, 0.5]), at)
+
+
 def test_a_motion_that_is_not_steady_has_no_linear_model_under_a_trace():
     """It was the model of an instant, without a word: now NaN in its row, as it is an error alone."""
     tilts = jnp.array([0.0, 0.4, np.pi])

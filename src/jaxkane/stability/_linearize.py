@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._common.lookup import as_names, hint, refuse_unknown
+from .._description.parameters import parameters_in
 from .._description.system import State, System
 from .._description.values import Values
 from .._method.checks import check_system, is_concrete
@@ -104,8 +105,8 @@ def linearize(
     **Returns:** a `LinearModel`; `A, B, C, D = linearize(...)` works too.
 
     **Raises:** `ValueError` for unknown names, a motion that is not steady, coordinates off the constraints, dependent
-    coordinates that the constraints do not determine, or equations that are singular. Under a trace the matrices are
-    NaN there, with their derivatives.
+    coordinates that the constraints do not determine, a parameter that cannot be, or equations that are singular. Under
+    a trace the matrices are NaN there, with their derivatives.
     """
     name = type(system).__name__
     check_is_system(system)
@@ -135,7 +136,7 @@ def linearize(
     own = output_names(system) if outputs is not None else ()
     known = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.states, *own)
     refuse_unknown(rows, (*known, *functions), f"{name}: outputs are functions, or by name; it has no output", "it has")
-    wrong = jnp.array(False) if is_concrete(*origin) else is_wrong(*origin, steady)
+    wrong = jnp.array(False) if is_concrete(*origin) else is_wrong(*origin, steady) | ~_is_allowed(system)
     # Numbers in the place of NaN, which would spoil the gradients of callers who do not use it (0 * NaN).
     at = tuple(jnp.where(jnp.all(jnp.isfinite(y)), y, 0.1) for y in (t, q, u, x, w))
     model, follows = _derivatives((system, *at), _Choice(dependent, kept, rows), functions)
@@ -143,6 +144,12 @@ def linearize(
         raise ValueError(_why_not(origin, dependent, bool(follows)))
     A, B, C, D = nan_where(wrong | ~follows, model, origin)
     return LinearModel(A, B, C, D, kept, tuple(system.inputs), rows)
+
+
+def _is_allowed(system: System) -> Array:
+    """Whether each parameter is what it was declared to be, which an error tells where the numbers are known."""
+    limited = [(value, info) for _, value, info in parameters_in(system) if info.is_limited]
+    return jnp.all(jnp.stack([jnp.array(True), *(jnp.all(info.allows(value)) for value, info in limited)]))
 
 
 def _why_not(origin: Any, dependent: tuple[str, ...], follows: bool) -> str:
