@@ -9,7 +9,7 @@ import pytest
 from test_stability_linear import RodOnPin
 
 import jaxkane as jk
-from jaxkane.stability import critical_speeds, eigenvalues, equilibrium, linearize
+from jaxkane.stability import critical_speeds, eigenvalues, equilibrium, family, linearize
 from jaxkane.stability._eig import eig, eigvals
 
 
@@ -276,3 +276,10 @@ def test_off_the_constraints_there_is_no_linear_model_of_an_instant_either():
     with pytest.raises(ValueError, match="violate the configuration constraints"):
         linearize(rod, off, steady=False)
     assert np.isnan(jax.jit(lambda q: linearize(rod, jk.State(q, off.u), steady=False).A)(off.q)).all()
+
+
+def test_a_family_along_which_an_input_is_found():
+    """The torque that holds a pendulum, as it is led aside: one equation fewer than unknowns."""
+    found = family(Pushed(), equilibrium(Pushed()), towards={"angle": 1}, until={"angle": 1.0}, find=("torque",))
+    np.testing.assert_allclose(found.q[-1], [1.0], rtol=1e-9)
+    np.testing.assert_allclose(found.inputs["torque"][-1], LIMIT * np.sin(1.0), rtol=1e-8)

@@ -218,7 +218,9 @@ def _side(problem: Problem, system: System, towards, tangent, curve: _Curve, y) 
     if more or name not in problem.names:
         one_of = hint(name, problem.names, "it is one of")
         raise ValueError(f"family: `towards` is one name with +1 or -1, got {dict(towards)}; {one_of}")
-    s = np.linalg.svd(curve.evaluate(y)[1], compute_uv=False)
+    J = curve.evaluate(y)[1]
+    s = np.zeros(J.shape[1])  # with inputs to find there are fewer equations than unknowns
+    s[: len(J)] = np.linalg.svd(J, compute_uv=False)[: len(s)]
     if s[-1] > 1e-8 * s[0]:
         raise ValueError(
             f"{type(system).__name__}: the start does not stand on a curve of steady motions: too much is held "
