@@ -276,6 +276,11 @@ CASES = {
         "motion of another system",
     ),
     "text for a system": (lambda: stability.equilibrium("bicycle"), TypeError, "instance of a System"),
+    "text to be held": (
+        lambda: stability.equilibrium(BIKE, hold={"roll": "0"}),
+        TypeError,
+        "roll is to be held at a value that is no number: '0'",
+    ),
     "no system": (lambda: stability.cyclic_coordinates(None), TypeError, "instance of a System"),
 }
 AHEAD = straight_ahead(BIKE, 4.0)

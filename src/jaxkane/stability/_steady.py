@@ -16,7 +16,7 @@ from .._method.checks import check_system, is_concrete
 from .._method.description_facts import configuration_residual
 from .._method.equations import dependent_speeds
 from .._method.right_hand_side import rates
-from .._method.values import as_array, check_is_system, check_time, checked_values
+from .._method.values import as_array, check_is_system, check_time, checked_values, is_one_number
 from .._scalars.nan import nan_where
 from .._scalars.types import Component
 from .._scalars.versions import compiled
@@ -111,6 +111,9 @@ def steady_turn(
     name = type(system).__name__
     check_is_system(system)
     values = dict(hold) if isinstance(hold, Mapping) else dict.fromkeys(as_names(hold))
+    texts = [k for k, x in values.items() if not (x is None or is_one_number(x))]
+    if texts:
+        raise TypeError(f"{name}: {', '.join(texts)} is to be held at a value that is no number: {values[texts[0]]!r}.")
     q = as_array({} if q is None else q, system.coordinates, f"{name}: q")
     u = as_array({} if u is None else u, system.speeds, f"{name}: u").astype(q.dtype)
     known = {k: jnp.asarray(x, q.dtype) for k, x in checked_values(system, inputs).items()}
