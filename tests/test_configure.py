@@ -13,7 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from jaxkane._scalars import native
-from jaxkane._scalars.configure import _made_folder, _split_cpu
+from jaxkane._scalars.configure import _made_folder, _split_cpu, configure
 from jaxkane._scalars.native.available import switched_on
 
 KERNELS = f"no native kernels ({native.why_not()})" if native.why_not() else "native kernels"
@@ -209,6 +209,12 @@ def test_words_for_on_and_off_in_the_environment(word, is_on):
 def test_an_unknown_word_in_the_environment_is_refused():
     with pytest.raises(ValueError, match="JAXKANE_NATIVE='maybe' in the environment: it is one of 1, true"):
         switched_on("maybe")
+
+
+@pytest.mark.parametrize("option", [{"float64": "no"}, {"native": "off"}, {"native": 0}, {"cache": 3}])
+def test_options_of_another_type_are_refused_before_anything_is_set(option):
+    with pytest.raises(TypeError, match=f"configure: `{next(iter(option))}` is"):
+        configure(**option)
 
 
 @pytest.mark.parametrize("why", ["read only", "no home"])

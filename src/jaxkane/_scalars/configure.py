@@ -82,6 +82,11 @@ def configure(
     No option of the compiler is set: what helps a program is set by the library where that program is compiled.
     """
     global _last
+    for what, flag in (("float64", float64), ("native", False if native is None else native)):
+        if not isinstance(flag, (bool, np.bool_)):
+            raise TypeError(f"configure: `{what}` is True or False, got {flag!r}.")
+    if not isinstance(cache, (bool, str, os.PathLike)):
+        raise TypeError(f"configure: `cache` is a folder, True or False, got {cache!r}.")
     made = _float32_arrays() if float64 and not jax.config.jax_enable_x64 else 0  # pyright: ignore[reportAttributeAccessIssue]
     jax.config.update("jax_enable_x64", bool(float64))
     os.environ["JAX_ENABLE_X64"] = str(int(float64))
