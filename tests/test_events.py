@@ -463,6 +463,15 @@ def test_events_that_are_no_quantities_by_name(events, message):
         dropped(1.0, system=Watching())
 
 
+def test_an_event_is_not_called_as_another_end():
+    class Confusing(Particle):
+        def events(self, t, q, u):
+            return {"max_steps": q[0] - 0.5}
+
+    with pytest.raises(ValueError, match="an event is called 'max_steps'"):
+        dropped(1.0, system=Confusing())
+
+
 def test_samples_that_are_none():
     times = np.array([0.0, 1.0, 2.0])
     for ts, values, error in (

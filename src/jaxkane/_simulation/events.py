@@ -19,6 +19,7 @@ from .._scalars.fuse import fused
 from .._scalars.linear import as_vector, determinant
 from .._scalars.types import Component
 from .crossings import Crossing
+from .trajectory import Status, reason
 
 
 class Events(NamedTuple):
@@ -55,6 +56,10 @@ def _events(system: System, t: Component, q: Any, u_all: Any, dtype: Any) -> dic
     found = system.events(t, q, u_all)
     if not isinstance(found, Mapping):
         raise TypeError(f"{type(system).__name__}.events returns quantities by name, a dict; got {found!r}.")
+    reasons = {reason(code, ()) for code in Status if code < Status.EVENT}
+    taken = [name for name in found if name.replace("_", " ") in reasons]
+    if taken:
+        raise ValueError(f"{type(system).__name__}: an event is called {taken[0]!r}, the reason of another end.")
     return {name: _as_float(name, found[name], dtype) for name in sorted(found)}
 
 
