@@ -195,3 +195,9 @@ def test_one_name_alone_says_the_same_as_a_list_of_it():
     ]
     np.testing.assert_array_equal(models[0].C, models[1].C)
     assert models[0].outputs == ("theta2",)
+
+
+def test_what_the_library_does_not_have_is_no_attribute():
+    assert {"simulate", "animate", "fit"} <= set(dir(jk))
+    with pytest.raises(AttributeError, match="module 'jaxkane' has no attribute 'simulated'"):
+        _ = jk.simulated
