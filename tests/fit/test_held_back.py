@@ -55,6 +55,9 @@ def test_trials_that_cannot_be_simulated_are_told_and_the_rest_is_kept(falling, 
     assert all("not finite" in why for why in held.failed.values())
     assert any(note.startswith("far (4) is left out: from 0 to 1 s") for note in held.notes)
     assert alone.failed == {}
+    # Parameters that were not fitted to these trials have no errors from them.
+    errors = [alone.standard_errors["gain"], alone.clustered_errors["gain"], *alone.intervals()["gain"]]
+    assert np.isnan(errors).all()
     assert load(held.save(tmp_path / "held.npz"), held.problem).failed == held.failed
     with pytest.raises(ValueError, match=r"None of these trials can be simulated .*: far \(0\), from"):
         applied_to(falling, FAR)

@@ -26,8 +26,8 @@ def applied_to(fit: Fit, trials: Sequence[Trial] | Trial) -> Fit:
         jk.fit.applied_to(result, others).variance_accounted_for
 
     **Returns:** a `Fit` of these trials, with the status "applied": its `cost`, `variance_accounted_for`, `tests` and
-    report are those of these trials. Trials that cannot be simulated with these parameters are left out: `failed` says
-    by name why, and so do the `notes`.
+    report are those of these trials; its parameters were not fitted to them, and have no errors here (NaN). Trials that
+    cannot be simulated with these parameters are left out: `failed` says by name why, and so do the `notes`.
 
     **Raises:** `ValueError` as `fit` does, for trials that do not suit the system, and where none can be simulated.
     """

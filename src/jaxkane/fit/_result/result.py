@@ -153,8 +153,11 @@ class Fit:
 
     @property
     def covariance(self) -> np.ndarray:
-        """(p, p), in the parameters' units."""
-        return self.identifiability.covariance
+        """(p, p), in the parameters' units; NaN of parameters that are those of another fit (`applied_to`)."""
+        return self._of_estimates(self.identifiability.covariance)
+
+    def _of_estimates(self, covariance: np.ndarray) -> np.ndarray:
+        return np.full_like(covariance, np.nan) if self.status == "applied" else covariance
 
     @property
     def standard_errors(self) -> dict[str, float]:
@@ -166,7 +169,7 @@ class Fit:
         `clusters`."""
         seen = self.identifiability
         along = covariance.covariance_by_cluster(self.problem, self.point, self.linearization, seen.directions)
-        return seen.in_units(along)
+        return self._of_estimates(seen.in_units(along))
 
     @property
     def clustered_errors(self) -> dict[str, float]:
