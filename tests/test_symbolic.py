@@ -245,6 +245,7 @@ def test_the_linear_model_of_the_bicycle_in_its_speed():
     bicycle = CATALOG["WhippleBicycle"].example()
     model = jk.symbolic.linearize(bicycle, {"rear_wheel_rate": "-v/rR"})
     assert model.operations < 1000
+    assert not model.A.has(sp.Piecewise, sp.nan)
     state = jk.assemble(bicycle, {}, {"rear_wheel_rate": -4.6 / bicycle.rR})
     expected = jk.stability.linearize(bicycle, state)
     assert model.states == expected.states

@@ -116,6 +116,7 @@ def table() -> dict[str, Any]:
         "and": sp.And,
         "or": sp.Or,
         "xor": sp.Xor,
-        "select": lambda c, x, y: sp.Piecewise((x, c), (y, True)),
+        # Where a description has no value, NaN, a formula needs none.
+        "select": lambda c, x, y: x if y is sp.nan else y if x is sp.nan else sp.Piecewise((x, c), (y, True)),
         "convert": lambda x: sp.Piecewise((1, x), (0, True)) if isinstance(x, sp.logic.boolalg.Boolean) else x,
     }
