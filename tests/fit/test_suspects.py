@@ -285,6 +285,8 @@ def test_fits_beside_each_other(rubbing, found):
         ["fit", "objection"],
         ["viscous", "damping = 0.5362 is above 0.45"],
     ]
+    said = {"damping": (0.0, 0.45), "gain of angle": 0.2}  # as a search was given
+    assert compare({"viscous": rubbing}, plausible=said).objections["viscous"]
     with pytest.raises(ValueError, match="`plausible` names dampign; did you mean 'damping'"):
         compare([rubbing], plausible={"dampign": 0.5})
     with pytest.raises(ValueError, match="There is no fit"):

@@ -120,7 +120,7 @@ def compare(
     - `fits`: by name; of a sequence, the free parameters are the names.
     - `held_out`: trials that none of them has seen: their starts and biases are found, the parameters are not
         (`applied_to`). Those of bicycles by `bicycle_rides`.
-    - `plausible`: as in `suspects`.
+    - `plausible`: as in `suspects`; names that none of the fits frees are passed over.
 
     **Returns:** a `Comparison`: print it for tables of parameters with errors (clustered by trial where the residuals
     are correlated), sums of squares on both sides, as a whole, by channel and by trial, and what is not plausible.
@@ -143,7 +143,9 @@ def compare(
     for fit in named.values():
         refuse_other(fit, Fit, "compare", "compare({'first': fit(...), 'second': fit(...)})")
     said = plausible or {}
-    refuse_unknown(said, [name for fit in named.values() for name in fit.names], "`plausible` names")
+    free = {name for fit in named.values() for name in fit.names}
+    if not free & set(said):  # of a table that served a search, names that no fit frees are no slip
+        refuse_unknown(said, free, "`plausible` names")
     return Comparison(
         fits=named,
         held_out={} if held_out is None else {name: applied_to(fit, held_out) for name, fit in named.items()},
