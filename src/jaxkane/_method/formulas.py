@@ -34,7 +34,7 @@ from .equations import (
 from .rates import motion_rates
 from .reading import Reading
 from .right_hand_side import rates
-from .values import as_row
+from .values import as_row, check_is_system
 
 
 class Function(NamedTuple):
@@ -108,8 +108,7 @@ class Formulas:
     """
 
     def __init__(self, system: System, dtype: str = "float64"):
-        if not isinstance(system, System):
-            raise TypeError(f"The first argument is an instance of a System, got {system!r}.")
+        check_is_system(system)
         self.system, self.name, self.dtype = system, type(system).__name__, str(jnp.dtype(dtype))
         if self.dtype not in ("float64", "float32"):
             raise ValueError(f"{self.name}: dtype is 'float64' or 'float32', got {dtype!r}.")

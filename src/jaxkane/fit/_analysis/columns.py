@@ -15,6 +15,7 @@ from ..._description.parameters import declared, leaf_name
 from ..._description.system import System
 from ..._method.body_parts import UNITS, Bodies, Described, described
 from ..._method.newton_euler import Carried, carried, columns_of, unbalanced, values_of
+from ..._method.values import check_is_system
 from ..._scalars.versions import compiled
 from .._problem.leaves import find_leaves
 
@@ -113,8 +114,7 @@ class Chosen(eqx.Module):
 
 def chosen_of(system: System, bodies: Bodies, parameters: Names) -> Chosen:
     """**Raises:** `ValueError` for names that are none, or given twice."""
-    if not isinstance(system, System):
-        raise TypeError(f"The first argument is an instance of a System, got {system!r}.")
+    check_is_system(system)
     parameters = (parameters,) if isinstance(parameters, str) or callable(parameters) else tuple(parameters)
     places, names, units = [], [], []
     for where in parameters:
