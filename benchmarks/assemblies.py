@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxkane as jk
-from jaxkane._method.right_hand_side import _packed_rates, packed_rates
+from jaxkane._kane.rhs import _packed_rates, packed_rates
 from jaxkane.bicycles import Bicycle, LateralSlip, LeaningRider, SteeringMotor, Tyre, separate_rider
 
 from ._bicycle import agree

@@ -20,17 +20,7 @@ import numpy as np
 
 import jaxkane as jk
 from jaxkane.catalog import WhippleBicycle
-from jaxkane.fit import (
-    Gain,
-    LeastSquares,
-    Problem,
-    Trial,
-    cross_validate,
-    fit_bicycle,
-    minimize,
-    multi_start,
-    report,
-)
+from jaxkane.fit import Gain, LeastSquares, Problem, Trial, cross_validate, fit_bicycle, minimize, multi_start, report
 
 jax.config.update("jax_enable_x64", True)
 

@@ -52,11 +52,11 @@ def on_config(config):
 
 # What one wants to do, by the room in which it is done, and the page that explains it.
 SUBJECTS = {
-    "_description": ("Describe a mechanism", "describing"),
-    "_method": ("Ask for its equations", "coming_from_sympy"),
-    "_simulation": ("Simulate, and look at a motion", "simulation"),
+    "_system": ("Describe a mechanism", "describing"),
+    "_kane": ("Ask for its equations", "coming_from_sympy"),
+    "_integrate": ("Simulate, and look at a motion", "simulation"),
     "_animate": ("Show it", "pictures"),
-    "_scalars": ("Set up the process", "speed"),
+    "_scalarjit": ("Set up the process", "speed"),
 }
 PAGES = {
     "fit": "identification",

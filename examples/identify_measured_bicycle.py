@@ -23,15 +23,7 @@ from pathlib import Path
 
 import jaxkane as jk
 from jaxkane.catalog import WhippleBicycle
-from jaxkane.fit import (
-    Gain,
-    LeastSquares,
-    cross_validate,
-    fit_bicycle,
-    frame_inertia,
-    profile,
-    save_report,
-)
+from jaxkane.fit import Gain, LeastSquares, cross_validate, fit_bicycle, frame_inertia, profile, save_report
 
 FREE = {
     "the damping alone": ("steer_damping",),

@@ -3,7 +3,7 @@
 How to run them:
 
     pytest                        everything, in as many processes as there are cores, four at most
-    pytest tests/test_vectors.py  a file or a test, in this process
+    pytest tests/system/test_vectors.py  a file or a test, in this process
     JAXKANE_TEST_CACHE=FOLDER     keeps the compiled programs for the next run; by default they go with this one
     JAXKANE_TEST_CACHE=0          keeps none, and leaves XLA as a user has it
     pytest -m ""                  the slow ones too, and with XLA's optimizations
@@ -21,7 +21,7 @@ import pytest
 import touched
 
 import jaxkane as jk
-from jaxkane._scalars import native as native_kernels
+from jaxkane._scalarjit.backends import native as native_kernels
 
 CACHE = "JAXKANE_TEST_CACHE"
 

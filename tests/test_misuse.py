@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._description.units import units_of
+from jaxkane._system.system import units_of
 from jaxkane.joints import Actuator, Coupling, Link, Loop, Site, hinge, mechanism
 
 TS = jnp.linspace(0.0, 0.2, 3)

@@ -13,8 +13,7 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from ._scalars.components import add, cross, dot, is_exact, matvec, mul, several, sub
-from ._scalars.types import Component, Triple
+from ._scalarjit.components import Component, Triple, add, cross, dot, is_exact, matvec, mul, several, sub
 
 Matrix = tuple[Triple, Triple, Triple]
 

@@ -21,12 +21,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from ._description.bodies import Body, point_of
-from ._description.frames import Frame
-from ._description.points import Point
-from ._description.vectors import Vector
-from ._scalars.components import positive
-from ._scalars.types import Component
+from ._scalarjit.components import Component, positive
+from ._system.bodies import Body, point_of
+from ._system.frames import Frame
+from ._system.points import Point
+from ._system.vectors import Vector
 
 Named = dict[str, Component]
 

@@ -6,10 +6,10 @@ import pytest
 from test_laws import QUICK, SLOW
 
 import jaxkane as jk
-from jaxkane._method.rates import _motion_rates
-from jaxkane._scalars import fuse
-from jaxkane._scalars.fuse import _Program
-from jaxkane._scalars.native import Scalars
+from jaxkane._kane.kane import _motion_rates
+from jaxkane._scalarjit import function as fuse
+from jaxkane._scalarjit.backends.native import Scalars
+from jaxkane._scalarjit.function import _Program
 from jaxkane.catalog import CATALOG
 
 

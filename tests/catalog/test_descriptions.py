@@ -9,7 +9,7 @@ from jaxkane import catalog
 from jaxkane.catalog import _entry
 
 FILES = sorted(pathlib.Path(catalog.__file__).parent.glob("*.py"))
-ROOMS_BELOW = {"_common", "_scalars", "rotations", "_description", "loads", ""}
+ROOMS_BELOW = {"_common", "_scalarjit", "rotations", "_system", "loads", ""}
 METHOD = {"jvp", "vjp", "grad", "jacfwd", "jacrev", "linearize", "solve", "inv"}
 
 

@@ -8,7 +8,7 @@ import pytest
 import jaxkane as jk
 from jaxkane.catalog import RigidBody, WhippleBicycle
 from jaxkane.fit import Free, Inertia, LeastSquares, PossibleBody, Problem, Trial, frame_inertia, minimize
-from jaxkane.fit._problem.entries import parameters_of
+from jaxkane.fit._parameters import parameters_of
 
 BICYCLE = WhippleBicycle.benchmark()
 MOMENTS = ("I11", "I22", "I33")

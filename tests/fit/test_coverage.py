@@ -6,9 +6,8 @@ from scipy import stats
 from systems import Track
 
 from jaxkane.fit import Free, LeastSquares, Problem, Simulation, Trial, laplace, minimize, profile
-from jaxkane.fit._analysis.score import beside_zero
-from jaxkane.fit._result.covariance import clustered_covariance
-from jaxkane.fit._result.residuals import autocorrelations
+from jaxkane.fit._score_test import beside_zero
+from jaxkane.fit._statistics import autocorrelations, clustered_covariance
 
 LOW, HIGH = 0.93, 0.97
 t = np.arange(0.0, 2.0, 0.1)

@@ -7,7 +7,7 @@ from slopes import differences, slopes
 from systems import Track
 
 from jaxkane.fit import LeastSquares, Problem, Trial, design, minimize
-from jaxkane.fit._analysis.information import covariance_of, goal_of
+from jaxkane.fit._design import covariance_of, goal_of
 
 t = np.arange(0.0, 4.0, 0.1)
 SIGMA = {"x": 0.01}

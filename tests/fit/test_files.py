@@ -8,7 +8,7 @@ import pytest
 from systems import POSED, PUSH, SEEN, TRIAL, Track
 from systems import T as t
 
-import jaxkane.fit._problem.linearization as linearization
+import jaxkane.fit._linearize as linearization
 from jaxkane.fit import (
     BFGS,
     GradientDescent,
@@ -21,7 +21,7 @@ from jaxkane.fit import (
     profile,
     read_trials,
 )
-from jaxkane.fit._problem.linearization import cost, linearize
+from jaxkane.fit._linearize import cost, linearize
 from jaxkane.sweep import grid
 
 
@@ -112,7 +112,7 @@ def test_a_checkpoint_that_cannot_be_read_is_named(how, problem, tmp_path):
 
 @pytest.mark.slow
 def test_bfgs_keeps_the_best_when_it_is_interrupted(problem, monkeypatch):
-    from jaxkane.fit._optimize import bfgs
+    from jaxkane.fit import _optimizers as bfgs
 
     whole = minimize(problem, BFGS())
     assert whole.status == "converged"
@@ -147,7 +147,7 @@ def test_many_starts_end_with_ctrl_c(problem):
 
 
 def test_studies_of_fits_end_with_ctrl_c(problem, monkeypatch):
-    import jaxkane.fit._analysis.profile as module
+    import jaxkane.fit._studies as module
 
     fit = minimize(problem, LeastSquares())
     stopped = lambda *args, **options: minimize(*args, **{**options, "callback": after(0)})  # noqa: E731

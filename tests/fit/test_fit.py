@@ -22,8 +22,8 @@ from jaxkane.fit import (
     identifiability,
     minimize,
 )
-from jaxkane.fit._problem.blocks import Blocks, eliminate
-from jaxkane.fit._problem.linearization import linearize
+from jaxkane.fit._block_lsq import Blocks, eliminate
+from jaxkane.fit._linearize import linearize
 
 TRUTH = DoublePendulum(mass=1.2, length=0.7)
 GUESS = DoublePendulum(mass=1.0, length=0.8)
@@ -143,7 +143,7 @@ def test_plain_coordinates_go_down(problem):
 
 
 def test_an_interrupted_fit_keeps_the_best(problem, monkeypatch):
-    import jaxkane.fit._optimize.gradient_descent as module
+    import jaxkane.fit._optimizers as module
 
     calls = []
 

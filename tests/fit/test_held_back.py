@@ -23,7 +23,7 @@ from jaxkane.fit import (
     load,
     minimize,
 )
-from jaxkane.fit._analysis.held_back import costs_by_trial
+from jaxkane.fit._validate import costs_by_trial
 
 
 class Falling(Track):

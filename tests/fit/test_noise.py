@@ -38,7 +38,7 @@ from jaxkane.fit import (
     smoothed,
     trajectories,
 )
-from jaxkane.fit._problem.linearization import cost, linearize
+from jaxkane.fit._linearize import cost, linearize
 
 EXACT = 1e-8
 STIFFNESS, DAMPING, Q = 4.0, 0.3, 0.2  # of the cart of 1 kg; the noise's intensity [m^2/s^3]

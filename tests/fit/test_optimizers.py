@@ -23,9 +23,9 @@ from jaxkane.fit import (
     multi_start,
     save_report,
 )
-from jaxkane.fit._optimize.steps import moved, refined
-from jaxkane.fit._problem.blocks import eliminate
-from jaxkane.fit._problem.linearization import linearize
+from jaxkane.fit._block_lsq import eliminate
+from jaxkane.fit._linearize import linearize
+from jaxkane.fit._optimize import moved, refined
 
 
 @dataclasses.dataclass(frozen=True)

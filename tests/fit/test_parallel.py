@@ -11,8 +11,8 @@ import jax
 import numpy as np
 import pytest
 
-from jaxkane.fit._problem import parallel
-from jaxkane.fit._problem.model import Unknowns
+from jaxkane.fit import _linearize as parallel
+from jaxkane.fit._model import Unknowns
 
 # Three pushed pendulums, windows of half a second: five a trial, so that the shares differ.
 SCRIPT = """

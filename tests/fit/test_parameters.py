@@ -8,9 +8,9 @@ from systems import POSED, TRIAL, Track
 
 import jaxkane as jk
 from jaxkane.fit import Delay, Free, Gain, Intensity, LeastSquares, Offset, Problem, Sigma, Trial, fit, profile
-from jaxkane.fit._analysis.plausible import plausible_of
-from jaxkane.fit._problem.bijections import Interval, log_gaussian_mass
-from jaxkane.fit._problem.entries import parameters_of
+from jaxkane.fit._bijections import Interval, log_gaussian_mass
+from jaxkane.fit._compare import plausible_of
+from jaxkane.fit._parameters import parameters_of
 
 
 class Springs(eqx.Module):

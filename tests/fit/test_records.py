@@ -8,7 +8,7 @@ from systems import Cart
 
 import jaxkane as jk
 from jaxkane.fit import Free, LeastSquares, Simulation, Trial, fit
-from jaxkane.fit._result.records import suspicious_records
+from jaxkane.fit._diagnostics import suspicious_records
 
 t = np.linspace(0.0, 4.0, 201)
 x = 0.3 * np.sin(2.0 * t) + 0.05 * np.sin(7.3 * t)

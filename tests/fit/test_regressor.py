@@ -12,10 +12,10 @@ import pytest
 import jaxkane as jk
 from jaxkane.catalog import CATALOG
 from jaxkane.fit import Inertia, Instants, Trial, base_parameters, first_guess, inertia_of, instants_of, regressor
-from jaxkane.fit._analysis.base_structure import random_states
-from jaxkane.fit._analysis.splines import max_spacing
-from jaxkane.fit._problem.entries import parameters_of
-from jaxkane.fit._result.bodies import bodies_in_words
+from jaxkane.fit._base_parameters import random_states
+from jaxkane.fit._kinematics import max_spacing
+from jaxkane.fit._parameters import parameters_of
+from jaxkane.fit._tables import bodies_in_words
 from jaxkane.joints import Actuator, Link, Loop, Site, hinge, mechanism
 
 FRICTION = ("k1", "k2")

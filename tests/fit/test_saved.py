@@ -6,7 +6,7 @@ from systems import PUSH, SEEN, Cart, Track
 from systems import T as t
 
 import jaxkane as jk
-from jaxkane._common.digest import differences
+from jaxkane._common.files import differences
 from jaxkane.fit import (
     GradientDescent,
     LeastSquares,
@@ -25,7 +25,7 @@ from jaxkane.fit import (
     report,
     trajectories,
 )
-from jaxkane.fit._problem.state_file import described
+from jaxkane.fit._io import described
 
 TRIALS = [Trial(t, {"x": SEEN + 0.01 * k}, {"push": PUSH}, sigma=0.1, initial={"x_dot": 0.0}) for k in (0, 1)]
 FREE = ["gain", "drift"]
@@ -61,7 +61,8 @@ def test_a_fit_comes_back_as_it_was(result, path):
 
 
 def test_to_look_at_a_fit_simulates_nothing(path, monkeypatch):
-    from jaxkane.fit._problem import linearization, problem
+    from jaxkane.fit import _linearize as linearization
+    from jaxkane.fit import _problem as problem
 
     again = load(path, pose())
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxkane.fit._problem import shifted
+from jaxkane.fit import _model as shifted
 
 earlier = jax.jit(shifted.earlier)
 T = jnp.linspace(0.0, 1.0, 41)

@@ -25,8 +25,8 @@ from jaxkane.fit import (
     save_report,
     suspects,
 )
-from jaxkane.fit._analysis.candidates import groups_of
-from jaxkane.fit._analysis.score import bic_change
+from jaxkane.fit._candidates import groups_of
+from jaxkane.fit._score_test import bic_change
 
 TS = np.linspace(0.0, 2.0, 41)
 NOISE = {"angle": 0.004, "rate": 0.02}

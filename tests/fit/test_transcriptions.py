@@ -9,21 +9,10 @@ import scipy.signal
 from systems import Cart
 
 import jaxkane as jk
-from jaxkane.fit import (
-    BFGS,
-    Delay,
-    Free,
-    Gain,
-    GradientDescent,
-    LeastSquares,
-    Problem,
-    Simulation,
-    Trial,
-    minimize,
-)
-from jaxkane.fit._optimize.bfgs import _step
-from jaxkane.fit._optimize.steps import solve_nuisance
-from jaxkane.fit._problem.blocks import Blocks, eliminate
+from jaxkane.fit import BFGS, Delay, Free, Gain, GradientDescent, LeastSquares, Problem, Simulation, Trial, minimize
+from jaxkane.fit._block_lsq import Blocks, eliminate
+from jaxkane.fit._optimize import solve_nuisance
+from jaxkane.fit._optimizers import _step
 
 TRUTH = Cart(mass=1.3, stiffness=5.0, damping=0.4)
 GUESS = Cart(mass=1.0, stiffness=4.0, damping=0.2)
@@ -159,7 +148,7 @@ def test_delays_gains_rates_and_gaps(result):
 
 @pytest.mark.slow
 def test_other_data_and_guesses_compile_nothing(result, runs, problem):
-    import jaxkane.fit._problem.programs as programs
+    import jaxkane.fit._linearize as programs
 
     before = programs.blocks_of.compiled._cached._cache_size()
     again = [Trial(r.t, r.measured, r.inputs, sigma=0.02, name="again") for r in runs]
@@ -333,7 +322,7 @@ class Pulled(jk.System):
 
 @pytest.mark.parametrize(("options", "kinks", "anew"), [({}, 11, False), ({"input_delay": ["left"]}, 2 * 11, True)])
 def test_inputs_that_share_their_times_share_their_kinks(options, kinks, anew, monkeypatch):
-    import jaxkane._simulation.ride as ride
+    import jaxkane._integrate.integrate as ride
 
     seen, original = [], ride.kinks_of
     monkeypatch.setattr(ride, "kinks_of", lambda *a, **more: seen.append(original(*a, **more)) or seen[-1])

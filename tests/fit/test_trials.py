@@ -24,7 +24,7 @@ from jaxkane.fit import (
     identifiability,
     read_trials,
 )
-from jaxkane.fit._result.covariance import check_level
+from jaxkane.fit._statistics import check_level
 
 t = np.linspace(0.0, 1.0, 11)
 good = np.sin(t)

@@ -10,7 +10,7 @@ from systems import Cart
 from test_transcriptions import GUESS, TRUTH, record
 
 import jaxkane as jk
-import jaxkane.fit._analysis.signs as signs
+import jaxkane.fit._studies as signs
 from jaxkane.fit import (
     Fit,
     Free,
@@ -30,10 +30,9 @@ from jaxkane.fit import (
     report,
     save_report,
 )
-from jaxkane.fit._optimize.steps import solve_nuisance
-from jaxkane.fit._result.notes import doubled_trials, empty_columns
-from jaxkane.fit._result.records import suspicious_records
-from jaxkane.fit._result.residuals import residual_test
+from jaxkane.fit._diagnostics import doubled_trials, empty_columns, suspicious_records
+from jaxkane.fit._optimize import solve_nuisance
+from jaxkane.fit._statistics import residual_test
 
 NAMES = ("mass", "stiffness", "damping")
 T = np.arange(0.0, 4.0, 0.1)

@@ -2,4 +2,4 @@
 
 from ._animate import Animation as Animation
 from ._animate import animate as animate
-from ._sketch import Sketch as Sketch
+from ._figures import Sketch as Sketch

@@ -1,19 +1,268 @@
-"""What is drawn of a system: a bicycle as a bicycle, any other by its bodies, points and frames."""
+"""What is drawn of a system along a motion, and the sketch that users draw with."""
 
 from __future__ import annotations
 
+import functools
+import weakref
+from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
-from .._description.bodies import Body
-from .._description.frames import Frame
-from .._description.motion import Motion
-from .._description.vectors import Vector
+from .._integrate.trajectory import Trajectory, reached_times
+from .._scalarjit.cache_key import version_of
+from .._scalarjit.captured_values import Reads
+from .._scalarjit.function import fused
+from .._scalarjit.linear import stack
+from .._system.bodies import Body
+from .._system.forces import Force, flatten_loads
+from .._system.frames import Frame
+from .._system.motion import Motion
+from .._system.points import Point
+from .._system.system import System
+from .._system.vectors import Vector
 from ..catalog import WhippleBicycle
-from ._builder import Builder
-from ._record import Record
-from ._sketch import CYCLE, Figure, Sketch
+from ._scene import Builder
+
+# On a light page and on a dark one. What is no name of these is taken for a colour of the browser's.
+COLORS = {
+    "paper": ("#fbfcfe", "#10141d"),
+    "grid": ("#d3d9e3", "#364159"),
+    "grey": ("#8a94a4", "#76829a"),
+    "ink": ("#1d2430", "#eef1f6"),
+    "gold": ("#b36b00", "#f0ab45"),
+    "blue": ("#1769b5", "#58aaf0"),
+    "green": ("#1f7a3d", "#5fc27a"),
+    "violet": ("#7a3fb0", "#b78cf0"),
+    "red": ("#c4302b", "#f0715f"),
+}
+CYCLE = ("gold", "blue", "green", "violet", "red")
+
+
+class Element(eqx.Module):
+    """Places (n, 3) in N, and how they are drawn: as a `kind` "line", "pairs", "dot", "center" or "trace".
+
+    `body`: the number of the body that the places turn with, where its frame does not spin with it.
+    """
+
+    places: Float[Array, "*times n 3"]
+    kind: str = eqx.field(static=True)
+    color: str = eqx.field(static=True)
+    width: float = eqx.field(static=True, default=1.5)
+    closed: bool = eqx.field(static=True, default=False)
+    fill: float = eqx.field(static=True, default=0.0)
+    body: int | None = eqx.field(static=True, default=None)
+    label: str = eqx.field(static=True, default="")
+
+
+Place = Vector | Point | Body
+
+
+class Sketch:
+    """The figure of a mechanism, drawn once and then carried by its motion.
+
+        def figure(system, motion, sketch):
+            sketch.line("gold", motion["O"], motion["A"])
+            sketch.trace("blue", motion["link2"])
+
+    A place is a `Point`, a `Body` (its mass centre) or a `Vector` from the origin. A colour is "ink", "grey", "gold",
+    "blue", "green", "violet" or "red", each legible on light and dark pages, or any colour of CSS such as "#4fa3e3".
+    """
+
+    def __init__(self, motion: Motion):
+        self.motion = motion
+        self.elements: list[Element] = []
+
+    def _add(self, places: Any, kind: str, color: str, turns_with: Body | None = None, **style: Any) -> None:
+        body = None if turns_with is None else self.motion.bodies.index(turns_with)
+        self.elements.append(Element(places, kind, color, body=body, **style))
+
+    def _at(self, place: Place) -> Float[Array, 3]:
+        if isinstance(place, Body):
+            place = place.center
+        return (place.position if isinstance(place, Point) else place).to(self.motion.N)
+
+    def line(
+        self,
+        color: str,
+        *places: Place,
+        width: float = 2.0,
+        closed: bool = False,
+        fill: float = 0.0,
+        turns_with: Body | None = None,
+    ) -> None:
+        """A line through places; `width` in pixels, `fill` the opacity of what a closed one encloses."""
+        at = jnp.stack([self._at(place) for place in places])
+        self._add(at, "line", color, turns_with, width=width, closed=closed, fill=fill)
+
+    def circle(
+        self,
+        color: str,
+        center: Place,
+        a: Vector,
+        b: Vector,
+        radius: Any,
+        *,
+        width: float = 2.0,
+        fill: float = 0.0,
+        turns_with: Body | None = None,
+    ) -> None:
+        """A circle in the plane of two unit vectors."""
+        self._add(
+            self._around(center, a, b, radius, 40), "line", color, turns_with, width=width, closed=True, fill=fill
+        )
+
+    def wheel(self, color: str, body: Body, radius: Any, *, axis: int = 2, spokes: int = 12) -> None:
+        """A spoked wheel about the mass centre of a body, and its `axis` 1, 2 or 3; it turns with the body."""
+        x, y, z = body.frame.x, body.frame.y, body.frame.z
+        a, b = {1: (y, z), 2: (z, x), 3: (x, y)}[axis]
+        self.circle(color, body, a, b, radius, width=3.5, fill=0.05, turns_with=body)
+        rim = self._around(body, a, b, radius, spokes)
+        hub = jnp.broadcast_to(self._at(body), rim.shape)
+        self._add(jnp.stack([hub, rim], axis=1).reshape(-1, 3), "pairs", color, body, width=0.7)
+        self.dot(color, body, 3.0)
+
+    def _around(self, center: Place, a: Vector, b: Vector, radius: Any, n: int) -> Float[Array, "n 3"]:
+        a_N, b_N = a.to(self.motion.N), b.to(self.motion.N)
+        angles = 2.0 * np.pi * np.arange(n)[:, None] / n
+        cos, sin = (jnp.asarray(f(angles), dtype=a_N.dtype) for f in (np.cos, np.sin))
+        return self._at(center)[None, :] + jnp.asarray(radius, dtype=a_N.dtype) * (cos * a_N[None] + sin * b_N[None])
+
+    def dot(self, color: str, place: Place, radius: float = 4.0, label: str = "") -> None:
+        """A dot; `radius` in pixels."""
+        self._add(self._at(place)[None], "dot", color, width=radius, label=label)
+
+    def mass_center(self, color: str, place: Place, radius: float = 6.0, label: str = "") -> None:
+        """The quartered disc that marks a mass centre; `radius` in pixels."""
+        self._add(self._at(place)[None], "center", color, width=radius, label=label)
+
+    def trace(self, color: str, *places: Place) -> None:
+        """The paths that places leave behind."""
+        for place in places:
+            self._add(self._at(place)[None], "trace", color, width=1.2)
+
+    def axes(self, center: Place, frame: Frame, length: Any) -> None:
+        """The axes 1, 2 and 3 of a frame in red, green and blue."""
+        start = center.center.position if isinstance(center, Body) else center
+        start = start.position if isinstance(start, Point) else start
+        for color, axis in zip(("red", "green", "blue"), (frame.x, frame.y, frame.z), strict=True):
+            self.line(color, start, start + length * axis)
+
+
+Figure = Callable[[System, Motion, Sketch], None]
+
+
+def rotation(frame: Frame, N: Frame) -> Float[Array, "3 3"]:
+    """Takes components in the frame to components in N, without a frame's name for either."""
+    return stack([unit.components_in(N) for unit in (frame.x, frame.y, frame.z)]).T
+
+
+class Record(eqx.Module):
+    """Bodies with a place, named points, frames and the elements of a figure, at n_t instants; components in N.
+
+    - `orientation` (n_t, b, 3, 3): takes components in a body's frame to components in N; `place` (n_t, b, 3): mass
+        centres; `spin` (n_t, b, 3): angular velocity relative to the frame, in the frame.
+    - `mass` (b,), `inertia` (b, 3, 3), in the bodies' frames.
+    - `points` (n_t, p, 3), the origin among them; `frames` (n_t, f, 3, 3).
+    - `forces` (n_t, l, 3): on mass centres, for the direction of gravity.
+    """
+
+    t: Any
+    orientation: Any
+    place: Any
+    spin: Any
+    mass: Any
+    inertia: Any
+    points: Any
+    frames: Any
+    forces: Any
+    elements: list[Element]
+    bodies: tuple[str, ...] = eqx.field(static=True)
+    numbers: tuple[int, ...] = eqx.field(static=True)
+    point_names: tuple[str, ...] = eqx.field(static=True)
+
+
+def record(system: System, trajectory: Trajectory, figure: Figure | None) -> Record:
+    """Everything at the times that the trajectory reached.
+
+    **Raises:** `ValueError` for a batch, and for a trajectory of another system, or one that reached fewer than two of
+    its times.
+    """
+    name = type(system).__name__
+    reached = reached_times("animate", system, trajectory)
+    numbers, rest = eqx.partition(system, eqx.is_array)
+    drawing = None if figure is None else _Drawing(weakref.ref(figure), Reads(figure).version)
+    t, q, u, u_dep = (np.asarray(x)[reached] for x in (trajectory.t, trajectory.q, trajectory.u, trajectory.u_dep))
+    u = np.concatenate([u, u_dep], axis=1)
+    found = jax.tree.map(np.asarray, _along(numbers, rest, drawing, version_of(system), t, q, u))
+    if not found.bodies:
+        raise ValueError(f"animate({name}): no body has a position. Give points their places, see jaxkane.Point.at.")
+    return eqx.tree_at(lambda r: (r.mass, r.inertia), found, (found.mass[0], found.inertia[0]))
+
+
+class _Drawing(eqx.Module):
+    """A figure, by a weak reference: no program keeps alive what it holds; and a digest of all that its code reads."""
+
+    figure: Any = eqx.field(static=True)
+    version: bytes = eqx.field(static=True)
+
+
+@functools.partial(jax.jit, static_argnums=(1, 2, 3))
+def _along(numbers, rest, drawing, version, t, q, u):
+    # A picture's program runs once or twice: it should compile quickly, which one function for one instant does.
+    system = eqx.combine(numbers, rest)
+    return jax.lax.map(lambda now: _instant(system, drawing, *now), (t, q, u))
+
+
+@fused
+def _instant(system: System, drawing: _Drawing | None, t, q, u) -> Any:
+    figure = None if drawing is None else drawing.figure()
+    motion = system.motion(t, q, u)
+    N, dtype = motion.N, q.dtype
+    placed = [i for i, body in enumerate(motion.bodies) if body.center.has_position]
+    bodies = [motion.bodies[i] for i in placed]
+    points = {"O": N.vector(0.0, 0.0, 0.0)}
+    points |= {name: point.position for name, point in motion.points.items() if point.has_position}
+    values = dict.fromkeys((*system.inputs, *system.states), jnp.zeros((), dtype))
+    centers = [body.center for body in bodies]
+    forces = [
+        load.vector
+        for load in flatten_loads(system.loads(t, q, u, motion, values))
+        if isinstance(load, Force) and load.point in centers
+    ]
+    sketch = Sketch(motion)
+    if figure is not None:
+        figure(system, motion, sketch)
+
+    def row(vector, frame=N):
+        return stack([vector.components_in(frame)])[0].astype(dtype)
+
+    def table(rows, *shape):
+        return jnp.stack(rows) if rows else jnp.zeros((0, *shape), dtype)
+
+    def rotations(frames):
+        return table([rotation(frame, N).astype(dtype) for frame in frames], 3, 3)
+
+    return Record(
+        t=t,
+        orientation=rotations([b.frame for b in bodies]),
+        place=table([row(b.center.position) for b in bodies], 3),
+        spin=table([row(b.angular_velocity - b.frame.angular_velocity, b.frame) for b in bodies], 3),
+        mass=stack([[b.mass for b in bodies]])[0].astype(dtype),
+        inertia=table([stack(b.inertia).astype(dtype) for b in bodies], 3, 3),
+        points=table([row(position) for position in points.values()], 3),
+        frames=rotations(list(motion.frames.values())),
+        forces=table([row(force) for force in forces], 3),
+        elements=sketch.elements,
+        bodies=tuple(b.name for b in bodies),
+        numbers=tuple(placed),
+        point_names=tuple(points),
+    )
+
 
 _AROUND = np.linspace(0.0, 2.0 * np.pi, 33)[:-1]
 

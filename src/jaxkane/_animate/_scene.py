@@ -1,8 +1,4 @@
-"""A motion as rigid parts that move and lines that are fixed in them. Knows numbers; knows no system and no page.
-
-Only the parts' places and orientations are kept over time; a vertex of a line is kept once, in the part that carries
-it. That is what makes a page small.
-"""
+"""A motion as rigid parts that move, and from where it is seen. Knows numbers; knows no system and no page."""
 
 from __future__ import annotations
 
@@ -13,7 +9,92 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
-from ._view import View
+from .._common.lookup import real_number
+
+
+@dataclasses.dataclass(frozen=True)
+class View:
+    """From where it is seen: towards `center` (3,) [m], or along with the motion; z is up on the page.
+
+    Angles in radians, about the vertical and above the horizon; `span` [m] is what the shorter side of the page shows.
+    """
+
+    center: np.ndarray
+    span: float
+    azimuth: float
+    elevation: float
+    follow: bool
+    span_following: float
+
+    def seen_from(self, azimuth: float | None, elevation: float | None) -> View:
+        """The view from other angles [degrees], where these are given.
+
+        **Raises:** `ValueError` for what is no finite number.
+        """
+        angles = {"azimuth": azimuth, "elevation": elevation}
+        angles = {key: real_number(x, f"`{key}`") for key, x in angles.items() if x is not None}
+        wrong = [key for key, x in angles.items() if not np.isfinite(x)]
+        if wrong:
+            raise ValueError(f"`{wrong[0]}` must be finite, got {angles[wrong[0]]}.")
+        return dataclasses.replace(self, **{key: float(np.deg2rad(x)) for key, x in angles.items()})
+
+
+UPRIGHT = {
+    "x": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+    "-x": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [-1.0, 0.0, 0.0]]),
+    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "-y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]]),
+    "z": np.eye(3),
+    "-z": np.diag([1.0, -1.0, -1.0]),
+}
+"""By the axis of N that is up: components in N -> on the page, where z is up."""
+
+
+def which_way_is_up(forces: np.ndarray) -> str:
+    """The axis of N that is nearest to the opposite of gravity: of the constant forces (n_t, l, 3) on mass centres."""
+    constant = np.ptp(forces, axis=0).max(axis=1, initial=0.0) <= 1e-9 * (np.abs(forces).max(initial=0.0) + 1e-300)
+    down = forces[0, constant].sum(axis=0)
+    if not np.any(down):
+        return "z"
+    axis = int(np.argmax(np.abs(down)))
+    return ("-" if down[axis] > 0 else "") + "xyz"[axis]
+
+
+def view_of(x: np.ndarray, moves: np.ndarray, leader: np.ndarray, follow: bool | None) -> View:
+    """A view of vertices (F, V, 3): from the front of what moves in a plane, else obliquely from above.
+
+    `moves` (V,): which vertices belong to parts; the others stand still.
+    """
+    low, high = x.min(axis=(0, 1)), x.max(axis=(0, 1))
+    center = 0.5 * (low + high)
+    reach = float(np.linalg.norm(x - center, axis=-1).max())
+    carried = x[:, moves] if moves.any() else x
+    size = float(np.linalg.norm(carried - leader[:, None], axis=-1).max())
+    travel = float(np.linalg.norm(np.ptp(leader, axis=0)))
+    if follow is None:
+        follow = travel > 4.0 * size
+    depth = np.abs(x - x[:1]).max(axis=(0, 1))  # how far anything moves along each axis
+    flat = depth <= 1e-5 * max(reach, 1e-12)
+    azimuth, elevation = np.deg2rad([-62.0, 18.0])
+    if flat.sum() == 1:
+        azimuth, elevation = np.deg2rad([(0.0, 0.0), (-90.0, 0.0), (-90.0, 90.0)][int(np.argmax(flat))])
+    return View(center, 2.15 * max(reach, 1e-9), float(azimuth), float(elevation), bool(follow), 2.2 * max(size, 1e-9))
+
+
+def project(x: np.ndarray, target: np.ndarray, view: View, span: float) -> np.ndarray:
+    """To the right, upwards (in spans of the page's shorter side) and away from the eye (n, V, 3): a mild perspective.
+
+    The viewer's script does the same.
+    """
+    c, s = np.cos([view.azimuth, view.elevation]), np.sin([view.azimuth, view.elevation])
+    right = np.array([-s[0], c[0], 0.0])
+    above = np.array([-s[1] * c[0], -s[1] * s[0], c[1]])
+    away = -np.array([c[1] * c[0], c[1] * s[0], s[1]])
+    r = (x - target) / span
+    depth = r @ away
+    scale = 1.0 / np.maximum(1.0 + depth / 3.0, 0.05)
+    return np.stack([(r @ right) * scale, (r @ above) * scale, depth], axis=-1)
+
 
 FIXED = -1  # the owner of what stands still
 
@@ -70,3 +151,119 @@ class Scene:
                 x[:, mine] = np.einsum("nij,vj->nvi", R, self.vertex[mine])
             x[:, mine] += position[:, k, None]
         return x, leader
+
+
+_SAME = 1e-6  # relative to the size of the scene: what moves less stands still
+
+
+class Builder:
+    """Gathers parts, vertices and shapes over F instants."""
+
+    def __init__(self, orientation: np.ndarray, place: np.ndarray, turned: np.ndarray, scale: float):
+        self.n_t = len(place)
+        # Far from the origin, and in single precision above all, nothing stands perfectly still.
+        self.tolerance = _SAME * scale + 16.0 * float(np.finfo(place.dtype).eps) * float(np.abs(place).max(initial=0.0))
+        # Bodies whose frames do not spin with them come twice: as their frame, and turned.
+        self.rotations = [*np.moveaxis(orientation, 1, 0), *np.moveaxis(turned, 1, 0)]
+        self.origins = [*np.moveaxis(place, 1, 0)] * 2
+        self.n_b = place.shape[1]
+        spins = np.abs(turned - orientation).max(axis=(0, 2, 3)) > 1e-12
+        self.turned = [k + self.n_b * bool(spins[k]) for k in range(self.n_b)]
+        self.paths: list[np.ndarray] = []
+        self.vertices: list[np.ndarray] = []
+        self.owners: list[tuple[str, int]] = []
+        self.shapes: list[Shape] = []
+
+    def shape(self, kind: str, color: str, count: int, **style: Any) -> None:
+        """A shape of the `count` vertices that were added last."""
+        self.shapes.append(Shape(kind, color, len(self.vertices) - count, count, **style))
+
+    def local(self, vertices: np.ndarray, body: int) -> None:
+        """Vertices (n, 3) that are fixed in a body, and turn with it."""
+        for x in vertices:
+            self._keep(x, "part", self.turned[body])
+
+    def moving(self, x: np.ndarray, body: int | None = None) -> None:
+        """Vertices (F, n, 3) in N, kept in the part in which they do not move.
+
+        `body` says which part they are to turn with; they are given as if it did not spin.
+        """
+        if body is not None:
+            self.local(self._seen_from(self.rotations[body], self.origins[body], x).mean(axis=0), body)
+            return
+        if np.abs(x - x[:1]).max() <= self.tolerance:
+            for vertex in x.mean(axis=0):
+                self._keep(vertex, "fixed", FIXED)
+            return
+        for k, (R, origin) in enumerate(zip(self.rotations, self.origins, strict=True)):
+            seen = self._seen_from(R, origin, x)
+            if np.abs(seen - seen[:1]).max() <= self.tolerance:
+                for vertex in seen.mean(axis=0):
+                    self._keep(vertex, "part", k)
+                return
+        if x.shape[1] == 1:
+            self._keep(np.zeros(3), "path", self._path(x[:, 0]))
+        elif not self._turn_about_the_first(x):
+            for i in range(x.shape[1]):
+                self.moving(x[:, i : i + 1])
+
+    def _turn_about_the_first(self, x: np.ndarray) -> bool:
+        """Whether all vertices are fixed in a frame that turns as one of the bodies, or not at all, about the first."""
+        still = np.broadcast_to(np.eye(3), (self.n_t, 3, 3))
+        for R in (still, *self.rotations[: self.n_b]):
+            seen = self._seen_from(R, x[:, 0], x)
+            if np.abs(seen - seen[:1]).max() <= self.tolerance:
+                self.rotations.append(R)
+                self.origins.append(x[:, 0])
+                for vertex in seen.mean(axis=0):
+                    self._keep(vertex, "part", len(self.rotations) - 1)
+                return True
+        return False
+
+    @staticmethod
+    def _seen_from(R: np.ndarray, origin: np.ndarray, x: np.ndarray) -> np.ndarray:
+        return np.einsum("tji,tnj->tni", R, x - origin[:, None])
+
+    def _path(self, x: np.ndarray) -> int:
+        for k, known in enumerate(self.paths):
+            if np.abs(known - x).max() <= self.tolerance:
+                return k
+        self.paths.append(x)
+        return len(self.paths) - 1
+
+    def _keep(self, vertex: np.ndarray, kind: str, number: int) -> None:
+        self.vertices.append(np.asarray(vertex, dtype=float))
+        self.owners.append((kind, number))
+
+    def arrays(self, upright: np.ndarray) -> dict[str, np.ndarray]:
+        """Arrays of a `Scene`, turned by `upright` (3, 3), parts that own nothing left out."""
+        used = sorted({number for kind, number in self.owners if kind == "part"})
+        parts = {k: i for i, k in enumerate(used)}
+        number = {"part": parts.__getitem__, "path": lambda k: len(used) + k, "fixed": lambda k: FIXED}
+        owner = np.array([number[kind](k) for kind, k in self.owners], dtype=np.int16)
+        vertex = np.array(self.vertices).reshape(-1, 3)
+        vertex[owner == FIXED] = vertex[owner == FIXED] @ upright.T
+        quaternions = [_quaternions(upright @ self.rotations[k]) for k in used]
+        origins = [self.origins[k] @ upright.T for k in used] + [x @ upright.T for x in self.paths]
+        empty = np.zeros((self.n_t, 0, 3))
+        return {
+            "rotation": np.stack(quaternions, axis=1) if used else np.zeros((self.n_t, 0, 4)),
+            "position": np.stack(origins, axis=1) if origins else empty,
+            "vertex": vertex,
+            "owner": owner,
+        }
+
+
+def _quaternions(R: np.ndarray) -> np.ndarray:
+    """Of rotation matrices (F, 3, 3), the signs such that neighbours are close."""
+    e = Rotation.from_matrix(R).as_quat()
+    turned = np.sum(e[1:] * e[:-1], axis=1) < 0
+    return e * np.concatenate([[1], np.where(np.cumsum(turned) % 2, -1, 1)])[:, None]
+
+
+def turned_by(t: np.ndarray, spin: np.ndarray, orientation: np.ndarray) -> np.ndarray:
+    """Orientations (n_t, b, 3, 3) of bodies that spin in them at `spin` (n_t, b, 3), each about a fixed axis."""
+    steps = 0.5 * (spin[1:] + spin[:-1]) * np.diff(t)[:, None, None]
+    angle = np.concatenate([np.zeros_like(spin[:1]), np.cumsum(steps, axis=0)])
+    spun = Rotation.from_rotvec(angle.reshape(-1, 3)).as_matrix().reshape(orientation.shape)
+    return orientation @ spun

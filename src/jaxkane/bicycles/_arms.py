@@ -10,20 +10,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._description.bodies import Body
-from .._description.frames import Frame
-from .._description.loads import Torque
-from .._description.parameters import in_batches, parameter
-from .._description.points import Point
-from .._method.checks import is_concrete
-from .._scalars.components import add
-from .._scalars.types import Component, Scalar
+from .._kane.checks import is_concrete
+from .._scalarjit.components import Component, Scalar, add
+from .._system.bodies import Body
+from .._system.forces import Torque
+from .._system.frames import Frame
+from .._system.parameters import in_batches, parameter
+from .._system.points import Point
 from ..catalog.bicycle import FAR
-from ._part import Part
+from ._parts import Part
 from ._rider import Rider
 
 if TYPE_CHECKING:
     from ._bicycle import Bicycle
+
 
 _SIDES = {"left": -1.0, "right": 1.0}
 _JOINTS = ("shoulder_flexion", "shoulder_rotation", "elbow")

@@ -16,34 +16,37 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._common.lookup import refuse_unknown
-from .._description.frames import Frame
-from .._description.motion import Motion
-from .._description.parameters import parameters_in, with_parameters
-from .._description.points import Point
-from .._description.vectors import Vector
-from .._method.right_hand_side import named_row
-from .._method.values import as_row
-from .._scalars.components import add
-from .._scalars.types import Component
+from .._kane.arguments import as_row
+from .._kane.rhs import named_row
+from .._scalarjit.components import Component, add
+from .._system.frames import Frame
+from .._system.motion import Motion
+from .._system.parameters import parameters_in, with_parameters
+from .._system.points import Point
+from .._system.vectors import Vector
 from ..catalog.bicycle import WhippleBicycle
 from ._files import as_meijaard, read_yaml
 from ._ground import Ground
-from ._head import HeadTwist
 from ._kinematics import clearance, motion_of, off_road, place_rates
-from ._names import (
+from ._part_methods import (
+    as_tuple,
+    by_name,
+    commanded,
     deflections_of_tyres,
     front_speeds,
+    label_of,
     lateral_names,
     load_transfers,
     mode_groups,
     needs_trim,
     of_parts,
+    refuse_misfits,
     road_coordinates,
     slip_speeds,
 )
-from ._part import Part
-from ._part_methods import as_tuple, by_name, commanded, label_of, refuse_misfits
+from ._parts import Part
 from ._rider import rider_of
+from ._steering import HeadTwist
 from ._tyre import Tyre
 from ._tyre_forces import deflection_rates, loads_of_tyres, overloaded, transfer_rates, tyre_forces, tyre_loads
 

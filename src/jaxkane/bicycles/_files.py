@@ -17,9 +17,8 @@ import math
 import os
 from collections.abc import Mapping
 
-from .._common.lookup import hint
-from .._common.real_numbers import decimal_number
-from ..catalog._bicycle_file import lines_of
+from .._common.lookup import decimal_number, hint
+from ..catalog._entry import lines_of
 
 _HEADER = ("parameterization", "parameters", "rider", "description", "values")
 

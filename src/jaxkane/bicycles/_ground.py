@@ -15,17 +15,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._description.frames import Frame
-from .._description.parameters import learned, parameter
-from .._description.points import Point
-from .._description.vectors import Vector
-from .._scalars.components import add, dot, mul, sub
-from .._scalars.types import Component, Scalar
+from .._scalarjit.components import Component, Scalar, add, dot, mul, sub
+from .._system.frames import Frame
+from .._system.parameters import learned, parameter
+from .._system.points import Point
+from .._system.vectors import Vector
 from ..catalog.bicycle import TILT
-from ._part import check_parameters
+from ._parts import check_parameters
 
 if TYPE_CHECKING:
     from ._tyre import Contact
+
 
 Pair = tuple[Component, Component]
 TURN = 2.0 * math.pi

@@ -7,15 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import jax.numpy as jnp
 
-from .._description.bodies import Body
-from .._description.frames import Frame
-from .._description.motion import Motion
-from .._description.points import Point, inertial
-from .._description.vectors import Vector
-from .._scalars.components import add
-from .._scalars.types import Component
-from ._names import FRONT, REAR
-from ._part_methods import moved
+from .._scalarjit.components import Component, add
+from .._system.bodies import Body
+from .._system.frames import Frame
+from .._system.motion import Motion
+from .._system.points import Point, inertial
+from .._system.vectors import Vector
+from ._part_methods import FRONT, REAR, moved
 from ._tyre import Contact, Tyre, rolling_speed
 
 if TYPE_CHECKING:

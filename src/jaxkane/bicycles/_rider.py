@@ -11,16 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._description.bodies import Body
-from .._description.frames import Frame
-from .._description.loads import Torque
-from .._description.parameters import in_batches, parameter
-from .._description.points import Point
-from .._method.checks import is_concrete, why_no_body
-from .._scalars.types import Scalar
+from .._kane.checks import is_concrete, why_no_body
+from .._scalarjit.components import Scalar
+from .._system.bodies import Body
+from .._system.forces import Torque
+from .._system.frames import Frame
+from .._system.parameters import in_batches, parameter
+from .._system.points import Point
 from ..catalog import read_bicycle_file
 from ..catalog.bicycle import ABOVE_GROUND, FAR, TILT
-from ._part import Part
+from ._parts import Part
 
 if TYPE_CHECKING:
     from ._bicycle import Bicycle

@@ -1,15 +1,59 @@
-"""What acts on the steer axis: dry friction, and a motor with its gear, rotor, lag and delay. Knows one joint."""
+"""What acts at the steering head: friction, a motor, torsion of the head, and steering by wire."""
 
 from __future__ import annotations
 
+from typing import Any
+
+import equinox as eqx
 import jax.numpy as jnp
 
-from .._description.loads import Torque
-from .._description.parameters import parameter
-from .._scalars.components import mul
-from .._scalars.types import Component, Scalar
+from .._scalarjit.components import Component, Scalar, mul
+from .._system.bodies import Body
+from .._system.forces import Torque
+from .._system.frames import Frame
+from .._system.parameters import parameter
+from .._system.points import Point
+from ..catalog.bicycle import ABOVE_GROUND, FAR
 from ..loads import coulomb, rotor
-from ._part import Part
+from ._parts import Part
+
+
+class HeadTwist(Part):
+    """Torsion of the frame at the steering head: one joint with a spring and a damper, before the steer axis.
+
+    The front assembly turns by "head_twist" [rad] about an axis through the steer axis, across it and in the plane of
+    the frame, as in Sharp and Alstead (1980), *The influence of structural flexibilities on the straight-running
+    stability of motorcycles*.
+
+    **Arguments:** `stiffness` [N m/rad], `damping` [N m s/rad]; `height` [m] of the axis of torsion, upwards along the
+    steer axis from its point that is nearest to the rear wheel's centre.
+    """
+
+    stiffness: Scalar = parameter(positive=True, unit="N m/rad")
+    damping: Scalar = parameter(0.0, unit="N m s/rad")
+    height: Scalar = parameter(0.0, within=(-FAR, FAR), unit="m")
+
+    coordinates = ("head_twist",)
+    speeds = ("head_twist_rate",)
+    units = {"head_twist": "rad", "head_twist_rate": "rad/s"}
+
+    def check(self, bicycle):
+        if bicycle.head is not self:
+            raise ValueError("A HeadTwist stands between frame and fork: with_parts(head=HeadTwist(...)).")
+
+    def turned(self, tilted: Frame, S: Point, q: Any, u: Any) -> tuple[Frame, Point]:
+        """The frame along the steer axis and the point on it, as they carry the front assembly."""
+        axis = S.fixed(-self.height * tilted.z)
+        twisted = tilted.rotate(1, q["head_twist"], u["head_twist_rate"], "head")
+        return twisted, axis.fixed(self.height * twisted.z)
+
+    def motion(self, bicycle, motion, t, q, u):
+        return motion.extended(frames={"head": motion["C"].parent})
+
+    def loads(self, bicycle, t, q, u, motion, values):
+        torque = -self.stiffness * q["head_twist"] - self.damping * u["head_twist_rate"]
+        head = motion["head"]
+        return Torque(torque * head.x, head, reaction_on=motion["B"])
 
 
 class SteeringFriction(Part):
@@ -88,3 +132,63 @@ class SteeringMotor(Part):
         if self.lag is not None:
             rates.append((self._asked(now) - now["steer_motor_torque"]) / self.lag)
         return rates
+
+
+class SteerByWire(Part):
+    """A handlebar that turns about the steer axis apart from the fork, and motors that couple them.
+
+        torque on the fork = stiffness * (ratio * handlebar - steer) + damping * (ratio * handlebar_rate - steer_rate)
+        torque on the handlebar = handlebar_torque - feedback * ratio * torque on the fork
+
+    each with its reaction on the frame. The coordinate "handlebar" [rad] is the handlebar's angle, "handlebar_torque"
+    [N m] what the rider does to it. The bicycle's mH, xH, zH and IH.. are then those of the fork alone, S in the
+    files of BicycleParameters, and the handlebar's are given here, G in those files.
+
+    **Arguments:**
+
+    - `mass` [kg]; `x`, `z` [m] of the mass centre, of the upright bicycle and from the rear contact; `Ixx`, `Iyy`,
+        `Izz`, `Ixz` [kg m^2] in the axes of the frame: of the handlebar.
+    - `stiffness` [N m/rad], `damping` [N m s/rad] of the coupling; `ratio`: the fork's angle over the handlebar's;
+        `feedback`: the share of the fork's torque that the rider feels, 1 for a coupling that takes and gives no work
+        but by its damping.
+    - `command`: the input that has the torque on the fork, "steer_command" where it goes through a `SteeringMotor`:
+        `steering=(SteerByWire(..., command="steer_command"), SteeringMotor(...))`.
+    """
+
+    mass: Scalar = parameter(positive=True, unit="kg")
+    x: Scalar = parameter(within=(-FAR, FAR), unit="m")
+    z: Scalar = parameter(within=ABOVE_GROUND, unit="m")
+    Ixx: Scalar = parameter(positive=True, unit="kg m^2")
+    Iyy: Scalar = parameter(positive=True, unit="kg m^2")
+    Izz: Scalar = parameter(positive=True, unit="kg m^2")
+    stiffness: Scalar = parameter(positive=True, unit="N m/rad")
+    Ixz: Scalar = parameter(0.0, unit="kg m^2")
+    damping: Scalar = parameter(0.0, unit="N m s/rad")
+    ratio: Scalar = parameter(1.0)
+    feedback: Scalar = parameter(1.0)
+    command: str = eqx.field(static=True, default="steer_torque")
+
+    coordinates = ("handlebar",)
+    speeds = ("handlebar_rate",)
+    inputs = ("handlebar_torque",)
+    units = {"handlebar": "rad", "handlebar_rate": "rad/s", "handlebar_torque": "N m"}
+
+    def motion(self, bicycle, motion, t, q, u):
+        turned = motion["C"].parent.rotate(3, q["handlebar"], u["handlebar_rate"], "handlebar")
+        G = turned.rotate(2, -bicycle.lam, 0.0, "grips")  # aligned with the rear frame at a zero angle
+        x, z = bicycle.steer_point
+        center = motion["S"].fixed(((self.x - x) * G.x + (self.z - z) * G.z).express(turned))
+        inertia = ((self.Ixx, 0.0, self.Ixz), (0.0, self.Iyy, 0.0), (self.Ixz, 0.0, self.Izz))
+        bar = Body(self.mass, inertia, center, G, name="handlebar")
+        return motion.extended([bar], frames={"grips": G})
+
+    def _torque(self, q, u):
+        apart, sliding = self.ratio * q["handlebar"] - q["steer"], self.ratio * u["handlebar_rate"] - u["steer_rate"]
+        return self.stiffness * apart + self.damping * sliding
+
+    def commands(self, bicycle, t, q, u, motion, values):
+        return {self.command: self._torque(q, u)}
+
+    def loads(self, bicycle, t, q, u, motion, values):
+        torque = values["handlebar_torque"] - self.feedback * self.ratio * self._torque(q, u)
+        return Torque(torque * motion["C"].parent.z, motion["handlebar"], reaction_on=motion["rear frame"])

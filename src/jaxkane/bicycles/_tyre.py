@@ -8,15 +8,14 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._description.bodies import Body
-from .._description.loads import Force, Torque
-from .._description.parameters import parameter
-from .._description.points import Point
-from .._description.vectors import Vector
-from .._scalars.components import is_zero, mul, sub
-from .._scalars.types import Component, Scalar
-from ._part import called, check_parameters
-from ._slip import LongitudinalSlip, Slip
+from .._scalarjit.components import Component, Scalar, is_zero, mul, sub
+from .._system.bodies import Body
+from .._system.forces import Force, Torque
+from .._system.parameters import parameter
+from .._system.points import Point
+from .._system.vectors import Vector
+from ._parts import called, check_parameters
+from ._tyre_laws import LongitudinalSlip, Slip
 
 
 class Contact(NamedTuple):

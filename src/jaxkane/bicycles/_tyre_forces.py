@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
-from .._description.motion import Motion
-from .._scalars.components import component, total
-from .._scalars.types import Component
+from .._scalarjit.components import Component, component, total
+from .._system.motion import Motion
 from ._kinematics import wheels
-from ._names import FRONT, REAR, load_transfers, tyres_of
+from ._part_methods import FRONT, REAR, load_transfers, tyres_of
 from ._tyre import Tyre
 
 if TYPE_CHECKING:

@@ -5,9 +5,9 @@
 the site's catalogue shows it.
 """
 
-from ._bicycle_file import read_bicycle_file as read_bicycle_file
 from ._entry import CATALOG as CATALOG
 from ._entry import Entry as Entry
+from ._entry import read_bicycle_file as read_bicycle_file
 from .aircraft import Aircraft as Aircraft
 from .aircraft import AircraftEulerParameters as AircraftEulerParameters
 from .bar_with_piston import BarWithPiston as BarWithPiston

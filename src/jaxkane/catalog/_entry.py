@@ -1,12 +1,16 @@
-"""The table of the catalogue: an example of every system, so that laws can be run over all of them."""
+"""The table of the catalogue, and files of parameters of a bicycle."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+import math
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TypeVar
 
-from .._description.system import System
+from .._common.lookup import decimal_number
+from .._system.system import System
 
 _Class = TypeVar("_Class", bound=type[System])
 
@@ -55,3 +59,51 @@ def entry(
         return cls
 
     return enter
+
+
+def lines_of(path: str | os.PathLike[str]) -> list[str]:
+    """The lines of a text file; the mark at its beginning that some editors write is none of its text.
+
+    **Raises:** `ValueError` for a file that is no text.
+    """
+    try:
+        return Path(path).read_text(encoding="utf-8-sig").splitlines()
+    except UnicodeDecodeError:
+        raise ValueError(f"{os.fspath(path)} is no text file in UTF-8.") from None
+
+
+def read_bicycle_file(
+    path: str | os.PathLike[str], known: Sequence[str] | None = None
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Values and standard deviations by name, from a text file of BicycleParameters.
+
+    **Arguments:** `path`; `known`: names to accept, by default all.
+
+    **Raises:** `ValueError` with one line for every entry that is malformed, unknown or repeated.
+    """
+    values: dict[str, float] = {}
+    deviations: dict[str, float] = {}
+    lines: dict[str, int] = {}
+    faults: list[str] = []
+    for number, line in enumerate(lines_of(path), start=1):
+        line = line.strip()
+        if not line or line.startswith("#"):
+            continue
+        name, equals, entry = (part.strip() for part in line.partition("="))
+        value, _, deviation = entry.partition("+/-")
+        try:
+            pair = decimal_number(value.strip()), decimal_number(deviation.strip() or "0")
+        except ValueError:
+            pair = (math.nan, math.nan)
+        if not equals or not name or not pair[1] >= 0:
+            faults.append(f"line {number}: {line!r} is not of the form NAME = value+/-deviation")
+        elif name in lines:
+            faults.append(f"line {number}: {name} was given before, on line {lines[name]}")
+        elif known is not None and name not in known:
+            faults.append(f"line {number}: {name} is no parameter of this model")
+        else:
+            lines[name] = number
+            values[name], deviations[name] = pair
+    if faults:
+        raise ValueError(f"{os.fspath(path)}: " + "; ".join(faults) + ".")
+    return values, deviations

@@ -7,14 +7,14 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 
 from .. import rotations
-from .._description.bodies import Body
-from .._description.frames import Frame
-from .._description.loads import Force, Torque
-from .._description.motion import Motion
-from .._description.parameters import parameter
-from .._description.points import Point, inertial
-from .._description.system import System
-from .._scalars.types import Component, Scalar
+from .._scalarjit.components import Component, Scalar
+from .._system.bodies import Body
+from .._system.forces import Force, Torque
+from .._system.frames import Frame
+from .._system.motion import Motion
+from .._system.parameters import parameter
+from .._system.points import Point, inertial
+from .._system.system import System
 from ._entry import entry
 
 _EULER = (0.1, -0.3, 0.5, 0.65**0.5)  # of unit norm, the scalar last

@@ -9,17 +9,16 @@ from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
 
-from .._description.bodies import Body
-from .._description.frames import Frame
-from .._description.loads import Torque
-from .._description.motion import Motion, weight
-from .._description.parameters import parameter, parameter_info
-from .._description.points import Point, inertial
-from .._description.system import System
-from .._description.vectors import Vector
-from .._scalars.types import Scalar
-from ._bicycle_file import read_bicycle_file
-from ._entry import entry
+from .._scalarjit.components import Scalar
+from .._system.bodies import Body
+from .._system.forces import Torque
+from .._system.frames import Frame
+from .._system.motion import Motion, weight
+from .._system.parameters import parameter, parameter_info
+from .._system.points import Point, inertial
+from .._system.system import System
+from .._system.vectors import Vector
+from ._entry import entry, read_bicycle_file
 
 # Meijaard et al. (2007), Table 1: the benchmark bicycle.
 _BENCHMARK = {

@@ -5,13 +5,13 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from .. import rotations
-from .._description.bodies import Body
-from .._description.loads import Force
-from .._description.motion import Motion, weight
-from .._description.parameters import parameter
-from .._description.points import inertial
-from .._description.system import System
-from .._scalars.types import Scalar
+from .._scalarjit.components import Scalar
+from .._system.bodies import Body
+from .._system.forces import Force
+from .._system.motion import Motion, weight
+from .._system.parameters import parameter
+from .._system.points import inertial
+from .._system.system import System
 from ._entry import entry
 
 

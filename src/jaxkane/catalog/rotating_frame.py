@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from .._description.bodies import Body
-from .._description.loads import Torque
-from .._description.motion import Motion
-from .._description.parameters import parameter
-from .._description.points import inertial
-from .._description.system import System
-from .._scalars.types import Scalar
+from .._scalarjit.components import Scalar
+from .._system.bodies import Body
+from .._system.forces import Torque
+from .._system.motion import Motion
+from .._system.parameters import parameter
+from .._system.points import inertial
+from .._system.system import System
 from ._entry import entry
 
 

@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from .._scalars.components import add, is_exact, is_zero, mul, sub
-from .._scalars.types import Component
+from .._scalarjit.components import Component, add, is_exact, is_zero, mul, sub
 
 Triangle = Sequence[Sequence[Any]]  # row i has i + 1 entries
 

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-from ._sympy_functions import FUNCTIONS
-from ._sympy_model import Words
+from ._sympy_model import FUNCTIONS, Words
 
 VectorPlan = tuple[tuple[int, tuple[int, int, int]], ...]  # (frame, places of three expressions), summed
 

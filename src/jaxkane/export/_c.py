@@ -3,18 +3,129 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from .._description.system import System
-from .._method.formulas import FUNCTIONS, Formulas
-from .._scalars.graph import needed
-from .._scalars.written import as_source
-from ._c_language import HELPERS, TYPES, C, array, as_comment, constant, folded, initial, without_end
-from ._c_test import COMPARE, trial
-from ._functions import chosen
-from ._names import C_WORDS, identifiers, variable_units
+import jax
+import numpy as np
+
+from .._kane.formulas import FUNCTIONS, Formulas
+from .._scalarjit.backends.source import (
+    ARITHMETIC,
+    COMPARED,
+    COMPARISONS,
+    LOOSE,
+    SIGNED,
+    SUM,
+    TIGHT,
+    Form,
+    Language,
+    as_source,
+    call,
+)
+from .._scalarjit.graph import LIBRARY, needed
+from .._system.system import System
+from ._functions import C_WORDS, chosen, identifiers, variable_units
+
+TYPES = {"float64": "double", "float32": "float", "bool": "int"}
+_IN_LIBRARY = {"abs": "fabs", "rem": "fmod", **{name: name for name in (*LIBRARY, "sqrt", "floor")}}
+_TWO = ("rem", "pow", "atan2")
+_FORMS = {
+    **ARITHMETIC,
+    **COMPARISONS,
+    **{name: call(f"{word}{{s}}", 1 + (name in _TWO)) for name, word in _IN_LIBRARY.items()},
+    "max": call("larger", 2),
+    "min": call("smaller", 2),
+    "and": Form("{0} && {1}", COMPARED, (TIGHT, TIGHT)),
+    "or": Form("{0} || {1}", COMPARED, (TIGHT, TIGHT)),
+    "xor": Form("{0} != {1}", COMPARED, (TIGHT, TIGHT)),
+    "select": Form("{0} ? {1} : {2}", LOOSE, (SUM, SUM, SUM)),
+    "convert": Form("({type}){0}", SIGNED, (TIGHT,)),
+}
+# As JAX has them: not a number where one of the two is not, and -0 is less than 0.
+HELPERS = {
+    "max": "static {type} larger({type} a, {type} b) {{\n"
+    "    return a != a || (a == b ? !signbit(a) : a > b) ? a : b;\n}}\n",
+    "min": "static {type} smaller({type} a, {type} b) {{\n"
+    "    return a != a || (a == b ? signbit(a) : a < b) ? a : b;\n}}\n",
+}
+
+
+def constant(value: Any, dtype: str) -> str:
+    if dtype == "bool":
+        return str(int(value))
+    if not np.isfinite(value):
+        return "NAN" if np.isnan(value) else "INFINITY" if value > 0 else "-INFINITY"
+    return f"{np.float32(value)!s}f" if dtype == "float32" else repr(float(value))
+
+
+C = Language(
+    "C99",
+    _FORMS,
+    constant,
+    lambda name, text, dtype: f"const {TYPES[dtype]} {name} = {text};",
+    TYPES,
+    {"float64": "", "float32": "f", "bool": ""},
+)
+
+
+def array(declaration: str, numbers: np.ndarray, dtype: str) -> str:
+    texts = [constant(x, dtype) for x in numbers.flat] or ["0"]
+    return f"static {declaration}[] = {{\n    {folded(texts)}\n}};"
+
+
+def initial(x: np.ndarray, dtype: str) -> str:
+    texts = [constant(v, dtype) for v in x.flat]
+    return f"{{{', '.join(texts) or '0'}}}" if x.shape else texts[0]
+
+
+def folded(texts: Sequence[str]) -> str:
+    return ",\n    ".join(", ".join(texts[i : i + 6]) for i in range(0, len(texts), 6))
+
+
+def as_comment(text: str) -> str:
+    return f" /* {text} */" if text else ""
+
+
+def without_end(text: str) -> str:
+    """A text that cannot end a comment."""
+    return text.replace("*/", "* /").replace("\\", "/")
+
+
+COMPARE = """
+/* Prints the largest difference, as a part of the largest expected number. */
+static int compare(const char *name, int n, const {type} *found, const {type} *expected) {{
+    double difference = 0.0, size = 0.0;
+    int i;
+    for (i = 0; i < n; i++) {{
+        const double d = fabs((double)found[i] - (double)expected[i]);
+        if (found[i] == expected[i] || (found[i] != found[i] && expected[i] != expected[i])) continue;
+        if (!(d <= difference)) difference = d; /* also where it is not a number */
+        if (fabs((double)expected[i]) > size) size = fabs((double)expected[i]);
+    }}
+    printf("%-40s %.1e\\n", name, size > 0.0 ? difference / size : difference);
+    return !(difference <= {tolerance} * size);
+}}
+"""
+
+
+def trial(formulas: Formulas, functions: Iterable[str]) -> tuple[dict[str, Any], dict[str, dict[str, np.ndarray]]]:
+    """Time, coordinates, speeds and inputs, and what JAX computes there for this system; all of it finite."""
+    state: dict[str, Any] = {}
+    expected: dict[str, dict[str, np.ndarray]] = {}
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        draw = lambda n, rng=rng: rng.uniform(0.2, 0.8, n).astype(formulas.dtype)  # noqa: E731
+        state = {"t": draw(()), **{kind: draw(len(formulas.names(kind))) for kind in ("q", "u", "inputs", "u_dep")}}
+        args = [*state.values(), *formulas.values().values()]
+        with jax.enable_x64(formulas.dtype == "float64"):
+            for function in functions:
+                outputs = jax.tree.map(np.asarray, formulas.by_jax(function, *args))
+                expected[function] = dict(zip(formulas.nodes(function), outputs, strict=True))
+        if all(np.all(np.isfinite(x)) for found in expected.values() for x in found.values()):
+            break
+    return state, expected
 
 
 class Written(NamedTuple):

@@ -7,12 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from .._description.system import System
-from .._method.formulas import Formulas
-from .._scalars.graph import OPERATORS, NotScalarError, needed
-from .._scalars.written import as_objects
-from ._functions import one_function
-from ._names import in_ascii
+from .._kane.formulas import Formulas
+from .._scalarjit.backends.source import as_objects
+from .._scalarjit.graph import OPERATORS, NotScalarError, needed
+from .._system.system import System
+from ._functions import in_ascii, one_function
 
 
 def casadi(system: System, function: str = "rates", *, name: str | None = None) -> Any:

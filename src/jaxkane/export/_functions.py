@@ -1,15 +1,17 @@
-"""What the exports have in common: which functions are asked for. Knows no language."""
+"""What the exports have in common: functions, names, units. Knows no language."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+import unicodedata
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
 from .._common.lookup import refuse_unknown
-from .._description.system import System
-from .._method.formulas import JACOBIANS, OFFERED, Formulas
+from .._kane.formulas import JACOBIANS, OFFERED, Formulas
+from .._system.system import System, unit_of, units_of
 
 USUAL = ("rates", "equations", "dependent_speeds", *JACOBIANS)
 
@@ -43,3 +45,54 @@ def parameters(system: System) -> dict[str, np.ndarray]:
     A parameter of a part is called by its path, "frame.mass"; one with axes is an array.
     """
     return Formulas(system).values()
+
+
+# Words that C99, C++ or their compilers have taken, macros of <math.h> and <stdio.h> among them.
+C_WORDS = frozenset(
+    """auto break case char const continue default do double else enum extern float for goto if inline int long register
+    restrict return short signed sizeof static struct switch typedef union unsigned void volatile while
+    alignas alignof and and_eq asm bitand bitor bool catch char16_t char32_t char8_t class co_await co_return co_yield
+    compl concept const_cast consteval constexpr constinit decltype delete dynamic_cast explicit export false friend
+    module mutable namespace new noexcept not not_eq nullptr operator or or_eq private protected public
+    reinterpret_cast requires static_assert static_cast template this thread_local throw true try typeid typename
+    typeof using virtual wchar_t xor xor_eq linux unix i386 errno stdin stdout stderr NULL EOF NAN INFINITY HUGE_VAL
+    HUGE_VALF HUGE_VALL DOMAIN SING OVERFLOW UNDERFLOW PLOSS TLOSS HUGE MAXFLOAT BUFSIZ L_tmpnam TMP_MAX FILENAME_MAX
+    FOPEN_MAX""".split()
+)
+
+
+def in_ascii(name: str) -> str:
+    """A name of letters, digits and underscores that begins with a letter: Greek letters by their names, accents
+    dropped, "frame.mass" as frame_mass, "moments[2]" as moments_2."""
+    words = []
+    for letter in unicodedata.normalize("NFKD", name):
+        if letter.isascii():
+            words.append(letter)
+        elif unicodedata.category(letter).startswith("L"):
+            said = unicodedata.name(letter, f"u{ord(letter):x}")
+            greek = re.fullmatch(r"GREEK (SMALL|CAPITAL) LETTER (?:FINAL )?(\w+).*", said)
+            words.append(
+                (greek[2].lower() if greek[1] == "SMALL" else greek[2].title()) if greek else f"u{ord(letter):x}"
+            )
+    word = re.sub(r"\W+", "_", "".join(words)).strip("_")
+    return word if word[:1].isalpha() else f"n{word}"
+
+
+def identifiers(names: Iterable[str], taken: Collection[str], in_ascii_only: bool = True) -> list[str]:
+    """For each name an identifier of its own: what is taken, or equal to another, gets an underscore or a number."""
+    found: list[str] = []
+    used = set(taken)
+    for name in names:
+        own = unicodedata.normalize("NFKC", name)  # as Python reads it
+        word = own if own.isidentifier() and not in_ascii_only else in_ascii(name)
+        candidates = (word, f"{word}_", *(f"{word}_{i}" for i in range(2, 10_000)))
+        found.append(next(c for c in candidates if c not in used))
+        used.add(found[-1])
+    return found
+
+
+def variable_units(system: System) -> dict[str, str]:
+    """Units of coordinates, speeds and inputs, where they are declared."""
+    declared = units_of(system)
+    names = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.inputs, *system.states)
+    return {name: unit_of(name, declared) for name in names}

@@ -11,13 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from .._description.system import System
-from .._method.formulas import JACOBIANS, Formulas
-from .._scalars.graph import DTYPES
-from .._scalars.numbers import NUMPY_NAMES
-from .._scalars.written import ARITHMETIC, COMPARED, COMPARISONS, TIGHT, Form, Language, as_source, call
-from ._functions import chosen
-from ._names import identifiers, variable_units
+from .._kane.formulas import JACOBIANS, Formulas
+from .._scalarjit.backends.numpy import NUMPY_NAMES
+from .._scalarjit.backends.source import ARITHMETIC, COMPARED, COMPARISONS, TIGHT, Form, Language, as_source, call
+from .._scalarjit.graph import DTYPES
+from .._system.system import System
+from ._functions import chosen, identifiers, variable_units
 
 _TWO = ("pow", "atan2", "rem", "max", "min")
 _FORMS = {

@@ -8,8 +8,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._description.system import System
-from .._method.formulas import Formulas
+from .._kane.formulas import Formulas
+from .._system.system import System
 from ._functions import one_function
 
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")

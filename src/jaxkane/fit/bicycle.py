@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 
 from ..catalog import WhippleBicycle
-from ..catalog._bicycle_file import read_bicycle_file
-from ._data.trial import Trial, as_trials
-from ._optimize.optimizer import Optimizer
-from ._optimize.solve import solve
-from ._problem.entries import parameters_of
-from ._problem.free import Inertia, Prior
-from ._problem.model import Unknowns
-from ._problem.problem import Problem
-from ._result.result import Fit
+from ..catalog._entry import read_bicycle_file
+from ._declarations import Inertia, Prior
+from ._fit import solve
+from ._model import Unknowns
+from ._optimize import Optimizer
+from ._parameters import parameters_of
+from ._problem import Problem
+from ._result import Fit
+from ._trial import Trial, as_trials
 
 WHEEL = "rear_wheel_rate"
 SIGMA = {"roll": 0.01, "steer": 0.02, "roll_rate": 0.1, "steer_rate": 0.2}

@@ -1,5 +1,6 @@
 """Mechanisms as trees of links and joints, given as data: `mechanism([Link(...), ...])` is an ordinary `System`."""
 
+from ._build import mechanism as mechanism
 from ._joints import Joint as Joint
 from ._joints import ball as ball
 from ._joints import fixed as fixed
@@ -8,10 +9,9 @@ from ._joints import hinge as hinge
 from ._joints import planar as planar
 from ._joints import slide as slide
 from ._joints import universal as universal
+from ._links import Actuator as Actuator
+from ._links import Coupling as Coupling
+from ._links import Link as Link
+from ._links import Loop as Loop
+from ._links import Site as Site
 from ._mechanism import Mechanism as Mechanism
-from ._parts import Actuator as Actuator
-from ._parts import Coupling as Coupling
-from ._parts import Link as Link
-from ._parts import Loop as Loop
-from ._parts import Site as Site
-from ._tree import mechanism as mechanism

@@ -14,9 +14,9 @@ import scipy.linalg
 from jax.core import Tracer
 
 from .._common.lookup import as_names, not_there
+from ._joints import Shape
 from ._mechanism import Field, Mechanism, class_of
-from ._shapes import Shape
-from ._structure import Structure
+from ._tree import Structure
 
 
 def with_dependent(

@@ -1,8 +1,4 @@
-"""Mechanisms: a class for every structure, its parameters by name, copies, and what is written to a file.
-
-For every structure there is one class, whose fields are the parameters that the structure has: `mass.forearm` is a
-field like any other, so that sweeps, fits and tables know it by this name. Programs are kept by class.
-"""
+"""Mechanisms: a class for every structure, with its parameters by name, made from links."""
 
 from __future__ import annotations
 
@@ -12,10 +8,9 @@ from collections.abc import Callable, Mapping
 from typing import Any, ClassVar
 
 from .._common.lookup import hint
-from .._description.parameters import parameter, parameter_info
-from .._scalars.types import Scalar
-from ._structure import KINDS, Named, Structure
-from ._tree_system import Tree
+from .._scalarjit.components import Scalar
+from .._system.parameters import parameter, parameter_info
+from ._tree import KINDS, Named, Structure, Tree
 
 
 class Mechanism(Tree):

@@ -21,8 +21,10 @@ added, and used along any speed:
 from ._between import Law as Law
 from ._between import actuator as actuator
 from ._between import damper as damper
+from ._between import dc_motor as dc_motor
 from ._between import drag as drag
 from ._between import friction as friction
+from ._between import rotor as rotor
 from ._between import spring as spring
 from ._between import torsional_damper as torsional_damper
 from ._between import torsional_friction as torsional_friction
@@ -35,5 +37,3 @@ from ._laws import quadratic as quadratic
 from ._laws import smooth_abs as smooth_abs
 from ._laws import smooth_sign as smooth_sign
 from ._laws import stribeck as stribeck
-from ._motors import dc_motor as dc_motor
-from ._motors import rotor as rotor

@@ -15,9 +15,8 @@ from typing import Any
 
 import jax.numpy as jnp
 
-from .._description.vectors import Vector
-from .._scalars.components import positive
-from .._scalars.types import Component
+from .._scalarjit.components import Component, positive
+from .._system.vectors import Vector
 
 
 def smooth_abs(x: Component | Vector, width: Component) -> Component:

@@ -5,9 +5,9 @@ arrays may come from anywhere. Colours, sizes and fonts are those of matplotlib'
 `plt.style.use("dark_background")`, and a style sheet of one's own. matplotlib is imported at the first call.
 """
 
-from ._audit import audit as audit
-from ._fits import fits as fits
-from ._modes import mode_shapes as mode_shapes
 from ._stability import eigenvalues as eigenvalues
+from ._stability import mode_shapes as mode_shapes
 from ._stability import root_locus as root_locus
+from ._trajectories import audit as audit
+from ._trajectories import fits as fits
 from ._trajectories import trajectories as trajectories

@@ -1,4 +1,4 @@
-"""Motions over time, by name and with units. Knows trajectories; knows no system."""
+"""Motions over time, audits, and fits beside measurements, drawn. Knows matplotlib and results."""
 
 from __future__ import annotations
 
@@ -7,10 +7,43 @@ from typing import Any
 
 import numpy as np
 
-from .._common.lookup import as_names, label_of
-from .._description.units import in_degrees, refuse_no_angle, unit_of
-from .._simulation.trajectory import Status, Trajectory
-from ._axes import SOFT, finish, panels
+from .._common.lookup import as_names, hint, label_of, refuse_unknown
+from .._integrate.audit import Audit
+from .._integrate.trajectory import Status, Trajectory
+from .._system.system import in_degrees, refuse_no_angle, unit_of, units_of
+
+SOFT = "0.55"  # a grey that is seen on white and on black
+STABLE = "#2ca02c"
+
+
+def panels(axes: Any, rows: int, columns: int = 1, *, size: tuple[float, float], **options: Any) -> np.ndarray:
+    """An array (rows, columns) of axes: those given, or of a new figure, `size` [inches] for each."""
+    if axes is not None:
+        given = np.ravel(axes)
+        if given.size != rows * columns:
+            raise ValueError(f"{rows * columns} axes are needed ({rows} rows, {columns} columns), got {given.size}.")
+        return given.reshape(rows, columns)
+    import matplotlib.pyplot as plt
+
+    figsize = (size[0] * columns, size[1] * rows)
+    return plt.subplots(rows, columns, figsize=figsize, squeeze=False, layout="constrained", **options)[1]
+
+
+def one(ax: Any, size: tuple[float, float] = (6.4, 4.2), **options: Any) -> Any:
+    """The axes given, or those of a new figure."""
+    if ax is not None:
+        return ax
+    import matplotlib.pyplot as plt
+
+    return plt.subplots(figsize=size, layout="constrained", **options)[1]
+
+
+def finish(ax: Any, legend: bool = True) -> None:
+    """A faint grid, and a legend without a frame where something has a name."""
+    ax.grid(alpha=0.25)
+    if legend and ax.get_legend_handles_labels()[1]:
+        ax.legend(frameon=False, fontsize="small")
+
 
 _MARKED = 200  # more members of a batch than this are drawn without a mark where they ended
 
@@ -101,3 +134,110 @@ def _tell_the_end(axes: np.ndarray, trajectory: Trajectory) -> None:
     axes[0].set_title(
         f"{label_of(trajectory.reason)} at {float(trajectory.t_end):.3g} s", loc="right", fontsize="small"
     )
+
+
+def audit(audit: Audit, *, axes: Any = None) -> np.ndarray:
+    """Energies, energy error, residuals of the constraints and conditioning over time.
+
+        jk.plot.audit(jk.audit(system, ride))
+
+    **Arguments:** an `Audit`; `axes`: four.
+
+    **Returns:** the axes (2, 2).
+    """
+    if not isinstance(audit, Audit):
+        raise TypeError(f"plot.audit draws an Audit, jk.audit(system, ride); got a {type(audit).__name__}.")
+    found = panels(axes, 2, 2, size=(4.75, 2.75), sharex=True)
+    audit.plot(found)
+    return found
+
+
+_TRIALS = 3
+
+
+def fits(
+    fit: Any,
+    trials: Sequence[str | int] | None = None,
+    channels: Sequence[str] | None = None,
+    *,
+    residuals: bool = True,
+    degrees: bool = False,
+    units: Mapping[str, str] | None = None,
+    axes: Any = None,
+) -> np.ndarray:
+    """Measured (dots) and simulated (line) by channel and trial; below each, the residuals in standard deviations.
+
+        result = jk.fit.fit(system, trials, ("mass", "damping"))
+        jk.plot.fits(result, ["ride 1", "ride 7"], degrees=True)
+
+    **Arguments:**
+
+    - `fit`: a `jaxkane.fit.Fit`.
+    - `trials`: names or numbers; by default the first, the middle and the last. `channels`: by default all.
+    - `residuals`: whether they are drawn. Their grey band is two standard deviations of the measurement.
+    - `degrees`, `units`: as for `trajectories`.
+    - `axes`: a row for each channel, or two with residuals; a column for each trial.
+
+    **Returns:** the axes (n_rows, n_trials).
+
+    **Raises:** `ValueError` for a trial or a channel that the fit does not have.
+    """
+    names = list(fit.trial_names)
+    if trials is None:
+        chosen = _spread(len(names))
+    else:
+        chosen = [_number(names, trial) for trial in ([trials] if isinstance(trials, (str, int)) else trials)]
+    all_channels = list(fit.problem.channels)
+    channels = all_channels if channels is None else list(as_names(channels))
+    refuse_unknown(channels, all_channels, "fits: there is no channel")
+    if not channels:
+        raise ValueError(f"fits: `channels` is empty; {hint([], all_channels)}")
+    known = {channel: unit_of(channel, units_of(fit.problem.system) | dict(units or {})) for channel in channels}
+    if degrees:
+        refuse_no_angle(channels, known.values())
+    each = 1 + residuals
+    heights = {"height_ratios": [3, 1.2][:each] * len(channels)}
+    axes = panels(axes, each * len(channels), len(chosen), size=(4.2, 1.5), sharex="col", sharey="row", **heights)
+    fitted, all_residuals = fit.fitted, fit.residuals
+    for column, k in zip(axes.T, chosen, strict=True):
+        trial = fit.problem.trials[k]
+        column[0].set_title(label_of(names[k]), fontsize="medium")
+        column[-1].set_xlabel("time [s]")
+        for ax, below, channel in zip(column[::each], column[each - 1 :: each], channels, strict=True):
+            if channel not in trial.measured:
+                ax.text(0.5, 0.5, "not measured", ha="center", va="center", color=SOFT, transform=ax.transAxes)
+                continue
+            scale, unit = _scale(known[channel], degrees)
+            ax.plot(
+                trial.t, scale * trial.measured[channel], ".", color="C0", markersize=3, alpha=0.6, label="measured"
+            )
+            ax.plot(trial.t, scale * fitted[names[k]][channel], color="C1", linewidth=1.2, label="simulated")
+            finish(ax, legend=False)
+            if residuals:
+                below.axhspan(-2.0, 2.0, color=SOFT, alpha=0.2, linewidth=0)
+                below.plot(trial.t, all_residuals[names[k]][channel], ".", color="C0", markersize=2)
+                finish(below, legend=False)
+            if column is axes.T[0] or k == chosen[0]:
+                words = label_of(channel).replace("_", " ")
+                ax.set_ylabel(f"{words}\n[{label_of(unit)}]" if unit else words)
+                if residuals:
+                    below.set_ylabel("residual\n[σ]", fontsize="small")
+    axes[0, 0].legend(frameon=False, fontsize="small", markerscale=2)
+    return axes
+
+
+def _number(names: list[str], trial: str | int) -> int:
+    if isinstance(trial, str) and trial in names:
+        return names.index(trial)
+    if not isinstance(trial, str) and -len(names) <= trial < len(names):
+        return range(len(names))[trial]
+    raise ValueError(f"fits: there is no trial {trial!r}; {hint(str(trial), names)}")
+
+
+def _spread(n: int) -> list[int]:
+    return np.unique(np.linspace(0, n - 1, min(n, _TRIALS)).astype(int)).tolist()
+
+
+def _scale(unit: str, degrees: bool) -> tuple[float, str]:
+    turns = degrees and in_degrees(unit)
+    return (180.0 / np.pi, unit.replace("rad", "deg")) if turns else (1.0, unit)

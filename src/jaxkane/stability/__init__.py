@@ -10,14 +10,14 @@ from ._control import to_control as to_control
 from ._control import transfer_function as transfer_function
 from ._critical import CriticalSpeeds as CriticalSpeeds
 from ._critical import critical_speeds as critical_speeds
-from ._cyclic import cyclic_coordinates as cyclic_coordinates
 from ._eigenvalues import Eigenvalues as Eigenvalues
 from ._eigenvalues import eigenvalues as eigenvalues
 from ._family import Family as Family
 from ._family import family as family
 from ._linearize import LinearModel as LinearModel
 from ._linearize import linearize as linearize
-from ._speeds import with_speeds as with_speeds
+from ._linearize import with_speeds as with_speeds
 from ._steady import SteadyMotion as SteadyMotion
+from ._steady import cyclic_coordinates as cyclic_coordinates
 from ._steady import equilibrium as equilibrium
 from ._steady import steady_turn as steady_turn

@@ -10,15 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._description.system import State
-from .._method.checks import is_concrete
-from .._method.equations import equations_of_motion
-from .._method.values import is_one_number
-from .._scalars.nan import nan_where
-from .._scalars.types import Component
+from .._kane.arguments import is_one_number
+from .._kane.checks import is_concrete
+from .._kane.equations import equations_of_motion
+from .._scalarjit.components import Component
+from .._scalarjit.nan import nan_where
+from .._system.system import State
 from ..catalog import WhippleBicycle
-from ._solve import jacobian
-from ._steady import SteadyMotion, steady_turn
+from ._steady import SteadyMotion, jacobian, steady_turn
 
 LATERAL = WhippleBicycle.lateral
 """The states of Meijaard et al. (2007); riding straight, the speed does not notice them to first order."""

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from .._common.lookup import not_there
-from .._description.system import System
-from .._method.checks import is_concrete
-from .._scalars.nan import nan_where
-from .._scalars.versions import compiled
+from .._kane.checks import is_concrete
+from .._scalarjit.cache_key import compiled
+from .._scalarjit.nan import nan_where
+from .._system.system import System
 from ._eig import Eig, eig
 from ._eigenvalues import MotionAt, eigenvalues, family_of, followed, matrix, names_of_modes
 

@@ -12,11 +12,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._common.lookup import by_name, hint
-from .._description.system import System, names_of
-from .._scalars.versions import compiled
-from .._simulation.one_motion import refuse_other_system
-from ._solve import jacobian
-from ._steady import Problem, SteadyMotion, as_motion
+from .._integrate.trajectory import refuse_other_system
+from .._scalarjit.cache_key import compiled
+from .._system.system import System, names_of
+from ._steady import Problem, SteadyMotion, as_motion, jacobian
 
 
 class Family(eqx.Module):

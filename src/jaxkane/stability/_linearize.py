@@ -1,7 +1,9 @@
-"""Linear models about steady motions, on the constraint manifold. Knows the method's rates and their derivatives."""
+"""Linear models about steady motions, on the constraint manifold; other independent speeds."""
 
 from __future__ import annotations
 
+import copy
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -12,27 +14,105 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._common.lookup import as_names, hint, refuse_unknown
-from .._description.parameters import parameters_in
-from .._description.system import State, System
-from .._description.values import Values
-from .._method.checks import check_system, is_concrete
-from .._method.description_facts import configuration_residual
-from .._method.diagnose import ROUNDING, diagnosis
-from .._method.equations import dependent_speeds
-from .._method.outputs import output_names, outputs_at
-from .._method.right_hand_side import rates, values_of
-from .._method.values import as_array, check_is_system, checked_inputs, is_one_number, refuse_incomplete
-from .._scalars.fuse import fused
-from .._scalars.linear import as_vector, solve, stack
-from .._scalars.nan import nan_where
-from .._scalars.types import Component
-from .._scalars.versions import compiled
-from .._simulation.one_motion import refuse_other_system
-from ._cyclic import cyclic_coordinates
+from .._integrate.trajectory import refuse_other_system
+from .._kane.arguments import as_array, check_is_system, checked_inputs, is_one_number, refuse_incomplete
+from .._kane.checks import SINGULAR_ROUNDING, check_system, diagnosis, is_concrete
+from .._kane.consistency import configuration_residual
+from .._kane.equations import dependent_speeds
+from .._kane.rhs import has_outputs, output_names, outputs_at, rates, values_of
+from .._scalarjit.cache_key import compiled
+from .._scalarjit.components import Component
+from .._scalarjit.function import fused
+from .._scalarjit.linear import as_vector, solve, stack
+from .._scalarjit.nan import nan_where
+from .._system.parameters import parameters_in
+from .._system.system import State, System, Values
 from ._eig import Eig, eig, eigvals
-from ._solve import jacobian
-from ._steadiness import check_dependent, check_state, inputs_by_name, is_wrong
-from ._steady import SteadyMotion
+from ._steady import SteadyMotion, check_dependent, check_state, cyclic_coordinates, inputs_by_name, is_wrong, jacobian
+
+
+class _Respeeded(System):
+    """A system read with its speeds in another order, other ones being independent."""
+
+    inner: System
+    independent: tuple[str, ...] = eqx.field(static=True)
+    dependent: tuple[str, ...] = eqx.field(static=True)
+
+    def _in_order(self, u: Any) -> Values:
+        names = (*self.inner.speeds, *self.inner.dependent_speeds, *self.inner.auxiliary_speeds)
+        return Values([u[name] for name in names], names)
+
+    def _of_inner(self, now: Any) -> Any:
+        """The same instant, with the accelerations in the order of the inner system's speeds."""
+        names = (*self.inner.speeds, *self.inner.dependent_speeds)
+        other = copy.copy(now)
+        other.u_dot = Values([now.u_dot[name] for name in names], names)
+        return other
+
+    def q_dot(self, t, q, u):
+        return self.inner.q_dot(t, q, self._in_order(u))
+
+    def motion(self, t, q, u):
+        return self.inner.motion(t, q, self._in_order(u))
+
+    def loads(self, t, q, u, motion, inputs):
+        return self.inner.loads(t, q, self._in_order(u), motion, inputs)
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return self.inner.state_rates(t, q, self._in_order(u), x, motion, self._of_inner(now))
+
+    def configuration_constraints(self, t, q):
+        return self.inner.configuration_constraints(t, q)
+
+    def implied_constraints(self, t, q):
+        return self.inner.implied_constraints(t, q)
+
+    def events(self, t, q, u):
+        return self.inner.events(t, q, self._in_order(u))
+
+
+for _name in ("coordinates", "auxiliary_speeds", "dependent_coordinates", "inputs", "states", "units", "check_inertia"):
+    setattr(_Respeeded, _name, property(lambda self, name=_name: getattr(self.inner, name)))
+setattr(_Respeeded, "speeds", property(lambda self: self.independent))  # noqa: B010
+setattr(_Respeeded, "dependent_speeds", property(lambda self: self.dependent))  # noqa: B010
+
+
+class _WithOutputs(_Respeeded):
+    def outputs(self, t, q, u, motion, now):
+        return self.inner.outputs(t, q, self._in_order(u), motion, self._of_inner(now))
+
+
+def with_speeds(system: System, speeds: Sequence[str]) -> System:
+    """The same system with other independent speeds, for motions in which its own do not determine the others.
+
+    A bicycle that pivots about its rear wheel's contact has a yaw rate although neither its rear wheel nor its roll
+    or steer turns: `with_speeds(bicycle, ("roll_rate", "yaw_rate", "steer_rate"))`.
+    `jaxkane.best_dependent_speeds` says which choice is well conditioned.
+
+    **Arguments:** `speeds`: names of as many speeds as there are independent ones, of the independent and the
+    dependent ones.
+
+    **Returns:** a system whose parameters are those of `.inner`, and all else is the system's.
+
+    **Raises:** `ValueError` for other names, or another number of them.
+    """
+    everything = (*system.speeds, *system.dependent_speeds)
+    speeds = as_names(speeds)
+    if len(set(speeds)) != len(system.speeds) or not set(speeds) <= set(everything) or len(speeds) != len(set(speeds)):
+        raise ValueError(
+            f"{type(system).__name__}: name {len(system.speeds)} different ones of {', '.join(everything)}; got "
+            f"{', '.join(speeds)}."
+        )
+    inner: Any = type(system)
+    base: Any = _WithOutputs if has_outputs(system) else _Respeeded
+    return _kind_of(inner, base)(system, speeds, tuple(name for name in everything if name not in speeds))
+
+
+@functools.lru_cache(maxsize=1000)
+def _kind_of(inner: Any, base: Any) -> Any:
+    """The class of such systems, under the name of the inner one for messages."""
+    return type(base)(inner.__name__, (base,), {"__doc__": inner.__doc__})
+
 
 Outputs = Sequence[str] | Mapping[str, Callable[..., Any]] | None
 
@@ -203,7 +283,7 @@ def _derivatives(at, choice: _Choice, functions: dict[str, Callable[..., Any]]):
     A, C = jacobian(lambda x: _at_deviation(x, w, at, T, choice, functions), x)
     B, D = jacobian(lambda w: _at_deviation(x, w, at, T, choice, functions), w)
     # Multiplied by more than that, a rounding error is as large as what it belongs to.
-    follows = jnp.max(jnp.abs(jax.lax.stop_gradient(T)), initial=0.0) < 1 / ROUNDING
+    follows = jnp.max(jnp.abs(jax.lax.stop_gradient(T)), initial=0.0) < 1 / SINGULAR_ROUNDING
     return (A, B, C, D), follows
 
 

@@ -1,27 +1,254 @@
-"""Equilibria and steady motions. Knows cyclic coordinates and roots; knows no mechanism."""
+"""Equilibria and steady motions: cyclic coordinates, roots, and whether a motion is steady."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._common.lookup import as_names, by_name, hint
-from .._description.system import State, System, names_of
-from .._method.checks import check_system, is_concrete
-from .._method.description_facts import configuration_residual
-from .._method.equations import dependent_speeds
-from .._method.right_hand_side import rates
-from .._method.values import as_array, check_is_system, check_time, checked_values, is_one_number
-from .._scalars.nan import nan_where
-from .._scalars.types import Component
-from .._scalars.versions import compiled
-from ._cyclic import cyclic_coordinates
-from ._solve import jacobian, root
+from .._common.lookup import as_names, by_name, hint, refuse_unknown
+from .._kane.arguments import as_array, check_is_system, check_time, checked_values, is_one_number
+from .._kane.checks import check_system, diagnosis, is_concrete
+from .._kane.consistency import configuration_residual
+from .._kane.equations import dependent_speeds
+from .._kane.rhs import rates, values_of
+from .._kane.rhs import rates as rates_of
+from .._scalarjit.cache_key import compiled, on_forget, version_of
+from .._scalarjit.compat import concretely
+from .._scalarjit.components import Component
+from .._scalarjit.nan import nan_where
+from .._system.system import State, System, names_of
+
+
+def jacobian(f: Callable[[Array], Any], x: Array) -> Any:
+    """df/dx (m, n) at x (n,), one column after the other."""
+    columns = jax.lax.map(lambda dx: jax.jvp(f, (x,), (dx,))[1], jnp.eye(x.shape[0], dtype=x.dtype))
+    return jax.tree.map(lambda y: jnp.moveaxis(y, 0, -1), columns)
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def root(residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
+    """z (n,) with residual(z, args) = 0 (m >= n equations), by Levenberg and Marquardt's method from `guess`.
+
+    Differentiable in `args`, any number of times, both modes:  dz = -F_z^+ F_args dargs. A solution is not promised:
+    look at the residual and at the rank of its derivative.
+    """
+    return _levenberg_marquardt(lambda z: residual(z, args), guess)
+
+
+@root.defjvp
+def _root_jvp(residual, primals, tangents):
+    guess, args = primals
+    z = root(residual, guess, args)
+    _, dF = jax.jvp(lambda args: residual(z, args), (args,), (tangents[1],))
+    J = jacobian(lambda z: residual(z, args), z)
+    J = jnp.where(jnp.all(jnp.isfinite(J)), J, 0.0)  # what was not found has no slope, and says so elsewhere
+    return z, -jnp.linalg.pinv(J) @ dF
+
+
+def _levenberg_marquardt(F: Callable[[Array], Array], z: Array, max_steps: int = 80) -> Array:
+    # Steps are kept while the residual falls; the damping vanishes near a solution, where this is Gauss and Newton's.
+    eps = float(jnp.finfo(z.dtype).eps)
+
+    def cost(r):
+        return jnp.where(jnp.all(jnp.isfinite(r)), jnp.sum(r**2), jnp.inf)
+
+    def step(carry):
+        z, r, damping, small, k = carry
+        J = jacobian(F, z)
+        safe = jnp.all(jnp.isfinite(J))
+        J = jnp.where(safe, J, 0.0)
+        size = jnp.linalg.norm(J, axis=0)
+        size = jnp.where(size > 0, size, 1.0)  # of columns, so that units do not matter
+        U, s, Vt = jnp.linalg.svd(J / size[None, :], full_matrices=False)
+        filtered = jnp.where(s > 1e3 * eps * s[0], s / (s**2 + damping), 0.0)
+        dz = -(Vt.T @ (filtered * (U.T @ r))) / size
+        trial = F(z + dz)
+        better = cost(trial) < cost(r)
+        tiny = jnp.all(jnp.abs(dz) <= 4 * eps * (1 + jnp.abs(z)))
+        z, r = jnp.where(better, z + dz, z), jnp.where(better, trial, r)
+        small = jnp.where(tiny | ~safe | (~better & (damping < 1e-13)) | (damping > 1e8), 1, 0)
+        damping = jnp.where(better, damping * jnp.where(damping < 1e-6, 0.0, 0.03), 10 * jnp.maximum(damping, 1e-14))
+        return z, r, damping, small, k + 1
+
+    def going(carry):
+        return (carry[3] == 0) & (carry[4] < max_steps)
+
+    r = F(z)
+    start = (z, r, jnp.asarray(1e-2, z.dtype), jnp.zeros((), int), jnp.zeros((), int))
+    return jax.lax.while_loop(going, step, start)[0]
+
+
+_FOUND: dict[tuple, tuple[str, ...]] = {}
+_TRIALS = 3  # at which the rates are finite
+_MOST_TRIALS = 12
+_SHIFTS = (0.3, -7.0, 150.0)  # of a coordinate [rad, m]: what begins far away counts too
+_INPUTS = (1.0, 30.0, 1000.0)  # sizes of trial inputs
+
+on_forget(_FOUND.clear)
+
+
+def cyclic_coordinates(system: System) -> tuple[str, ...]:
+    """Names of the cyclic (ignorable) coordinates: those that may be shifted without a change of any other rate.
+
+    Neither the accelerations, nor the configuration constraints, nor the rates of the other coordinates depend on
+    them: a bicycle's wheel angles, yaw and place. They may grow in a steady motion, in which the others stand still.
+
+    Found by shifting each coordinate at trial states, times, inputs and parameters, once for each class and shape of
+    the parameters: a dependence that vanishes for special parameters (a spring of zero stiffness), or as long as an
+    input is zero (a force that follows a steer angle), counts as one.
+
+    **Raises:** `ValueError` where no trial has finite accelerations.
+    """
+    check_is_system(system)
+    leaves, treedef = jax.tree.flatten(system)
+    shapes = tuple((jnp.shape(x), str(jnp.result_type(x))) for x in leaves)
+    key = (type(system), str(treedef), shapes, version_of(system))
+    if key not in _FOUND:
+        with concretely():
+            _FOUND[key] = _search(system, leaves, treedef)
+    return _FOUND[key]
+
+
+def _search(system: System, leaves: list, treedef) -> tuple[str, ...]:
+    names, n_q = system.coordinates, len(system.coordinates)
+    rng = np.random.default_rng(0)
+    dtype = jnp.result_type(*leaves) if leaves else jnp.zeros(()).dtype
+    as_floats = lambda x: jnp.asarray(x, dtype)  # noqa: E731
+
+    @jax.jit
+    def rates(trial, t, q, u, w):
+        moves = rates_of(trial, t, q, u, w)
+        others = [moves.u, configuration_residual(trial, t, q)]
+        return moves.q, jnp.concatenate(others if moves.x is None else [*others, moves.x])
+
+    notices = np.zeros((n_q + 1, n_q), bool)  # row: a rate, the last those of the speeds and the constraints
+    compared = 0
+    for k in range(_MOST_TRIALS):
+        # Parameters are about one; where these cannot be, those of the system itself.
+        trial = jax.tree.unflatten(treedef, [jnp.asarray(rng.uniform(0.5, 1.5, x.shape), x.dtype) for x in leaves])
+        if k >= _MOST_TRIALS // 2 and is_concrete(leaves):
+            trial = system
+        q, u = rng.uniform(-0.4, 0.4, n_q), rng.uniform(-1.0, 1.0, len(system.speeds))
+        size = _INPUTS[compared % len(_INPUTS)]
+        w = {
+            name: as_floats(size * rng.choice([-1, 1]) * rng.uniform(0.5, 1.5))
+            for name in (*system.inputs, *system.states)
+        }
+        t, u = as_floats(rng.uniform(0.0, 2.0)), as_floats(u)
+        at = lambda q, trial=trial, t=t, u=u, w=w: tuple(map(np.asarray, rates(trial, t, as_floats(q), u, w)))  # noqa: E731
+        here = at(q)
+        if not all(np.all(np.isfinite(x)) for x in here):
+            continue
+        for i in range(n_q):
+            for shift in _SHIFTS:
+                notices[:, i] |= _noticed(here, at(q + shift * np.eye(n_q)[i]), 1 + abs(shift))
+        compared += 1
+        if compared == _TRIALS:
+            break
+    if not compared:
+        raise ValueError(
+            f"{type(system).__name__}: which coordinates are cyclic cannot be found: at none of {_MOST_TRIALS} trial "
+            "states, with parameters of about one and with its own, are its accelerations finite."
+        )
+    kept = notices[-1].copy()  # not cyclic: the accelerations depend on them,
+    while (more := kept | notices[:-1][kept].any(axis=0)).sum() > kept.sum():
+        kept = more  # or the rate of one that is not cyclic does
+    return tuple(name for name, k in zip(names, kept, strict=True) if not k)
+
+
+def _noticed(here: tuple[np.ndarray, ...], there: tuple[np.ndarray, ...], rounding: float) -> np.ndarray:
+    """Which rates of the coordinates, and last whether any of the others, differ beyond rounding."""
+    eps = float(np.finfo(here[0].dtype).eps)
+    rows = []
+    for a, b in (*zip(here[0], there[0], strict=True), (here[1], there[1])):
+        a, b = np.atleast_1d(a), np.atleast_1d(b)
+        size = rounding * (1.0 + np.abs(a).max(initial=0.0))
+        # What is not finite after a shift of a cyclic coordinate was not finite before.
+        rows.append(not np.all(np.abs(b - a) <= eps**0.6 * size))
+    return np.array(rows)
+
+
+def inputs_by_name(system: System, w) -> dict[str, Any]:
+    return {k: w[i] for i, k in enumerate(system.inputs)}
+
+
+@compiled
+def _rates(system, t, q, u, x, w):
+    rate = rates(system, t, q, u, values_of(system, x, inputs_by_name(system, w)))
+    return rate.q, rate.u, x if rate.x is None else rate.x, configuration_residual(system, t, q)
+
+
+def _tolerances(system: System, u) -> tuple[float, Any]:
+    """How far coordinates may be off the constraints, and rates from zero."""
+    tol = float(jnp.finfo(u.dtype).eps) ** 0.4
+    return tol, tol * (1.0 + jnp.max(jnp.abs(u), initial=0.0))
+
+
+def _still(system: System) -> np.ndarray:
+    """Places of the coordinates that stand still in a steady motion."""
+    cyclic = cyclic_coordinates(system)
+    return np.array([i for i, k in enumerate(system.coordinates) if k not in cyclic], int)
+
+
+def check_dependent(system: System, dependent: Sequence[str], n_h: int) -> None:
+    """**Raises:** `ValueError` where not as many coordinates are named as `n_h` configuration constraints determine."""
+    name = type(system).__name__
+    refuse_unknown(dependent, system.coordinates, f"{name}: `dependent` names coordinates; it has no", "it has")
+    if len(set(dependent)) != n_h:
+        raise ValueError(
+            f"{name}: {n_h} configuration constraints determine as many coordinates, but "
+            f"{len(set(dependent))} are named ({', '.join(dependent) or 'none'}). Give linearize(..., dependent=(...)) "
+            f"{n_h} of {', '.join(system.coordinates)}."
+        )
+
+
+def is_wrong(system: System, t, q, u, x, w, steady: bool):
+    """Whether a state is off the constraints, not finite or, where that is asked, not steady."""
+    q_dot, u_dot, x_dot, h = _rates(system, t, q, u, x, w)
+    tol, slack = _tolerances(system, u)
+    moving = jnp.concatenate([u_dot, q_dot[_still(system)], x_dot]) if steady else jnp.zeros(0, q.dtype)
+    fine = jnp.all(jnp.abs(h) <= tol) & jnp.all(jnp.abs(moving) <= slack)
+    return jax.lax.stop_gradient(~(fine & jnp.all(jnp.isfinite(jnp.concatenate([q, u, x, w, t[None]])))))
+
+
+def check_state(system: System, t, q, u, x, w, steady: bool) -> None:
+    name = type(system).__name__
+    q_dot, u_dot, x_dot, h = map(np.asarray, _rates(system, t, q, u, x, w))
+    tol, slack = _tolerances(system, u)
+    named = (
+        (system.coordinates, q),
+        (system.speeds, u),
+        (system.states, x),
+        (system.inputs, w),
+        (("t",), t[None]),
+    )
+    bad = [k for names, y in named for k, value in zip(names, np.asarray(y), strict=True) if not np.isfinite(value)]
+    if bad:
+        raise ValueError(f"{name}: {', '.join(bad)} is not finite: there is no linear model there.")
+    if h.size and not np.abs(h).max() <= tol:
+        raise ValueError(f"{name}: the coordinates violate the configuration constraints by {h}. Use assemble.")
+    if not np.all(np.isfinite(np.concatenate([q_dot, u_dot]))):
+        wrong = diagnosis(system, t, q, u, values_of(system, x, inputs_by_name(system, w)))
+        raise ValueError(wrong or f"{name}: rates are not finite there: there is no linear model.")
+    if not steady:
+        return
+    found = {f"{k} is accelerated by": y for k, y in zip(system.speeds, u_dot, strict=True)}
+    found |= {f"{system.coordinates[i]} changes with": q_dot[i] for i in _still(system)}
+    found |= {f"{k} changes with": y for k, y in zip(system.states, x_dot, strict=True)}
+    moving = [f"{k} {float(x):.3g}" for k, x in found.items() if not abs(x) <= float(slack)]
+    if moving:
+        raise ValueError(
+            f"{name}: this motion is not steady: {', '.join(moving)}. Find one with equilibrium or steady_turn; or ask "
+            "for the linear model of an instant with linearize(..., steady=False)."
+        )
+
 
 Held = Sequence[str] | Mapping[str, Any]
 

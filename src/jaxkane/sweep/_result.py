@@ -11,9 +11,9 @@ import numpy as np
 from jax.core import Tracer
 
 from .._common.lookup import not_there
-from .._simulation.trajectory import Status, Trajectory, reason
-from ._solve import Part
-from ._table import Table
+from .._integrate.trajectory import Status, Trajectory, reason
+from ._chunks import Part
+from ._members import Table
 
 
 class Sweep(eqx.Module):

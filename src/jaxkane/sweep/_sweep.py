@@ -13,22 +13,17 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
-from .._description.system import State, System
-from .._method.checks import is_concrete
-from .._scalars.types import Inputs
-from .._scalars.versions import captured
-from .._simulation.modes import in_its_mode
-from .._simulation.ride import refuse_captured
-from .._simulation.settings import as_state, checked_times, settings_for
-from .._simulation.trajectory import Status, Trajectory
-from ._cluster import on_cluster
-from ._files import Folder
-from ._fingerprint import traced
-from ._manifest import manifest_of
-from ._members import Row, members_of
+from .._integrate.integrate import refuse_captured
+from .._integrate.settings import as_state, checked_times, in_its_mode, settings_for
+from .._integrate.trajectory import Status, Trajectory
+from .._kane.checks import is_concrete
+from .._scalarjit.cache_key import captured
+from .._scalarjit.components import Inputs
+from .._system.system import State, System
+from ._chunks import GROUP, Job, Part, mesh_of, on_cluster, traced
+from ._files import Folder, manifest_of
+from ._members import Row, Table, as_table, members_of
 from ._result import Sweep
-from ._solve import GROUP, Job, Part, mesh_of
-from ._table import Table, as_table
 
 
 def sweep(

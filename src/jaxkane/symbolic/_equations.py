@@ -8,12 +8,22 @@ from typing import Any
 
 import numpy as np
 
-from .._description.system import System
-from .._method.formulas import Formulas
-from .._scalars.graph import NotScalarError, needed, reads
-from .._scalars.written import as_objects, count_operations, uses
-from ._latex import aligned, escaped, in_latex, name_in_latex
-from ._sympy import exact, fresh_names, given_nodes, imported, symbols_of, table
+from .._kane.formulas import Formulas
+from .._scalarjit.backends.source import as_objects, count_operations, uses
+from .._scalarjit.graph import NotScalarError, needed, reads
+from .._system.system import System
+from ._sympy import (
+    aligned,
+    escaped,
+    exact,
+    fresh_names,
+    given_nodes,
+    imported,
+    in_latex,
+    name_in_latex,
+    symbols_of,
+    table,
+)
 
 WHOLE_UP_TO = 3000  # operations of all formulas, each written out wherever it is read
 _SHOWN_UP_TO = 400  # operations that a notebook shows

@@ -1,4 +1,4 @@
-"""Linear models as matrices of formulas of the parameters. Knows SymPy; knows a motion by its formulas."""
+"""Linear models as matrices of formulas of the parameters, at a steady motion."""
 
 from __future__ import annotations
 
@@ -6,14 +6,176 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from .._common.lookup import as_names, refuse_unknown
-from .._description.system import System
-from .._method.formulas import Formulas
-from ..stability._cyclic import cyclic_coordinates
-from ._at_motion import AtMotion, sizes_of
-from ._equations import WHOLE_UP_TO
-from ._latex import aligned, escaped, in_latex, name_in_latex
-from ._sympy import fresh_names, imported
+from .._kane.formulas import Formulas
+from .._scalarjit.backends.source import as_objects
+from .._scalarjit.graph import NotScalarError, needed
+from .._system.system import System
+from ..stability._steady import check_dependent, cyclic_coordinates
+from ._equations import WHOLE_UP_TO, by_name
+from ._sympy import (
+    aligned,
+    escaped,
+    exact,
+    fresh_names,
+    given_nodes,
+    imported,
+    in_latex,
+    name_in_latex,
+    symbols_of,
+    table,
+)
+
+_TOLERANCE = 1e-9  # of residuals and rates that are to be zero, beside numbers of order one
+
+
+def sizes_of(*matrices: Any) -> dict[Any, int]:
+    """The number of operations of every expression in matrices, each looked at once however often it stands there."""
+    sizes: dict[Any, int] = {}
+
+    def size(x: Any) -> int:
+        if x not in sizes:
+            sizes[x] = max(len(x.args) - 1, 0) + sum(map(size, x.args))
+        return sizes[x]
+
+    for m in matrices:
+        for x in m:
+            size(x)
+    return sizes
+
+
+class AtMotion:
+    """Functions of a system at a motion whose numbers and expressions are put in."""
+
+    def __init__(self, formulas: Formulas, at: dict[str, Any]):
+        sp = imported()
+        self.formulas = formulas
+        kinds = symbols_of(formulas, of_time=False)
+        self.symbols = by_name(kinds)
+        moving = {"t": kinds["t"], **{kind: kinds[kind] for kind in ("q", "u", "inputs")}}
+        known = [*(name for of in moving.values() for name in of), *kinds["parameters"]]
+        refuse_unknown(at, known, f"{formulas.name} has no", "it has")
+        values = {name: self._value(name, x) for name, x in at.items()}
+        symbols = {symbol: name for of in moving.values() for name, symbol in of.items()}
+        for name, x in values.items():
+            read = sorted(symbols[s] for s in x.free_symbols if s in symbols)
+            if read:
+                raise ValueError(
+                    f"{formulas.name}: `at` says {name} = {x}, but {', '.join(read)} has a value of its own there. "
+                    "Expressions are of parameters and of symbols that the system does not have."
+                )
+        put = {kind: {name: values.get(name, sp.Integer(0)) for name in of} for kind, of in moving.items()}
+        variables = [name for of in put.values() for name in of]
+        put["u_dep"] = kinds["u_dep"]
+        put["parameters"] = {
+            name: values[name] if name in values and name not in variables else symbol
+            for name, symbol in kinds["parameters"].items()
+        }
+        self.given = given_nodes(formulas, put)
+        self.parameters = kinds["parameters"]
+
+    def _value(self, name: str, x: Any) -> Any:
+        """A number, an expression, or a string in which the declared names are the declared symbols."""
+        sp = imported()
+        try:
+            value = exact(x, "float64") if isinstance(x, float) else sp.sympify(x, locals=dict(self.symbols))
+        except (
+            sp.SympifyError,
+            TypeError,
+            AttributeError,
+        ) as error:  # SymPy raises the others for "f(", "1.x" and such
+            raise ValueError(self._no_value(name, x)) from error
+        if not isinstance(value, sp.Expr):
+            raise ValueError(self._no_value(name, x))
+        own = {s: sp.Symbol(s.name, real=True) for s in value.free_symbols if s not in self.symbols.values()}
+        value = value.xreplace({s: new for s, new in own.items() if not s.is_real})
+        if value.has(sp.I, sp.nan, sp.oo, -sp.oo, sp.zoo) or value.is_real is False:
+            raise ValueError(self._no_value(name, x))
+        return value
+
+    def _no_value(self, name: str, x: Any) -> str:
+        return (
+            f"{self.formulas.name}: `at` says {name} = {x!r}, which is neither a finite number nor an expression of "
+            'SymPy; one is {"%s": "-v/radius"}.' % name
+        )
+
+    def expressions(self, nodes: np.ndarray) -> Any:
+        """An array of nodes (m,) or (m, n) as a matrix."""
+        sp = imported()
+        graph = self.formulas.graph
+        try:
+            found = as_objects(graph, needed(graph.nodes, [nodes]), self.given, table(), exact, "SymPy")
+        except NotScalarError as error:
+            raise ValueError(f"{self.formulas.name}: its equations hold {error}.") from None
+        shape = nodes.shape if nodes.ndim == 2 else (nodes.size, 1)
+        return sp.Matrix(*shape, [found[int(k)] for k in nodes.flat])
+
+    def jacobian(self, kinds: tuple[str, ...]) -> Any:
+        """The derivatives of (q_dot, u_dot)."""
+        return self.expressions(np.concatenate([*self.formulas.derivatives("rates", kinds).values()]))
+
+    def tangents(self, names: tuple[str, ...], dependent: tuple[str, ...]) -> Any:
+        """T (n_q + n, n_free): how all coordinates and speeds move with the free ones, on the constraints."""
+        sp = imported()
+        free = [x for x in names if x not in dependent]
+        T = sp.Matrix(len(names), len(free), lambda i, j: int(names[i] == free[j]))
+        (h,) = self.formulas.derivatives("configuration_residuals", ("q",)).values()
+        check_dependent(self.formulas.system, dependent, len(h))
+        if dependent:
+            G = self.expressions(h)  # dh/dq
+            by = [names.index(x) for x in dependent]
+            rest = [j for j in range(G.cols) if j not in by]
+            everywhere = list(range(G.rows))
+            moves = -G.extract(everywhere, by).LUsolve(G.extract(everywhere, rest))
+            for i, row in enumerate(by):
+                for j, column in enumerate(rest):
+                    T[row, free.index(names[column])] = moves[i, j]
+        return T
+
+    def check(self, cyclic: Sequence[str]) -> None:
+        """Refuse what is not steady, or off the constraints, as numbers say."""
+        rates, system = self.formulas.nodes("rates"), self.formulas.system
+        (h,) = self.formulas.nodes("configuration_residuals").values()
+        still = [i for i, name in enumerate(system.coordinates) if name not in cyclic]
+        said = [f"{system.coordinates[i]} changes with" for i in still]
+        said += [f"{name} is accelerated by" for name in system.speeds]
+        said += [f"configuration constraint {i} is violated by" for i in range(len(h))]
+        found = self.expressions(np.concatenate([rates["q_dot"][still], rates["u_dot"], h]))
+        self.refuse_singular(found)
+        wrong = [
+            f"{what} {x:.3g}" for what, x in zip(said, self._numbers(found), strict=True) if not abs(x) < _TOLERANCE
+        ]
+        if wrong:
+            raise ValueError(
+                f"{self.formulas.name}: this motion is not steady: {', '.join(wrong)}, with the system's own "
+                "parameters. Name other values in `at`; or ask for the linear model of an instant with steady=False."
+            )
+
+    def _numbers(self, expressions: Any) -> list[float]:
+        """Values at the system's own parameters, and at some number for every other symbol."""
+        values = {
+            self.parameters[name]: float(x)
+            for a, array in self.formulas.values().items()
+            for name, x in zip(self._elements(a), array.flat, strict=True)
+        }
+        others = sorted((x for x in sizes_of(expressions) if x.is_Symbol and x not in values), key=str)
+        numbers = values | {s: 0.3 + 0.1 * i for i, s in enumerate(others)}
+        f = imported().lambdify([*numbers], [*expressions], "numpy", cse=True)
+        return [float(x) for x in f(*numbers.values())]
+
+    def _elements(self, parameter: str) -> tuple[str, ...]:
+        return next(a.elements for a in self.formulas.of_kind("parameters") if a.name == parameter)
+
+    def refuse_singular(self, matrix: Any) -> None:
+        sp = imported()
+        if {sp.nan, sp.zoo, sp.oo, -sp.oo} & sizes_of(matrix).keys():
+            raise ValueError(
+                f"{self.formulas.name}: its equations are singular at this motion, where something is divided by zero; "
+                "name other coordinates or speeds in `at`."
+            )
+
 
 _SHOWN_UP_TO = 500  # operations that a notebook shows
 

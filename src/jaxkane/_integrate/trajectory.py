@@ -1,0 +1,170 @@
+"""What a simulation gives: motion over time by name, and how it ended. Knows names and numbers; knows no solver."""
+
+from __future__ import annotations
+
+import enum
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float, Int
+
+from .._common.lookup import by_name
+from .._kane.arguments import check_is_system
+from .._system.system import State, System, names_of
+
+
+class Status(enum.IntEnum):
+    """How a simulation ended. Codes from `EVENT` on are events of the system, in the order of the alphabet."""
+
+    COMPLETED = 0
+    """Reached the last time."""
+    SINGULAR_SPEEDS = 1
+    """The dependent speeds are no longer determined by the independent ones: det C_dep passed zero."""
+    STEP_TOO_SMALL = 2
+    """The solver could not go on: the step fell below its minimum, as it does when something becomes infinite."""
+    MAX_STEPS = 3
+    """The solver took `max_steps` steps before the last time."""
+    INVALID = 4
+    """A parameter or an initial value was not finite, a positive parameter was not positive, a body had a mass or an
+    inertia that no body has, or the coordinates violated a configuration constraint: nothing was solved."""
+    INTERRUPTED = 5
+    """A sweep was stopped before it came to this member."""
+    NO_SOLUTION = 6
+    """The equations have no finite solution at the first state: a speed that no mass moves with, angles that lock,
+    constraints that cannot be solved for the dependent speeds. One simulation alone raises an error that says which."""
+    EVENT = 10
+
+
+class Sides(eqx.Module):
+    """Where inputs that are samples have kinks and jumps: at `times` (n,) [s]. Where there are jumps, `inputs` (n_t,)
+    by name just before and just after each time of the trajectory."""
+
+    times: Float[Array, "*batch n"]
+    inputs: tuple[dict[str, Float[Array, "*batch n_t"]], ...]
+
+
+class Trajectory(eqx.Module):
+    """Motion over time, by name: `ride["roll"]`, `ride["yaw_rate"]`, `ride["steer_torque"]`, `ride["imu.ay"]`.
+
+    Values after the end of a simulation that stopped early are NaN. A batch has leading axes.
+
+    Attributes:
+
+    - `t` (n_t,) [s]; `q` (n_t, n_q); `u` (n_t, n_u) independent speeds; `u_dep` (n_t, k) dependent speeds;
+        `x` (n_t, n_x) states of the first order.
+    - `inputs`, `outputs`: values (n_t,) of every input, and of every output of the system, by name.
+    - `status`: a `Status` code; `reason` says it in words.
+    - `t_end` [s] and `end`, the state there: where the simulation ended. They have derivatives where it ended at the
+        last time or by an event, whose time moves with what it follows from; otherwise their derivatives are NaN.
+    - `stats`: numbers of steps taken, accepted and rejected. `adjoint`: how it is differentiated.
+    - `units`: pairs of a name and its unit, as the system declares them.
+    - `sides`: where inputs have kinks and jumps, and their values on both sides, for `audit`; else None.
+    """
+
+    t: Float[Array, "*batch n_t"]
+    q: Float[Array, "*batch n_t n_q"]
+    u: Float[Array, "*batch n_t n_u"]
+    u_dep: Float[Array, "*batch n_t k"]
+    x: Float[Array, "*batch n_t n_x"]
+    inputs: dict[str, Float[Array, "*batch n_t"]]
+    outputs: dict[str, Float[Array, "*batch n_t"]]
+    status: Int[Array, "*batch"]
+    t_end: Float[Array, "*batch"]
+    stats: dict[str, Int[Array, "*batch"]]
+    names: tuple[tuple[str, ...], ...] = eqx.field(static=True)
+    events: tuple[str, ...] = eqx.field(static=True)
+    adjoint: str = eqx.field(static=True)
+    units: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
+    end: State | None = None
+    sides: Sides | None = None
+
+    def __getitem__(self, name: str) -> Float[Array, "*batch n_t"]:
+        groups = zip(self.names, (self.q, self.u, self.u_dep, self.x), strict=True)
+        return by_name(name, groups, {**self.inputs, **self.outputs}, "this trajectory")
+
+    @property
+    def values(self) -> dict[str, Float[Array, "*batch n_t"]]:
+        """Inputs and states of the first order by name, as `loads` reads them."""
+        return {**self.inputs, **{name: self.x[..., i] for i, name in enumerate(self.names[3])}}
+
+    @property
+    def ok(self) -> Any:
+        """Whether the last time was reached; an array for a batch."""
+        return self.status == Status.COMPLETED
+
+    @property
+    def reason(self) -> Any:
+        """The status in words; a list for a batch."""
+        codes = np.asarray(self.status)
+        words = [reason(int(code), self.events) for code in codes.ravel()]
+        return words[0] if codes.ndim == 0 else words
+
+    def state(self, i: int = -1) -> State:
+        """The state at the i-th time, to go on from."""
+        return State(self.q[..., i, :], self.u[..., i, :], self.x[..., i, :] if self.names[3] else None)
+
+    def __repr__(self) -> str:
+        if isinstance(self.status, Tracer) or np.ndim(self.status) > 0:
+            return f"Trajectory(shape={self.t.shape})"
+        steps = int(self.stats["steps"])
+        text = f"Trajectory({self.t.shape[-1]} times to {float(self.t_end):.6g} s in {steps} steps: {self.reason})"
+        advice = _advice(int(self.status), self.reason)
+        return f"{text}. {advice}" if advice else text
+
+
+def reason(code: int, events: tuple[str, ...]) -> str:
+    """A status code in words."""
+    if code >= Status.EVENT:
+        return events[code - Status.EVENT].replace("_", " ")
+    return Status(code).name.lower().replace("_", " ")
+
+
+def _advice(code: int, reason: str) -> str:
+    if reason.startswith("gimbal lock"):
+        return "Angles lock there: describe the orientation with Euler parameters, or with another sequence of angles."
+    advice = {
+        Status.SINGULAR_SPEEDS: "Choose other dependent speeds: see jaxkane.best_dependent_speeds(system, t, q).",
+        Status.STEP_TOO_SMALL: "Something becomes infinite or jumps: look at the last times that were reached.",
+        Status.MAX_STEPS: "Raise max_steps (a sample of an input takes a step); or look for what is stiff or jumps.",
+    }
+    return advice.get(Status(code), "") if code < Status.EVENT else ""
+
+
+def refuse_other_system(label: str, system: System, trajectory: Any) -> None:
+    """Every function of a system and a trajectory, or a steady motion, asks this first; `label` is the one that was
+    called, for the message.
+
+    **Raises:** `ValueError` where the names differ, by which a motion is read; `TypeError` for what is no system.
+    """
+    check_is_system(system)
+    kinds = ("coordinates", "speeds", "dependent speeds", "states")
+    groups = zip(kinds, trajectory.names, names_of(system), strict=True)
+    for kind, of_trajectory, own in (*groups, ("inputs", sorted(trajectory.inputs), sorted(system.inputs))):
+        if tuple(of_trajectory) != tuple(own):
+            raise ValueError(
+                f"{label}: the motion has the {kind}: {', '.join(of_trajectory) or 'none'}, the system has: "
+                f"{', '.join(own) or 'none'}: it is the motion of another system."
+            )
+
+
+def reached_times(function: str, system: System, trajectory: Any) -> np.ndarray:
+    """Which times (n_t,) a motion reached, at least two; `function` is the one that was called, for messages.
+
+    **Raises:** `TypeError` for what is no `Trajectory`; `ValueError` for a batch, for the motion of another system, and
+    for one that reached fewer than two of its times.
+    """
+    label = f"{function}({type(system).__name__})"
+    if not isinstance(trajectory, Trajectory):
+        raise TypeError(f"{label}: the second argument is a Trajectory, as from simulate, got {trajectory!r}.")
+    if trajectory.t.ndim != 1:
+        raise ValueError(
+            f"{label}: takes one motion; of a batch of shape {trajectory.t.shape[:-1]} give one member: "
+            "jax.tree.map(lambda x: x[0], rides)."
+        )
+    refuse_other_system(label, system, trajectory)
+    reached = np.all(np.isfinite(np.asarray(trajectory.q)), axis=1)
+    if reached.sum() < 2:
+        raise ValueError(f"{label}: the simulation reached only {reached.sum()} of its times: {trajectory.reason}.")
+    return reached

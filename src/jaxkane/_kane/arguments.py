@@ -1,0 +1,169 @@
+"""Values as callers give them, in their order or by name, checked. Knows the names of a system; knows no mechanics."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array
+
+from .._common.lookup import not_there, refuse_unknown
+from .._scalarjit.components import Component, component
+from .._system.system import System
+
+Row = tuple[Component, ...]
+
+
+def as_row(values: Any, names: Sequence[str], label: str) -> Row:
+    """A sequence, or an array of shape (len(names),), as a row of components."""
+    if hasattr(values, "shape"):
+        array = as_array(values, names, label)
+        return tuple(array[i] for i in range(len(names)))
+    if not isinstance(values, Iterable) or isinstance(values, Mapping):
+        raise TypeError(f"{label} must be {len(names)} numbers in a sequence ({', '.join(names)}), got {values!r}.")
+    try:
+        row = tuple(component(x) for x in values)
+    except TypeError as error:
+        raise TypeError(f"{label} must be {len(names)} numbers ({', '.join(names)}): {error}") from None
+    if len(row) != len(names):
+        raise ValueError(f"{label} must have {len(names)} entries ({', '.join(names)}), got {len(row)}.")
+    return row
+
+
+def as_array(values: Any, names: Sequence[str], label: str) -> Array:
+    """Numbers, in their order or by name, as a float array of shape (len(names),). Those not named are zero."""
+    array = by_names(values, names, label) if isinstance(values, Mapping) else _numbers(values, names, label)
+    if not _is_real(array):
+        raise TypeError(f"{label} must be {len(names)} real numbers ({', '.join(names)}), got {values!r}.")
+    if not jnp.issubdtype(array.dtype, jnp.inexact):
+        array = array.astype(float)
+    if array.shape != (len(names),):
+        hint = " For a batch use jax.vmap." if array.ndim > 1 else ""
+        raise ValueError(f"{label} must have the shape ({len(names)},): {', '.join(names)}. Got {array.shape}.{hint}")
+    return array
+
+
+def _is_real(array: Any) -> bool:
+    return jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
+
+
+def is_one_number(value: Any) -> bool:
+    """Whether this is one real number, known or traced."""
+    return is_numeric(value) and not isinstance(value, (list, tuple)) and np.shape(value) == ()
+
+
+def is_numeric(value: Any) -> bool:
+    """Whether this is a real number, or an array or a sequence of such, which may be traced."""
+    leaves = jax.tree.leaves(value, is_leaf=lambda x: x is None)
+    if not any(isinstance(x, Tracer) for x in leaves):
+        leaves = [value]
+    try:
+        return all(_is_real(x if isinstance(x, jax.Array) else np.asarray(x)) for x in leaves)
+    except ValueError:  # a nested sequence of uneven lengths
+        return False
+
+
+def check_is_system(system: Any) -> None:
+    """**Raises:** `TypeError` for what is no instance of a system."""
+    if not isinstance(system, System):
+        hint = f" Make one: {system.__name__}(...)." if isinstance(system, type) else ""
+        raise TypeError(f"The first argument is an instance of a System, got {system!r}.{hint}")
+
+
+def check_time(name: str, t: Any) -> None:
+    """Refuse what is no time; `name` is that of the system."""
+    if not is_one_number(t):
+        raise TypeError(f"{name}: the time `t` is one number [s], got {t!r}.")
+    if not isinstance(t, Tracer) and not np.isfinite(np.asarray(t)):
+        raise ValueError(f"{name}: the time t = {t} is not finite.")
+
+
+def _numbers(values: Any, names: Sequence[str], label: str) -> Array:
+    try:
+        return jnp.asarray(values)
+    except (TypeError, ValueError) as error:
+        raise type(error)(f"{label} must be {len(names)} numbers ({', '.join(names)}), got {values!r}.") from None
+
+
+def by_names(values: Mapping[str, Any], names: Sequence[str], label: str) -> Array:
+    """Numbers by name as an array (*batch, len(names)); those not named are zero."""
+    refuse_unknown(values, names, f"{label} has no", "it has")
+    # What is known is put together by NumPy: operation by operation, JAX would compile a program for each.
+    is_traced = any(isinstance(x, Tracer) for value in values.values() for x in jax.tree.leaves(value))
+    xp: Any = jnp if is_traced else np
+    dtype = jnp.result_type(float)
+    for name, value in values.items():
+        if not is_numeric(value):
+            raise TypeError(f"{label}: {name!r} must be a real number, or an array of such, got {value!r}.")
+    columns = [xp.asarray(values.get(name, 0.0), dtype=dtype) for name in names]
+    return jnp.asarray(xp.stack(xp.broadcast_arrays(*columns), axis=-1) if columns else np.zeros(0, dtype), dtype=dtype)
+
+
+def refuse_incomplete(system: System, q: Any, u: Any) -> None:
+    """Refuse dicts of coordinates and speeds that leave out a dependent coordinate, or name a dependent speed.
+
+    Where nothing is solved for, a dependent coordinate left out is no zero: it is not known.
+    """
+    name = type(system).__name__
+    for label, values, names in (
+        ("q", q, system.coordinates),
+        ("u", u, (*system.speeds, *system.dependent_speeds)),
+    ):
+        if isinstance(values, Mapping):
+            refuse_unknown(values, names, f"{name}: {label} has no", "it has")
+    missing = [c for c in system.dependent_coordinates if c not in q] if isinstance(q, Mapping) else []
+    if missing:
+        raise ValueError(
+            f"{name}: {', '.join(missing)} is left out of q, and follows from the other coordinates: find the state "
+            "with jaxkane.assemble(system, q, u), and give its state.q; or name the value here."
+        )
+    given = [s for s in system.dependent_speeds if s in u] if isinstance(u, Mapping) else []
+    if given:
+        raise ValueError(
+            f"{name}: {', '.join(given)} is a dependent speed, which follows from the others: leave it out of u. "
+            "(jaxkane.assemble compares it with what the velocity residuals say.)"
+        )
+
+
+def inputs_of(system: System) -> str:
+    """What `loads` reads by name, in words."""
+    return f"the inputs{' and states' if system.states else ''} of {type(system).__name__}"
+
+
+class Inputs(dict[str, Component]):
+    """Inputs and states by name, as `loads` reads them. One that is not there is refused with the names that are."""
+
+    def __init__(self, values: Mapping[str, Component], of: str):
+        super().__init__(values)
+        self._of = of
+
+    def __missing__(self, name: str) -> Component:
+        raise not_there(name, self, self._of)
+
+
+def checked_inputs(system: System, inputs: Mapping[str, Component] | None) -> dict[str, Component]:
+    """All inputs of a system by name; those left out are exactly zero."""
+    return _checked(system, inputs, system.inputs, "input")
+
+
+def checked_values(system: System, values: Mapping[str, Component] | None) -> dict[str, Component]:
+    """All inputs and states of a system by name, as `loads` reads them; those left out are exactly zero."""
+    if not system.states:
+        return checked_inputs(system, values)
+    return _checked(system, values, (*system.inputs, *system.states), "input or state")
+
+
+def _checked(system: System, values: Any, names: Sequence[str], what: str) -> dict[str, Component]:
+    own = type(system).__name__
+    if not isinstance(values, (Mapping, type(None))):
+        raise TypeError(f"{own}: the inputs are numbers by name, {{name: number}}, got {values!r}.")
+    values = dict(values or {})
+    refuse_unknown(values, names, f"{own} has no {what} named", "it has")
+    for name, value in values.items():
+        if not is_one_number(value):
+            raise TypeError(f"{own}: the {what} {name!r} must be one number, got {value!r}.")
+    return {name: component(values.get(name, 0.0)) for name in names}

@@ -1,0 +1,241 @@
+"""The equations of a system as graphs of scalars, with the names of what they read. Knows the method and no language.
+
+Every function is the library's own: it is traced as a simulation traces it, and the derivatives are JAX's. All stand in
+one graph, so that what two of them have in common is there once.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._scalarjit.compat import FUSES, ClosedJaxpr, jaxpr_as_fun
+from .._scalarjit.graph import Graph, NotScalarError, unrolled
+from .._scalarjit.jaxpr import jacobian, without_repetition
+from .._scalarjit.linear import as_vector, is_written_out
+from .._system.parameters import ANY, ParameterInfo, declared, in_batches, leaf_name
+from .._system.system import System
+from .arguments import as_row, check_is_system
+from .checks import check_system, is_concrete
+from .equations import (
+    constraint_jacobian,
+    constraint_jacobian_rate,
+    dependent_accelerations,
+    dependent_speeds,
+    equations_of_motion,
+    kinetic_energy,
+    partial_velocities,
+)
+from .evaluate import Reading
+from .kane import motion_rates
+from .rhs import rates
+
+
+class Function(NamedTuple):
+    """A function of (system, t, q, u, inputs, u_dep), and what its outputs are called."""
+
+    outputs: tuple[str, ...]
+    evaluate: Callable[..., tuple[Any, ...]]
+    needs_constraints: bool = False
+    needs_states: bool = False
+
+
+def _all_rates(system, t, q, u, w, u_dep):
+    """Rates of the coordinates by all speeds, dependent ones too."""
+    now = Reading(system)
+    return (as_vector(now.rates(t, as_row(q, system.coordinates, "q"), (*u, *u_dep)), q),)
+
+
+def _velocity_residuals(system, t, q, u, w, u_dep):
+    return (as_vector(Reading(system).residuals(t, as_row(q, system.coordinates, "q"), (*u, *u_dep)), q),)
+
+
+def _configuration_residuals(system, t, q, u, w, u_dep):
+    return (as_vector(Reading(system).configuration(t, as_row(q, system.coordinates, "q")), q),)
+
+
+FUNCTIONS: dict[str, Function] = {
+    "rates": Function(("q_dot", "u_dot"), lambda s, t, q, u, w, _: motion_rates(s, t, q, u, w)),
+    "equations": Function(("M", "f"), lambda s, t, q, u, w, _: equations_of_motion(s, t, q, u, w)),
+    "dependent_speeds": Function(("u_dep",), lambda s, t, q, u, w, _: (dependent_speeds(s, t, q, u),), True),
+    "dependent_accelerations": Function(
+        ("u_dep_dot",), lambda s, t, q, u, w, _: (dependent_accelerations(s, t, q, u, w),), True
+    ),
+    "constraint_jacobian": Function(("J",), lambda s, t, q, u, w, _: (constraint_jacobian(s, t, q),), True),
+    "constraint_jacobian_rate": Function(
+        ("J_dot",), lambda s, t, q, u, w, _: (constraint_jacobian_rate(s, t, q, u),), True
+    ),
+    "partial_velocities": Function(("V", "W"), lambda s, t, q, u, w, _: partial_velocities(s, t, q, u, w)),
+    "state_rates": Function(("x_dot",), lambda s, t, q, u, w, _: (rates(s, t, q, u, w).x,), needs_states=True),
+    "kinetic_energy": Function(("energy",), lambda s, t, q, u, w, _: (kinetic_energy(s, t, q, u),)),
+    "coordinate_rates": Function(("q_dot",), _all_rates),
+    "velocity_residuals": Function(("c",), _velocity_residuals, True),
+    "configuration_residuals": Function(("h",), _configuration_residuals),
+}
+# Derivatives of the rates (q_dot, u_dot), by what.
+JACOBIANS = {
+    "state_jacobian": ("q", "u"),
+    "parameter_jacobian": ("parameters",),
+    "input_jacobian": ("inputs",),
+}
+OFFERED = (*(name for name, f in FUNCTIONS.items() if f.evaluate.__name__ == "<lambda>"), *JACOBIANS)
+
+
+class Argument(NamedTuple):
+    """What functions read: an array, with the name of each element; a parameter is one by itself."""
+
+    kind: str  # "t", "q", "u", "inputs", "u_dep" or "parameters"
+    name: str
+    shape: tuple[int, ...]
+    elements: tuple[str, ...]
+    info: ParameterInfo = ANY
+
+
+class Formulas:
+    """Functions of a system, each as arrays of nodes of one graph.
+
+    `arguments`: what they read. An input node's operands are the argument's place in them, the element's place in it,
+    and its size.
+
+    **Raises:** `TypeError` for what is no `System`, or traced; `ValueError` for a batch, a description that contradicts
+    itself, and, when a function is asked for, one that there is not or whose operations are none of scalars.
+    """
+
+    def __init__(self, system: System, dtype: str = "float64"):
+        check_is_system(system)
+        self.system, self.name, self.dtype = system, type(system).__name__, str(jnp.dtype(dtype))
+        if self.dtype not in ("float64", "float32"):
+            raise ValueError(f"{self.name}: dtype is 'float64' or 'float32', got {dtype!r}.")
+        batched = in_batches(system)
+        if batched:
+            raise ValueError(
+                f"{self.name} is a batch: {', '.join(batched)} has additional leading axes. Give one member of it."
+            )
+        if not is_concrete(system):
+            raise TypeError(f"{self.name} is being traced: write its equations outside of jax.jit, vmap and grad.")
+        if FUSES is not None:
+            raise ImportError(f"{self.name} cannot be written as formulas: {FUSES}.")
+        check_system(system, 0.0, None)
+        paths, self.structure = jax.tree_util.tree_flatten_with_path(system)
+        self.leaves = [leaf for _, leaf in paths]
+        self.moves = [bool(jnp.issubdtype(jnp.result_type(leaf), jnp.floating)) for leaf in self.leaves]
+        parameters = [
+            Argument(
+                "parameters", name := leaf_name(path), np.shape(x), _elements(name, np.shape(x)), declared(system, path)
+            )
+            for (path, x), moves in zip(paths, self.moves, strict=True)
+            if moves
+        ]
+        vectors = {"q": system.coordinates, "u": system.speeds}
+        # At one time a state of the first order is one more number that loads read.
+        vectors |= {"inputs": (*system.inputs, *system.states)}
+        vectors |= {"u_dep": system.dependent_speeds}
+        self.arguments = (
+            Argument("t", "t", (), ("t",)),
+            *(Argument(kind, kind, (len(names),), tuple(names)) for kind, names in vectors.items()),
+            *parameters,
+        )
+        self.graph = Graph()
+        self.inputs = [
+            np.array(
+                [self.graph.add("input", (i, e, len(a.elements)), self.dtype) for e in range(len(a.elements))], np.int64
+            ).reshape(a.shape)
+            for i, a in enumerate(self.arguments)
+        ]
+        self.program = functools.cache(self._program)
+        self.nodes = functools.cache(self._nodes)
+
+    def values(self) -> dict[str, np.ndarray]:
+        """The system's own parameters by name."""
+        numbers = [np.asarray(x, self.dtype) for x, moves in zip(self.leaves, self.moves, strict=True) if moves]
+        return {a.name: x for a, x in zip(self.of_kind("parameters"), numbers, strict=True)}
+
+    def of_kind(self, kind: str) -> list[Argument]:
+        return [a for a in self.arguments if a.kind == kind]
+
+    def names(self, kind: str) -> tuple[str, ...]:
+        """The names of all numbers of a kind, in their order."""
+        return tuple(name for a in self.of_kind(kind) for name in a.elements)
+
+    def evaluate(self, function: str, *args: Any) -> tuple[Any, ...]:
+        """A function of `FUNCTIONS` at arrays that stand as `arguments` do."""
+        t, q, u, w, u_dep, *parameters = args
+        given = iter(parameters)
+        leaves = [next(given) if moves else leaf for leaf, moves in zip(self.leaves, self.moves, strict=True)]
+        inputs = {name: w[i] for i, name in enumerate((*self.system.inputs, *self.system.states))}
+        return tuple(FUNCTIONS[function].evaluate(jax.tree.unflatten(self.structure, leaves), t, q, u, inputs, u_dep))
+
+    def _program(self, function: str) -> ClosedJaxpr:
+        """A function as a program of JAX, in which no other is called."""
+        if FUNCTIONS[function].needs_constraints and not self.system.dependent_speeds:
+            raise ValueError(f"{self.name} has no dependent speeds, so that there is no {function!r}. Leave it out.")
+        if FUNCTIONS[function].needs_states and not self.system.states:
+            raise ValueError(f"{self.name} has no states of the first order, so that there is no {function!r}.")
+        specs = [jax.ShapeDtypeStruct(a.shape, self.dtype) for a in self.arguments]
+        with jax.enable_x64(self.dtype == "float64"):
+            return without_repetition(jax.make_jaxpr(functools.partial(self.evaluate, function))(*specs))
+
+    def _nodes(self, function: str) -> dict[str, np.ndarray]:
+        """The outputs of a function by name, as nodes."""
+        if function in JACOBIANS:
+            blocks = self.derivatives("rates", JACOBIANS[function])
+            return {"jacobian": np.concatenate([*blocks.values()])}
+        program = self.program(function)
+        try:
+            found = unrolled(program.jaxpr, program.consts, self.inputs, self.graph)
+        except NotScalarError as error:
+            raise ValueError(self._refusal(function, error)) from None
+        return dict(zip(FUNCTIONS[function].outputs, found, strict=True))
+
+    def derivatives(self, function: str, kinds: tuple[str, ...]) -> dict[str, np.ndarray]:
+        """The derivatives (..., d) of a function's outputs by all numbers of some kinds, as nodes."""
+        directions = [(i, e) for i, a in enumerate(self.arguments) if a.kind in kinds for e in range(len(a.elements))]
+        try:
+            with jax.enable_x64(self.dtype == "float64"):
+                found = jacobian(self.program(function), self.inputs, directions, self.graph)
+        except NotScalarError as error:
+            raise ValueError(self._refusal(function, error)) from None
+        return dict(zip(FUNCTIONS[function].outputs, found, strict=True))
+
+    def by_jax(self, function: str, *args: Any) -> tuple[Any, ...]:
+        """What JAX gives for a function, Jacobians among them, at arrays that stand as `arguments` do."""
+        if function not in JACOBIANS:
+            return tuple(jaxpr_as_fun(self.program(function))(*args))
+        places = [i for i, a in enumerate(self.arguments) if a.kind in JACOBIANS[function]]
+
+        def rates(moving):
+            full = list(args)
+            for i, x in zip(places, moving, strict=True):
+                full[i] = x
+            return jnp.concatenate(jaxpr_as_fun(self.program("rates"))(*full))
+
+        n = len(self.system.coordinates) + len(self.system.speeds)
+        if not any(self.arguments[i].elements for i in places):
+            return (jnp.zeros((n, 0), self.dtype),)
+        blocks = jax.jacfwd(rates)([jnp.asarray(args[i]) for i in places])
+        return (jnp.concatenate([block.reshape(n, -1) for block in blocks], axis=1),)
+
+    def _refusal(self, function: str, error: NotScalarError) -> str:
+        n, k = len(self.system.speeds), len(self.system.dependent_speeds)
+        if not is_written_out(n) and function not in ("equations", "coordinate_rates"):
+            why = f"with {n} speeds the method solves its equations by LAPACK"
+            remedy = "Take M and f, functions=('equations',), and solve M u_dot = f there"
+        elif k > 3:
+            why = f"with {k} dependent speeds the method solves for them by LAPACK"
+            remedy = "Describe the mechanism with fewer"
+        else:
+            why = "which its description uses"
+            remedy = "Functions of single numbers, jnp.where and entries at places known beforehand can be written out"
+        return (
+            f"{self.name}: {function!r} cannot be written as formulas of single numbers: it holds {error}, {why}. "
+            f"{remedy}; or take jaxkane.export.stablehlo, which holds every operation."
+        )
+
+
+def _elements(name: str, shape: tuple[int, ...]) -> tuple[str, ...]:
+    return tuple(name + "".join(f"[{i}]" for i in place) for place in np.ndindex(shape))

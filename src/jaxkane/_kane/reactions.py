@@ -1,0 +1,172 @@
+"""Constraint forces, by auxiliary speeds that the library adds itself. Knows the method; knows no mechanism.
+
+An auxiliary speed is zero in the motion and gives a point or a frame a velocity that it does not have. Its Kane
+equation holds one unknown more, the force there (Kamman, Unit 5, Example 7, note on constraint forces; Kane and
+Levinson, "Dynamics", section 4.9). With R_r = F_r + F*_r at the accelerations of the motion, without elimination of the
+dependent speeds, and the residuals c = C_ind u + C_dep u_dep + C_aux u_aux + c0:
+
+    R_dep + C_dep^T lambda = 0                  multipliers of the residuals
+    R_aux + C_aux^T lambda + Q = 0              the force (moment) Q that holds the auxiliary speed at zero
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from .._scalarjit.cache_key import compiled
+from .._scalarjit.components import Component, Triple, add, dot, mul
+from .._scalarjit.function import fused
+from .._scalarjit.linear import as_vector, solve
+from .._system.frames import Frame, virtual
+from .._system.motion import Motion
+from .._system.points import Point
+from .._system.system import System
+from .arguments import Row, as_row
+from .equations import InputValues
+from .evaluate import Parts, unit
+from .kane import Instant, motion_rates
+
+
+@compiled
+def multipliers_now(system, t, q, u, inputs):
+    """Of the residuals (k,), at the accelerations of the motion."""
+    return _multipliers(system, t, q, u, inputs, motion_rates(system, t, q, u, inputs)[1])
+
+
+@compiled
+def forces_now(system, t, q, u, inputs):
+    """By name, numbers and components in N (3,), at the accelerations of the motion."""
+    return _forces(system, t, q, u, inputs, motion_rates(system, t, q, u, inputs)[1])
+
+
+@fused
+def _multipliers(system, t, q, u, inputs, u_dot):
+    multipliers = Reactions(system, t, q, u, inputs, u_dot).multipliers
+    return as_vector(multipliers, q)
+
+
+@fused
+def _forces(system, t, q, u, inputs, u_dot):
+    now = Reactions(system, t, q, u, inputs, u_dot)
+    vectors = {name: as_vector(row, q) for name, row in now.forces_of_parts()}
+    return vectors | {name: jnp.asarray(x, dtype=q.dtype) for name, x in now.forces_of_auxiliary_speeds()}
+
+
+class _Forces(NamedTuple):
+    """Along N.x, N.y, N.z."""
+
+    transmitted: Row  # on what is built from a point or a frame
+    of_residuals: Row  # of the constraint residuals that depend on its motion
+
+
+class Reactions(Instant):
+    """An instant of the motion with its accelerations `u_dot` (n,), and the multipliers of its residuals.
+
+    The accelerations are given: they are a program of their own, which for many speeds calls into libraries.
+    """
+
+    def __init__(self, system: System, t: Any, q: Any, u: Any, inputs: InputValues, u_dot: Any):
+        super().__init__(system, t, q, u, inputs)
+        self.description: Motion = self.motion(self.t, self.q, self.u_all)
+        u_dot = as_row(u_dot, system.speeds, f"{self.name}: u_dot")
+        u_dep_dot = self.dependent_accelerations(u_dot)
+        self.momentum = self.momentum_rates((*u_dot, *u_dep_dot))
+        self.load_vectors = self.force_components()
+        # R_dep + C_dep^T lambda = 0
+        directions = [unit(self.n + self.k, self.n + r) for r in range(self.k)]
+        R = [mul(-1.0, self.unbalanced(self.along_speeds(self.velocities, direction))) for direction in directions]
+        self.multipliers: Row = solve(tuple(zip(*self.C_dep, strict=True)), R)[0] if self.k else ()
+
+    def read(self, part: str, t: Component, q: Row, u: Row) -> Any:
+        # The description itself: a record knows neither virtual velocities nor auxiliary speeds.
+        return getattr(Parts(self, t, q, u), part)()
+
+    def unbalanced(self, partial: Any) -> Component:
+        """R = sum F . V + T . W - V . dp/dt - W . dH/dt along one direction."""
+        bodies, columns = partial
+        total: Component = 0.0
+        for V, F in zip(columns, self.load_vectors, strict=True):
+            total = add(total, dot(V, F))
+        for (V, W), (p_dot, H_dot) in zip(bodies, self.momentum, strict=True):
+            total = add(total, mul(-1.0, add(dot(V, p_dot), dot(W, H_dot))))
+        return total
+
+    def power_of_prescribed_motions(self) -> Component:
+        """Power [W] of what drives velocities that are left when all speeds are zero, and of moving constraints.
+
+        sum V_t . dp/dt + W_t . dH/dt - F . V_t - T . W_t - lambda . c0
+        """
+        still = (0.0,) * (self.n + self.k)
+        c0 = self.residuals(self.t, self.q, still)
+        return mul(-1.0, add(self.unbalanced(self.velocities(still)), dot(c0, self.multipliers)))
+
+    def forces_of_parts(self) -> Iterator[tuple[str, Row]]:
+        """Forces at the named points, moments at the named frames."""
+        for name, point in self.description.points.items():
+            if self.is_cut(point):
+                yield name, self.along_axes(point).transmitted
+            elif self.k:
+                yield name, self.along_axes(point).of_residuals
+        for name, frame in self.description.frames.items():
+            if frame.parent is not None:
+                yield name, self.along_axes(frame).transmitted
+
+    def forces_of_auxiliary_speeds(self) -> Iterator[tuple[str, Component]]:
+        names = self.system.auxiliary_speeds
+        for i, name in enumerate(names):
+            direction = unit(self.n + self.k + len(names), self.n + self.k + i)
+            C_aux = self.along_speeds(lambda u: self.residuals(self.t, self.q, u), direction)
+            # R_aux + C_aux^T lambda + Q = 0
+            R = self.unbalanced(self.along_speeds(self.velocities, direction))
+            yield name, mul(-1.0, add(R, dot(C_aux, self.multipliers)))
+
+    def along_axes(self, part: Point | Frame) -> _Forces:
+        """Three auxiliary speeds of a point or a frame, along N.x, N.y and N.z."""
+        of_residuals, transmitted = [], []
+        still = (0.0,) * (self.n + self.k)
+        for axis in range(3):
+            Q = dot(self._virtual_residuals(part, axis), self.multipliers)
+            partial = self._along_virtual(part, axis, lambda: self.velocities(still))
+            of_residuals.append(Q)
+            transmitted.append(mul(-1.0, add(self.unbalanced(partial), Q)))
+        return _Forces(tuple(transmitted), tuple(of_residuals))
+
+    def _virtual_residuals(self, part: Point | Frame, axis: int) -> Row:
+        """C_aux: how the residuals change with a virtual velocity; constraints of the configuration, with a
+        displacement."""
+        if not self.k:
+            return ()
+        still = (0.0,) * (self.n + self.k)
+        rows = self._along_virtual(part, axis, lambda: self.read("rolling", self.t, self.q, still))
+        if len(rows) < self.k:
+            configuration = lambda: self.configuration(self.t, self.q)  # noqa: E731
+            rows = (*rows, *self._along_virtual(part, axis, configuration, displace=True))
+        return rows
+
+    def _along_virtual(self, part: Point | Frame, axis: int, read: Callable[[], Any], displace: bool = False) -> Any:
+        """The derivative of what `read` reads, along a virtual velocity (or displacement) of a point or a frame."""
+
+        def reading(row: Row) -> Any:
+            moving: Triple = tuple(row[0] if i == axis else 0.0 for i in range(3))  # type: ignore[assignment]
+            with virtual(part, displacement=moving) if displace else virtual(part, velocity=moving):
+                return read()
+
+        return self.along_speeds(reading, (1.0,))
+
+    def is_cut(self, point: Point) -> bool:
+        """Whether bodies are built from a point, which is not itself held by a residual."""
+        if any(point.velocity is residual for residual in self.description.vanishing):
+            return False
+        chains = [_chain(body.center) for body in self.description.bodies]
+        return any(point in chain for chain in chains)
+
+
+def _chain(point: Point | None) -> list[Point]:
+    chain = []
+    while point is not None:
+        chain.append(point)
+        point = point._base
+    return chain

@@ -1,0 +1,150 @@
+"""Graphs of scalars in another language: as objects of a library, or as lines of source. Knows no language itself.
+
+A language is a table of the operations that graphs have (`graph.py`): of functions, for objects; of `Form`s, for text.
+What a table lacks is refused by name.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..graph import Graph, Node, NotScalarError, needed, reads
+
+Table = Mapping[str, Callable[..., Any]]
+Constant = Callable[[Any, str], Any]
+"""A number and its dtype -> what stands for it."""
+
+
+def as_objects(
+    graph: Graph,
+    nodes: Iterable[int],
+    given: Mapping[int, Any],
+    table: Table,
+    constant: Constant,
+    language: str,
+    kept: Callable[[int, Any], Any] = lambda k, x: x,
+) -> dict[int, Any]:
+    """Nodes, each after those that it reads, as objects of a library.
+
+    `given`: the objects that stand for inputs, and for other nodes that are not to be opened. `kept` may put another
+    object, such as a name, in the place of the one that was made for a node.
+    """
+    found: dict[int, Any] = {}
+    for k in nodes:
+        node = graph.nodes[k]
+        if k in given:
+            found[k] = given[k]
+        elif node.operation == "constant":
+            found[k] = constant(graph.value(k), node.dtype)
+        else:
+            operands = [found[i] for i in node.operands]
+            found[k] = kept(k, operation_in(table, node, language)(*operands))
+    return found
+
+
+def operation_in(table: Mapping[str, Any], node: Node, language: str) -> Any:
+    if node.operation not in table:
+        raise NotScalarError(f"`{node.operation}` of {node.dtype}, which {language} has not")
+    return table[node.operation]
+
+
+def uses(graph: Graph, nodes: Sequence[int], outputs: Iterable[np.ndarray]) -> dict[int, int]:
+    """How often each node is read, by other nodes and by outputs."""
+    count = dict.fromkeys(nodes, 0)
+    for k in nodes:
+        for i in reads(graph.nodes[k]):
+            if i in count:
+                count[i] += 1
+    for array in outputs:
+        for k in array.flat:
+            count[int(k)] += 1
+    return count
+
+
+def count_operations(graph: Graph, outputs: Sequence[np.ndarray]) -> int:
+    """Scalar operations, each counted once however often its result is read."""
+    return sum(graph.nodes[k].operation not in ("input", "constant") for k in needed(graph.nodes, outputs))
+
+
+class Form(NamedTuple):
+    """How an operation is written: `text` with places {0}, {1} for the operands, {s} for the suffix of the result's
+    type and {type} for the type itself; how tightly it binds; and how tightly each operand must, not to need
+    parentheses."""
+
+    text: str
+    binds: int
+    operands: tuple[int, ...]
+
+
+LOOSE, COMPARED, SUM, PRODUCT, SIGNED, TIGHT = range(6)
+"""How tightly forms bind. Sums and products are grouped from the left, as every language reads them."""
+
+ARITHMETIC = {
+    "add": Form("{0} + {1}", SUM, (SUM, PRODUCT)),
+    "sub": Form("{0} - {1}", SUM, (SUM, PRODUCT)),
+    "mul": Form("{0} * {1}", PRODUCT, (PRODUCT, SIGNED)),
+    "div": Form("{0} / {1}", PRODUCT, (PRODUCT, SIGNED)),
+    "neg": Form("-{0}", SIGNED, (TIGHT,)),
+}
+COMPARISONS = {
+    name: Form(f"{{0}} {sign} {{1}}", COMPARED, (SUM, SUM))
+    for name, sign in {"eq": "==", "ne": "!=", "lt": "<", "le": "<=", "gt": ">", "ge": ">="}.items()
+}
+
+
+def call(function: str, n: int = 1) -> Form:
+    """A function of n operands."""
+    return Form(f"{function}({', '.join(f'{{{i}}}' for i in range(n))})", TIGHT, (LOOSE,) * n)
+
+
+@dataclasses.dataclass(frozen=True)
+class Language:
+    """`forms` by operation; `constant` writes a number, `declared` a line that names one: (name, text, dtype) -> line.
+    `suffix` and `types` stand for {s} and {type} in forms, by dtype."""
+
+    name: str
+    forms: Mapping[str, Form]
+    constant: Constant
+    declared: Callable[[str, str, str], str]
+    types: Mapping[str, str]
+    suffix: Mapping[str, str] = dataclasses.field(default_factory=lambda: {"float64": "", "float32": "", "bool": ""})
+
+
+_WIDE = 70  # characters that are still read at a glance
+
+
+def as_source(
+    graph: Graph, outputs: Sequence[np.ndarray], given: Mapping[int, str], language: Language, temporary: str = "x{}"
+) -> tuple[list[str], list[list[str]]]:
+    """The lines before the outputs, and the outputs' elements as expressions.
+
+    What is read more than once, or would be long, has a line and a name of its own; `given` are the names of inputs.
+    """
+    nodes = needed(graph.nodes, outputs)
+    count = uses(graph, nodes, outputs)
+    lines: list[str] = []
+    found: dict[int, tuple[str, int]] = {}
+    for k in nodes:
+        node = graph.nodes[k]
+        if node.operation == "input":
+            found[k] = given[k], TIGHT
+        elif node.operation == "constant":
+            text = language.constant(graph.value(k), node.dtype)
+            found[k] = text, SIGNED if text.startswith("-") else TIGHT
+        else:
+            form = operation_in(language.forms, node, language.name)
+            operands = [
+                text if binds >= needs else f"({text})"
+                for (text, binds), needs in zip((found[i] for i in node.operands), form.operands, strict=True)
+            ]
+            text = form.text.format(*operands, s=language.suffix[node.dtype], type=language.types[node.dtype])
+            found[k] = text, form.binds
+            if count[k] > 1 or len(text) > _WIDE:
+                name = temporary.format(len(lines))
+                lines.append(language.declared(name, text, node.dtype))
+                found[k] = name, TIGHT
+    return lines, [[found[int(k)][0] for k in array.flat] for array in outputs]

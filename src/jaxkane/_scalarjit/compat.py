@@ -1,0 +1,201 @@
+"""All that this library uses of JAX and equinox beyond what they promise. Knows no programs and no mechanics.
+
+Each has a way back, so that where a release takes it away, results stay right and only speed, or a convenience, goes:
+
+| what | without it |
+|---|---|
+| jaxprs and primitives (`jax.extend`, `jax.interpreters`) | `FUSES` says why; right-hand sides are plain JAX |
+| the frontend attribute that makes one function of a program | XLA cuts the program as it does any other |
+| tracers of a derivative in forward mode | such a derivative must be announced by `adjoint="forward"` |
+| the state of traces | motions are compiled for derivatives that nobody can take, a tenth slower at first |
+| `reset_cache`, equinox's switch of its checks | programs are kept only where the environment says so from the start |
+| `eval_context` | a sweep on a cluster may be refused, since programs that were first traced in a check differ |
+| `process_allgather` | none: a fit by several processes raises ImportError |
+
+`tests/scalarjit/test_compat.py` names what has gone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+import jax
+from jax.core import Tracer
+
+FUSES: str | None = None  # why programs cannot be fused, or None
+try:
+    from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, jaxpr_as_fun
+    from jax.interpreters import ad, batching, mlir
+    from jax.interpreters.ad import instantiate_zeros, is_undefined_primal
+    from jax.interpreters.partial_eval import dce_jaxpr
+
+    _ = Jaxpr.replace, JaxprEqn.replace
+except (ImportError, AttributeError) as error:
+    FUSES = f"this JAX lacks what that needs ({error})"
+    missing: Any = None
+    ClosedJaxpr = Jaxpr = Literal = Primitive = missing
+    jaxpr_as_fun = dce_jaxpr = instantiate_zeros = is_undefined_primal = ad = batching = mlir = missing
+
+
+def types_of(program: Any) -> tuple[list[Any], list[Any]]:
+    """Shapes and dtypes of what a program takes and gives; JAX 0.12 declares them as types without either."""
+    return [*program.in_avals], [*program.out_avals]
+
+
+def new_primitive(
+    name: str,
+    *,
+    evaluate: Callable[..., Any],
+    shapes: Callable[..., Any],
+    jvp: Callable[..., Any],
+    transpose: Callable[..., Any],
+    batch: Callable[..., Any],
+    traced: Callable[..., Any],
+    lower_on_cpu: Callable[..., Any],
+) -> Any:
+    """An operation of JAX with several results and these rules; `traced` is what it stands for, `lower_on_cpu` makes
+    its text for XLA there."""
+    primitive = Primitive(name)
+    primitive.multiple_results = True
+    primitive.def_impl(evaluate)
+    primitive.def_abstract_eval(shapes)
+    ad.primitive_jvps[primitive] = jvp
+    ad.primitive_transposes[primitive] = transpose
+    batching.primitive_batchers[primitive] = batch
+    mlir.register_lowering(primitive, mlir.lower_fun(traced, multiple_results=True))
+    mlir.register_lowering(primitive, lower_on_cpu, platform="cpu")
+    return primitive
+
+
+def bound(equation: Any, inputs: list[Any]) -> Any:
+    """What an equation of a jaxpr does, to other inputs; with its own rules for derivatives, where it has some."""
+    primitive = equation.primitive
+    return primitive.bind(*inputs, **primitive.get_bind_params(equation.params))
+
+
+def new_variable(like: Any) -> Any:
+    """A variable of a jaxpr, of the same type as another; they are told apart by identity."""
+    return copy.copy(like)
+
+
+def is_moved_forward(x: Any) -> bool:
+    """Whether a derivative in forward mode (`jax.jvp`, `jax.jacfwd`) is under way by `x` that nobody will transpose."""
+    try:
+        from jax.interpreters.ad import JVPTracer
+        from jax.interpreters.partial_eval import JaxprTracer
+    except ImportError:
+        return False
+    while isinstance(x, Tracer) and not isinstance(x, JVPTracer) and hasattr(x, "val"):
+        x = x.val  # of a batch
+    return isinstance(x, JVPTracer) and not isinstance(x.tangent, JaxprTracer)
+
+
+def is_moved_forward_below(x: Any) -> bool:
+    """Whether a derivative of `x` is under way, and one in forward mode of that: `jax.hessian`."""
+    return is_moved_forward(getattr(x, "primal", None))
+
+
+def is_under_way(x: Tracer) -> bool:
+    """Whether the trace of a number has not ended yet: one that has ended refuses every operation."""
+    try:
+        jax.numpy.isfinite(x)
+    except jax.errors.UnexpectedTracerError:
+        return False
+    return True
+
+
+def as_lowering(f: Callable[..., Any]) -> Callable[..., Any]:
+    """A function of JAX, with several results, as a rule that makes text for XLA."""
+    return mlir.lower_fun(f, multiple_results=True)
+
+
+def is_no_tangent(tangent: Any) -> bool:
+    """Whether a tangent is JAX's sign for none at all, which is more than zero."""
+    return type(tangent) is ad.Zero
+
+
+def no_tangent(x: Any) -> Any:
+    """JAX's sign for it, of an abstract value: what truth values and whole numbers have."""
+    return ad.Zero(x.to_tangent_aval())
+
+
+def one_function() -> contextlib.AbstractContextManager[Any]:
+    """Under it, each call of a jitted function is compiled by XLA:CPU as one function of LLVM."""
+    try:
+        from jax.experimental.xla_metadata import set_xla_metadata
+
+        return set_xla_metadata(xla_cpu_small_call="true", inlineable="false")
+    except (ImportError, TypeError):
+        return contextlib.nullcontext()
+
+
+def concretely() -> contextlib.AbstractContextManager[Any]:
+    """Under it numbers that are at hand are computed with at once, inside a trace too; what is traced under it is the
+    same program as elsewhere, which `jax.ensure_compile_time_eval` does not promise."""
+    try:
+        from jax.core import eval_context
+    except ImportError:
+        return jax.ensure_compile_time_eval()
+    return eval_context()
+
+
+def nothing_is_traced() -> bool:
+    """Whether no trace is under way at all, so that nobody can differentiate what is computed now."""
+    try:
+        from jax.core import eval_context
+        from jax.extend.core import get_opaque_trace_state
+    except ImportError:
+        return False
+    with eval_context():
+        plain = get_opaque_trace_state()
+    return get_opaque_trace_state() == plain
+
+
+def settings() -> Any:
+    """JAX's settings on which a traced program depends beside its arguments."""
+    return tuple(getattr(jax.config, name, None) for name in _SETTINGS)
+
+
+_SETTINGS = (
+    "jax_enable_x64",
+    "jax_numpy_dtype_promotion",
+    "jax_numpy_rank_promotion",
+    "jax_default_matmul_precision",
+    "jax_default_dtype_bits",
+    "jax_debug_nans",
+)
+
+
+def look_for_cache_again() -> None:
+    """Have JAX look again where programs are kept: it does so once, when it first compiles."""
+    try:
+        from jax.experimental.compilation_cache.compilation_cache import reset_cache
+    except ImportError:
+        return
+    reset_cache()
+
+
+def on_failed_checks(how: str) -> str | None:
+    """Have equinox's checks "raise", or give "nan". **Returns:** what they did before; None where that is not known.
+
+    equinox reads the environment's EQX_ON_ERROR when it is imported; its checks look at the name in their own module
+    when they are traced.
+    """
+    try:
+        checks: Any = importlib.import_module("equinox._errors")
+    except ImportError:
+        return None
+    before = getattr(checks, "EQX_ON_ERROR", None)
+    checks.EQX_ON_ERROR = how
+    return before
+
+
+def process_allgather(x: Any, *, tiled: bool = False) -> Any:
+    """The arrays of all processes, stacked or, if `tiled`, one after the other."""
+    from jax.experimental.multihost_utils import process_allgather
+
+    return process_allgather(x, tiled=tiled)

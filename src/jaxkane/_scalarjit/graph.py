@@ -1,0 +1,338 @@
+"""Programs of JAX as graphs of scalars, every node once. Knows jaxprs; knows no machine and no mechanics."""
+
+from __future__ import annotations
+
+import functools
+import operator
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jax.lax import RoundingMethod
+
+from .compat import ClosedJaxpr, Jaxpr, Literal, types_of
+
+OPERATORS: dict[str, Callable[..., Any]] = {
+    "add": operator.add,
+    "sub": operator.sub,
+    "mul": operator.mul,
+    "div": operator.truediv,
+    "neg": operator.neg,
+}
+"""Arithmetic, by JAX's names of it, for whatever has Python's operators."""
+
+CALLS = ("jit", "pjit")
+# Programs within programs, and the parameter that holds them. A rule for derivatives has been used before, or is not.
+_OPENED = dict.fromkeys(CALLS, "jaxpr") | dict.fromkeys(("custom_jvp_call", "custom_vjp_call"), "call_jaxpr")
+
+# Operations by the names of JAX's primitives.
+FLOATS = ("float64", "float32")
+DTYPES = (*FLOATS, "bool")
+ARITHMETIC = frozenset("add sub mul div rem".split())
+LOGIC = frozenset("and or xor".split())
+COMPARISONS = frozenset("eq ne lt le gt ge".split())
+SIMPLE = frozenset("sqrt abs floor max min".split())
+# Those that a mathematical library has, by the same names.
+LIBRARY = frozenset(
+    "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp exp2 expm1 log log1p pow cbrt erf".split()
+)
+_OF_MANY = {"reduce_max": "max", "reduce_min": "min", "reduce_prod": "mul", "reduce_and": "and", "reduce_or": "or"}
+_COMMUTES = frozenset("add mul max min and or xor".split())
+_SAME = frozenset("copy copy_p stop_gradient optimization_barrier".split())
+
+
+class NotScalarError(Exception):
+    """The program holds something that is no operation of scalars, or that a language lacks."""
+
+
+class Node(NamedTuple):
+    operation: str
+    operands: tuple[Any, ...]
+    dtype: str
+
+
+def symbol(node: Node) -> str:
+    """The name of a function in the C library."""
+    return node.operation if node.dtype == "float64" else node.operation + "f"
+
+
+class Graph:
+    """Scalars, each once. Folded is what XLA folds too: x + 0, x - 0, x * 1, x * -1, x / 1; and signs, which are exact:
+    -(-x) is x, and x + (-y) is x - y. Not x * 0 and 0 / x, which are NaN where x is not finite or zero, nor 0 - x,
+    which is no -x where x is zero: the zeros of descriptions and of derivatives are gone before (`components`, and
+    JAX), so that nothing is to be gained."""
+
+    def __init__(self) -> None:
+        self.nodes: list[Node] = []
+        self._numbers: dict[Node, int] = {}
+
+    def add(self, operation: str, operands: tuple[Any, ...], dtype: str) -> int:
+        if dtype not in DTYPES:
+            raise NotScalarError(dtype)
+        node = Node(operation, tuple(sorted(operands)) if operation in _COMMUTES else operands, dtype)
+        if node not in self._numbers:
+            self._numbers[node] = len(self.nodes)
+            self.nodes.append(node)
+        return self._numbers[node]
+
+    def constant(self, value: Any, dtype: str) -> int:
+        # By its digits, since -0.0 == 0.0 and nan != nan.
+        return self.add("constant", (float(value).hex() if dtype != "bool" else bool(value),), dtype)
+
+    def value(self, number: int) -> float | bool | None:
+        node = self.nodes[number]
+        if node.operation != "constant":
+            return None
+        return float.fromhex(node.operands[0]) if node.dtype != "bool" else node.operands[0]
+
+    def reading_groups(self, groups: Sequence[Sequence[int]]) -> Graph:
+        """The same, of arguments in groups: several numbers are one array. What is in no group is not read."""
+        place = {i: (g, e, len(group)) for g, group in enumerate(groups) for e, i in enumerate(group)}
+        graph = Graph()
+        for node in self.nodes:
+            if node.operation == "input" and node.operands[0] in place:
+                argument, element, size = node.operands
+                g, e, n = place[argument]
+                node = node._replace(operands=(g, e + element, n * size))
+            graph.nodes.append(node)
+        return graph
+
+    def apply(self, operation: str, operands: tuple[int, ...], dtype: str) -> int:
+        known = self._folded(operation, operands, dtype) if operation in ARITHMETIC else None
+        if known is None:
+            known = self._signed(operation, operands, dtype) if operation in ("neg", "add", "sub") else None
+        return self.add(operation, operands, dtype) if known is None else known
+
+    def _signed(self, operation: str, operands: tuple[int, ...], dtype: str) -> int | None:
+        last = operands[-1]
+        if self.nodes[last].operation == "neg":
+            opposite = self.nodes[last].operands[0]
+            if operation == "neg":
+                return opposite
+            return self.apply("sub" if operation == "add" else "add", (operands[0], opposite), dtype)
+        if operation == "add" and self.nodes[operands[0]].operation == "neg":
+            return self.apply("sub", (last, self.nodes[operands[0]].operands[0]), dtype)
+        value = self.value(last) if operation == "neg" else None
+        return None if value is None else self.constant(-value, dtype)
+
+    def _folded(self, operation: str, operands: tuple[int, ...], dtype: str) -> int | None:
+        a, b = operands
+        x, y = self.value(a), self.value(b)
+        match operation:
+            case "add":
+                return b if x == 0 else a if y == 0 else None
+            case "sub":
+                return a if y == 0 else None
+            case "mul":
+                if x in (1, -1) or y in (1, -1):
+                    other, unit = (b, x) if x in (1, -1) else (a, y)
+                    return other if unit == 1 else self.add("neg", (other,), dtype)
+            case "div":
+                return a if y == 1 else None
+        return None
+
+
+def graph_of(program: ClosedJaxpr) -> tuple[Graph, list[np.ndarray]]:
+    """A program as a graph, and its outputs as arrays of node numbers. Element e of argument i is an input (i, e, the
+    argument's size)."""
+    graph, inputs = Graph(), []
+    for i, aval in enumerate(types_of(program)[0]):
+        elements = [graph.add("input", (i, e, aval.size), str(aval.dtype)) for e in range(aval.size)]
+        inputs.append(np.array(elements, np.int64).reshape(aval.shape))
+    return graph, unrolled(program.jaxpr, program.consts, inputs, graph)
+
+
+def unrolled(program: Jaxpr, consts: Sequence[Any], inputs: Sequence[np.ndarray], graph: Graph) -> list[np.ndarray]:
+    """The program's outputs as arrays of node numbers."""
+
+    constants = functools.partial(as_constants, graph=graph)
+    values: dict[Any, np.ndarray] = {}
+    values.update(zip(program.constvars, map(constants, consts), strict=True))
+    values.update(zip(program.invars, inputs, strict=True))
+    for equation in program.eqns:
+        xs = [constants(v.val) if isinstance(v, Literal) else values[v] for v in equation.invars]
+        values.update(zip(equation.outvars, applied(equation, xs, graph), strict=True))
+    return [constants(v.val) if isinstance(v, Literal) else values[v] for v in program.outvars]
+
+
+def as_constants(x: Any, graph: Graph) -> np.ndarray:
+    x = np.asarray(x)
+    dtype = _name_of(x.dtype)
+    if dtype in DTYPES:
+        return _each(lambda v: graph.constant(v, dtype), x)
+    return x  # whole numbers: exponents, places
+
+
+def applied(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.ndarray]:
+    """The outputs of an equation whose inputs are these nodes."""
+    if equation.primitive.name in _OPENED:
+        inner = equation.params[_OPENED[equation.primitive.name]]
+        return unrolled(inner.jaxpr, inner.consts, xs, graph)
+    avals: list[Any] = [v.aval for v in equation.outvars]
+    found = zip(_operation(equation, xs, graph), avals, strict=True)
+    return [x if x.shape == aval.shape else np.broadcast_to(x, aval.shape) for x, aval in found]
+
+
+def _each(f: Callable[..., int], *xs: np.ndarray) -> np.ndarray:
+    if any(x.shape != xs[0].shape for x in xs):
+        xs = np.broadcast_arrays(*xs)
+    found = [f(*numbers) for numbers in zip(*(x.ravel().tolist() for x in xs), strict=True)]
+    return np.array(found, np.int64).reshape(xs[0].shape)
+
+
+_name_of = functools.cache(str)  # of a dtype; NumPy composes it anew each time
+
+
+def _operation(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.ndarray]:
+    name, params, aval = equation.primitive.name, equation.params, equation.outvars[0].aval
+    name = "add" if name == "add_any" else name
+    dtype = _name_of(aval.dtype)
+    x_dtype = _name_of(equation.invars[0].aval.dtype) if equation.invars else dtype
+
+    def each(operation: str, *ys: np.ndarray, dtype: str = dtype) -> np.ndarray:
+        return _each(lambda *numbers: graph.apply(operation, numbers, dtype), *ys)
+
+    moved = _moved(name, params, xs, aval.shape)
+    if moved is not None:
+        return moved
+    if name == "convert_element_type" and dtype in DTYPES and x_dtype not in DTYPES:
+        return [_each(lambda v: graph.constant(v, dtype), xs[0])]  # whole numbers are constants here
+    if x_dtype not in DTYPES or dtype not in DTYPES:
+        raise NotScalarError(f"{name} of {x_dtype}")
+    one = np.array(graph.constant(1.0, dtype)) if dtype in FLOATS else xs[0]
+    match name:
+        case "eq" | "ne" if x_dtype == "bool":  # as jnp.mod asks whether two signs differ
+            differ = each("xor", *xs)
+            return [differ if name == "ne" else each("xor", differ, _full((), True, graph, "bool"))]
+        case "convert_element_type" if dtype == x_dtype:
+            return [xs[0]]
+        case "neg":
+            return [each(name, xs[0])]
+        case "ceil":
+            return [each("neg", each("floor", each("neg", xs[0])))]
+        case "round":
+            to_even = params["rounding_method"] == RoundingMethod.TO_NEAREST_EVEN
+            return [_rounded(xs[0], to_even, each, graph, dtype)]
+        case "sign":
+            zero = _full((), 0.0, graph, dtype)
+            positive, negative = each("gt", xs[0], zero, dtype="bool"), each("lt", xs[0], zero, dtype="bool")
+            return [each("select", positive, one, each("select", negative, each("neg", one), xs[0]))]
+        case "logistic":
+            return [each("div", one, each("add", one, each("exp", each("neg", xs[0]))))]
+        case "square":
+            return [each("mul", xs[0], xs[0])]
+        case "one_minus_square":  # of JAX 0.12, in the derivative of tanh
+            return [each("mul", each("sub", one, xs[0]), each("add", one, xs[0]))]
+        case "integer_pow":
+            return [_power(xs[0], params["y"], each, one)]
+        case "rsqrt":
+            return [each("div", one, each("sqrt", xs[0]))]
+        case "is_finite":
+            return [each("lt", each("abs", xs[0], dtype=x_dtype), _full((), np.inf, graph, x_dtype))]
+        case "not" if dtype == "bool":
+            return [each("xor", xs[0], _full((), True, graph, "bool"))]
+        case "select_n" if len(xs) == 3 and x_dtype == "bool":
+            return [each("select", xs[0], xs[2], xs[1])]
+        case "clamp":
+            return [each("min", each("max", xs[1], xs[0]), xs[2])]
+        case "convert_element_type" if dtype in FLOATS:
+            return [each("convert", xs[0])]
+        case "reduce_sum":
+            return [_reduced("add", xs[0], params["axes"], each, _full((), 0.0, graph, dtype))]
+        case "reduce_max" | "reduce_min" | "reduce_prod" | "reduce_and" | "reduce_or" if xs[0].size:
+            return [_reduced(_OF_MANY[name], xs[0], params["axes"], each)]
+    if name in LOGIC and dtype == "bool":
+        return [each(name, *xs)]
+    if name in COMPARISONS and x_dtype in FLOATS:
+        return [each(name, *xs)]
+    of_one_type = dtype in FLOATS and all(_name_of(v.aval.dtype) == dtype for v in equation.invars)
+    if of_one_type and name in ARITHMETIC | SIMPLE | LIBRARY:
+        return [each(name, *xs)]
+    raise NotScalarError(f"{name} of {x_dtype}")
+
+
+def _moved(name: str, params: Any, xs: list[np.ndarray], shape: tuple[int, ...]) -> list[np.ndarray] | None:
+    """What only carries scalars from place to place."""
+    x = xs[0] if xs else np.empty(0)
+    match name:
+        case _ if name in _SAME:
+            return xs
+        case "reshape" | "squeeze":
+            return [x.reshape(shape)]
+        case "broadcast_in_dim":
+            kept = [shape[d] if d in params["broadcast_dimensions"] else 1 for d in range(len(shape))]
+            places = dict(zip(params["broadcast_dimensions"], x.shape, strict=True))
+            return [np.broadcast_to(x.reshape([places.get(d, 1) for d in range(len(kept))]), shape)]
+        case "concatenate":
+            return [np.concatenate(xs, axis=params["dimension"])]
+        case "stack":
+            return [np.stack(xs, axis=params["axis"])]
+        case "unstack":
+            return [np.take(x, i, axis=params["axis"]) for i in range(x.shape[params["axis"]])]
+        case "split":
+            return list(np.split(x, np.cumsum(params["sizes"])[:-1], axis=params["axis"]))
+        case "transpose":
+            return [np.transpose(x, params["permutation"])]
+        case "rev":
+            return [np.flip(x, params["dimensions"])]
+        case "slice":
+            steps = params["strides"] or (1,) * x.ndim
+            return [x[tuple(map(slice, params["start_indices"], params["limit_indices"], steps))]]
+        case "pad":
+            out = np.full(shape, xs[1], dtype=x.dtype)
+            places = [low + (1 + step) * np.arange(n) for n, (low, _, step) in zip(x.shape, params["padding_config"])]
+            kept = [(0 <= at) & (at < n) for at, n in zip(places, shape)]  # a negative padding takes away
+            out[np.ix_(*(at[k] for at, k in zip(places, kept)))] = x[np.ix_(*kept)]
+            return [out]
+    return None
+
+
+def _full(shape: Sequence[int], value: Any, graph: Graph, dtype: str) -> np.ndarray:
+    return np.full(shape, graph.constant(value, dtype), dtype=np.int64)
+
+
+def _power(x: np.ndarray, y: int, each: Callable[..., np.ndarray], one: np.ndarray) -> np.ndarray:
+    found, factor, n = one, x, abs(y)
+    while n:
+        if n & 1:
+            found = each("mul", found, factor)
+        factor, n = each("mul", factor, factor) if n > 1 else factor, n >> 1
+    return found if y >= 0 else each("div", one, found)
+
+
+def _rounded(x: np.ndarray, to_even: bool, each: Callable[..., np.ndarray], graph: Graph, dtype: str) -> np.ndarray:
+    """The nearest whole number; of two that are as near the even one, or else that farther from zero."""
+    half, one = _full((), 0.5, graph, dtype), _full((), 1.0, graph, dtype)
+    below = each("floor", x)
+    rest, halved = each("sub", x, below), each("mul", half, below)
+    even = each("eq", halved, each("floor", halved), dtype="bool")
+    down = even if to_even else each("lt", x, _full((), 0.0, graph, dtype), dtype="bool")
+    down = each("and", each("eq", rest, half, dtype="bool"), down, dtype="bool")
+    down = each("or", each("lt", rest, half, dtype="bool"), down, dtype="bool")
+    return each("select", down, below, each("add", below, one))
+
+
+def _reduced(
+    operation: str, x: np.ndarray, axes: Iterable[int], each: Callable[..., np.ndarray], *first: np.ndarray
+) -> np.ndarray:
+    for axis in sorted(axes, reverse=True):
+        x = functools.reduce(lambda a, b: each(operation, a, b), [*first, *np.moveaxis(x, axis, 0)])
+    return x
+
+
+def needed(nodes: Sequence[Node], outputs: Iterable[np.ndarray]) -> list[int]:
+    """The nodes that outputs are made of, each after those that it reads."""
+    is_needed = [False] * len(nodes)
+    for array in outputs:
+        for k in array.flat:
+            is_needed[int(k)] = True
+    for k in range(len(nodes) - 1, -1, -1):
+        if is_needed[k]:
+            for i in reads(nodes[k]):
+                is_needed[i] = True
+    return [k for k, needs in enumerate(is_needed) if needs]
+
+
+def reads(node: Node) -> tuple[int, ...]:
+    """The nodes that a node is computed from."""
+    return () if node.operation in ("input", "constant") else node.operands

@@ -1,0 +1,125 @@
+"""What a bicycle pulls, and what holds it back: a trailer, air, and a speed that is prescribed."""
+
+from __future__ import annotations
+
+from .._scalarjit.components import Scalar
+from .._system.bodies import Body
+from .._system.forces import Force
+from .._system.parameters import parameter
+from ..catalog.bicycle import ABOVE_GROUND, FAR
+from ..loads import smooth_abs
+from ._parts import Part
+
+
+class Trailer(Part):
+    """A trailer on a ball at the frame: it rolls without slipping sideways, on an axle that stays level.
+
+    Its frame, "trailer", turns from the bicycle's heading by "trailer_angle" [rad], positive to the right, and tips by
+    the dependent "trailer_pitch" [rad] as the hitch rises and sinks. Neither is a new degree of freedom of the speeds:
+    what the bicycle does determines both rates. Its wheels count as mass, and not as rotors.
+
+    **Arguments:** `hitch_x`, `hitch_z` [m] in Meijaard's measures; `length` [m] from the hitch to the axle;
+    `wheel_radius`, `track` [m]: of the wheels, and between them (which is only drawn); `mass` [kg]; `center`, `height`
+    [m]: of the mass centre, before the axle and above it; `Ixx`, `Iyy`, `Izz` [kg m^2] about it.
+    """
+
+    hitch_x: Scalar = parameter(within=(-FAR, FAR), unit="m")
+    hitch_z: Scalar = parameter(within=ABOVE_GROUND, unit="m")
+    length: Scalar = parameter(positive=True, within=(0.0, FAR), unit="m")
+    wheel_radius: Scalar = parameter(positive=True, within=(0.0, FAR), unit="m")
+    mass: Scalar = parameter(positive=True, unit="kg")
+    center: Scalar = parameter(within=(-FAR, FAR), unit="m")
+    height: Scalar = parameter(within=(0.0, FAR), unit="m")
+    Ixx: Scalar = parameter(positive=True, unit="kg m^2")
+    Iyy: Scalar = parameter(positive=True, unit="kg m^2")
+    Izz: Scalar = parameter(positive=True, unit="kg m^2")
+    track: Scalar = parameter(0.6, within=(0.0, FAR), unit="m")
+
+    coordinates = ("trailer_angle", "trailer_pitch")
+    dependent_coordinates = ("trailer_pitch",)
+    dependent_speeds = ("trailer_angle_rate", "trailer_pitch_rate")
+    units = {
+        "trailer_angle": "rad",
+        "trailer_pitch": "rad",
+        "trailer_angle_rate": "rad/s",
+        "trailer_pitch_rate": "rad/s",
+    }
+
+    def check(self, bicycle):
+        if bicycle.road.curved:
+            raise ValueError("A Trailer rolls on level ground or a Slope, not on a Road of given height.")
+
+    def motion(self, bicycle, motion, t, q, u):
+        heading = motion["Y"].rotate(3, q["trailer_angle"], u["trailer_angle_rate"])
+        T = heading.rotate(2, q["trailer_pitch"], u["trailer_pitch_rate"], "trailer")
+        hitch = bicycle.on_frame(motion, self.hitch_x, 0.0, self.hitch_z)
+        axle = hitch.fixed(T.vector(-self.length, 0.0, -self.hitch_z - self.wheel_radius))
+        center = axle.fixed(T.vector(self.center, 0.0, -self.height))
+        box = Body(self.mass, (self.Ixx, self.Iyy, self.Izz), center, T, name="box")
+        residuals = [axle.velocity.dot(motion.N.z), axle.velocity.dot(heading.y)]
+        return motion.extended([box], residuals, points={"hitch": hitch, "axle": axle}, frames={"trailer": T})
+
+    def configuration_constraints(self, bicycle, t, q, motion):
+        return [motion["axle"].position.dot(motion.N.z) + self.wheel_radius]
+
+    def draw(self, bicycle, motion, sketch):
+        axle, T, half = motion["axle"].position, motion["trailer"], 0.5 * self.track
+        for side in (-1.0, 1.0):
+            sketch.circle("ink", axle + side * half * T.y, T.x, T.z, self.wheel_radius, width=3.0, fill=0.05)
+        corners = [axle + x * T.x + y * T.y for x, y in ((0.4, -half), (0.4, half), (-0.4, half), (-0.4, -half))]
+        top = [corner - 0.5 * T.z for corner in corners]
+        sketch.line("green", *corners, closed=True, fill=0.15)
+        sketch.line("green", *top, closed=True)
+        for low, high in zip(corners, top, strict=True):
+            sketch.line("green", low, high)
+        sketch.line("green", motion["hitch"], axle + 0.4 * T.x, width=3.0)
+
+
+class Drag(Part):
+    """Drag of still air at a point of the frame: -density / 2 * area * |v| v.
+
+    **Arguments:** `area` [m^2]: frontal area times drag coefficient, of an upright rider some 0.5; `height` over the
+    ground and place `ahead` of the rear contact [m] of the point at which it acts, when upright; `density` [kg/m^3].
+    """
+
+    area: Scalar = parameter(0.5, positive=True, unit="m^2")
+    height: Scalar = parameter(1.1, within=(0.0, FAR), unit="m")
+    ahead: Scalar = parameter(0.4, within=(-FAR, FAR), unit="m")
+    density: Scalar = parameter(1.2, positive=True, unit="kg/m^3")
+
+    resists = True
+
+    def motion(self, bicycle, motion, t, q, u):
+        B, hub = motion["B"], motion["rear wheel"].center
+        place = hub.fixed(self.ahead * B.x + (bicycle.rR - self.height) * B.z, B)
+        return motion.extended(points={"center of drag": place})
+
+    def loads(self, bicycle, t, q, u, motion, values):
+        v = motion["center of drag"].velocity
+        size = 0.5 * self.density * self.area * smooth_abs(v, 1e-3)  # [N s/m]; smooth below a millimetre a second
+        return Force(-size * v, motion["center of drag"])
+
+
+class ConstantSpeed(Part):
+    """The rear wheel turns against the frame at a prescribed rate, whatever torque that takes.
+
+        rear_wheel_rate = -speed / rR
+
+    The rate is a dependent speed then, which an initial state leaves out. The output "holding_torque" [N m] is the
+    torque that the drive has to give, on the rear wheel with its reaction on the frame, negative where it pushes on, as
+    "drive_torque". Linear models over speeds are those of the bicycle without this part, with the "drive_torque" that
+    riding straight and upright takes: deviations from it change the speed to second order only.
+
+    **Arguments:** `speed` [m/s].
+    """
+
+    speed: Scalar = parameter(within=(-100.0, 100.0), unit="m/s")
+
+    dependent_speeds = ("rear_wheel_rate",)
+    units = {"holding_torque": "N m"}
+
+    def motion(self, bicycle, motion, t, q, u):
+        return motion.extended((), [u["rear_wheel_rate"] + self.speed / bicycle.rR])
+
+    def outputs(self, bicycle, t, q, u, motion, now):
+        return {"holding_torque": now.multipliers[bicycle.dependent_speeds.index("rear_wheel_rate")]}

@@ -1,0 +1,219 @@
+"""Fits beside each other, and whether a value can be believed. Fits nothing."""
+
+from __future__ import annotations
+
+import dataclasses
+import html
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from .._common.lookup import refuse_unknown
+from ._bijections import Interval
+from ._parameters import Parameters
+from ._problem import refuse_other
+from ._result import Fit
+from ._tables import html_table, plain
+from ._trial import Trial
+from ._validate import applied_to
+
+Range = tuple[float, float]
+
+DEVIATIONS = 3.0
+"""Of its prior, by which a value may be off."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Plausible:
+    """By name of a parameter, between what it is believed."""
+
+    ranges: Mapping[str, Range]
+
+    def objections(self, values: Mapping[str, float]) -> list[str]:
+        """What is not believed of these values, in words."""
+        found = []
+        for name, value in values.items():
+            low, high = self.ranges.get(name, (-math.inf, math.inf))
+            if not low <= value <= high:
+                side = f"below {low:.4g}" if value < low else f"above {high:.4g}"
+                found.append(f"{name} = {value:.4g} is {side}" if math.isfinite(value) else f"{name} is {value}")
+        return found
+
+
+def plausible_of(parameters: Parameters, said: Mapping[str, Any]) -> Plausible:
+    """For every parameter what was said of it, (lower, upper) or a share of its start; else three deviations of its
+    prior; else its bounds, of which it must stay away. Where a search starts says nothing."""
+    ranges, first = {}, 0
+    for bijection, size in zip(parameters.bijections, parameters.sizes, strict=True):
+        for i in range(first, first + size):
+            name, start = parameters.names[i], float(parameters.start[i])
+            mean, deviation = float(parameters.prior_mean[i]), float(parameters.prior_deviation[i])
+            if name in said:
+                ranges[name] = checked_range(name, said[name], start)
+            elif math.isfinite(deviation):
+                ranges[name] = mean - DEVIATIONS * deviation, mean + DEVIATIONS * deviation
+            elif isinstance(bijection, Interval) and all(bijection.bounded) and bijection.uniform:
+                low, high = float(bijection.lower), float(bijection.upper)
+                ranges[name] = low + 1e-3 * (high - low), high - 1e-3 * (high - low)
+        first += size
+    return Plausible(ranges)
+
+
+def checked_range(name: str, given: Any, start: float) -> Range:
+    """(lower, upper) of a pair, or of a share of the start.
+
+    **Raises:** `ValueError` where it is neither.
+    """
+    if isinstance(given, (int, float)):
+        share = float(given)
+        if not (share > 0 and start):
+            raise ValueError(
+                f"`plausible` of {name}: a share is positive, and of a start that is not zero; got {given}."
+            )
+        return start - share * abs(start), start + share * abs(start)
+    if not isinstance(given, (tuple, list)) or len(given) != 2:
+        raise ValueError(f"`plausible` of {name} is (lower, upper), or a share of its start; got {given!r}.")
+    low = -math.inf if given[0] is None else float(given[0])
+    high = math.inf if given[1] is None else float(given[1])
+    if not low < high:
+        raise ValueError(f"`plausible` of {name}: nothing lies between {low} and {high}.")
+    return low, high
+
+
+Table = tuple[str, list[list[str]]]
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Comparison:
+    """What `compare` gives; print it for the tables.
+
+    - `fits`: by name. `held_out`: by name, the parameters of each on trials that were held back; empty without any.
+    - `objections`: by name, what is not plausible of each fit's parameters, in words.
+    """
+
+    fits: Mapping[str, Fit]
+    held_out: Mapping[str, Fit]
+    objections: Mapping[str, tuple[str, ...]]
+
+    @property
+    def tables(self) -> list[Table]:
+        """A heading and rows, of which the first is the head, for each."""
+        found = [("Parameters, with the errors of their intervals", self._parameters()), ("All", self._sums())]
+        if any(self.objections.values()):
+            rows = [[name, objection] for name, objections in self.objections.items() for objection in objections]
+            found.append(("Not plausible", [["fit", "objection"], *rows]))
+        found.append(("Sum of squares and variance accounted for, by channel", self._channels(self.fits)))
+        found.append(("Sum of squares, by trial", self._trials(self.fits)))
+        if self.held_out:
+            found.append(("Held back: by channel", self._channels(self.held_out)))
+            found.append(("Held back: by trial", self._trials(self.held_out)))
+        return found
+
+    def _parameters(self) -> list[list[str]]:
+        names = list(dict.fromkeys(name for fit in self.fits.values() for name in fit.names))
+        units = {n: u for fit in self.fits.values() for n, u in zip(fit.names, fit.parameters.units, strict=True)}
+        rows = [["parameter", *self.fits]]
+        for name in names:
+            cells = []
+            for fit in self.fits.values():
+                cells.append(f"{fit.estimates[name]:.5g} ({fit.errors[name]:.2g})" if name in fit.names else "")
+            rows.append([f"{name} [{units[name]}]" if units[name] else name, *cells])
+        return rows
+
+    def _sums(self) -> list[list[str]]:
+        fits, columns = list(self.fits.values()), list(self.fits)
+        rows = [["", *columns], ["status", *(fit.status for fit in fits)]]
+        for cost in dict.fromkeys(fit.problem.cost_name for fit in fits):
+            rows.append([cost, *(f"{fit.cost:.6g}" if fit.problem.cost_name == cost else "" for fit in fits)])
+        if self.held_out:
+            rows.append(["held back", *(_held_cost(self.held_out[name]) for name in columns)])
+        rows.append(["residuals", *(str(fit.problem.size[0]) for fit in fits)])
+        rows.append(["unknowns", *(str(fit.problem.size[1]) for fit in fits)])
+        rows.append(["variance of a residual", *(f"{fit.variance:.3g}" for fit in fits)])
+        rows.append(["neighbours' correlation", *(f"{fit.autocorrelation:.2f}" for fit in fits)])
+        return rows
+
+    def _channels(self, fits: Mapping[str, Fit]) -> list[list[str]]:
+        channels = list(dict.fromkeys(c for fit in fits.values() for c in fit.problem.channels))
+        rows = [["channel", *fits]]
+        for channel in channels:
+            cells = []
+            for fit in fits.values():
+                share = fit.variance_accounted_for.get(channel, math.nan)
+                squares = sum(float(np.nansum(r[channel] ** 2)) for r in fit.residuals.values() if channel in r)
+                cells.append(f"{squares:.5g}, {100 * share:.1f} %" if channel in fit.problem.channels else "")
+            rows.append([channel, *cells])
+        return rows
+
+    def _trials(self, fits: Mapping[str, Fit]) -> list[list[str]]:
+        trials = list(dict.fromkeys(name for fit in fits.values() for name in (*fit.trial_names, *fit.failed)))
+        of = {name: dict.fromkeys(fit.failed, "not simulated") for name, fit in fits.items()}
+        for name, fit in fits.items():
+            for trial, channels in fit.residuals.items():
+                of[name][trial] = f"{sum(float(np.nansum(r**2)) for r in channels.values()):.5g}"
+        return [["trial", *fits], *([trial, *(of[name].get(trial, "") for name in fits)] for trial in trials)]
+
+    def __str__(self) -> str:
+        return "\n\n".join(f"{heading}\n{plain(rows)}" for heading, rows in self.tables)
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        return "".join(f"<p>{html.escape(heading)}</p>{html_table(rows)}" for heading, rows in self.tables)
+
+
+def _held_cost(fit: Fit) -> str:
+    n = len(fit.trial_names)
+    return f"{fit.cost:.6g}" + (f" ({n} of {n + len(fit.failed)} trials)" if fit.failed else "")
+
+
+def compare(
+    fits: Mapping[str, Fit] | Sequence[Fit],
+    held_out: Sequence[Trial] | Trial | None = None,
+    *,
+    plausible: Mapping[str, Any] | None = None,
+) -> Comparison:
+    """Fits beside each other: which is nearer to what was measured, where, and which can be believed.
+
+        print(compare({"viscous": one, "with dry friction": other}, held_out=others))
+
+    **Arguments:**
+
+    - `fits`: by name; of a sequence, the free parameters are the names.
+    - `held_out`: trials that none of them has seen: their starts and biases are found, the parameters are not
+        (`applied_to`). Those of bicycles by `bicycle_rides`.
+    - `plausible`: as in `suspects`; names that none of the fits frees are passed over.
+
+    **Returns:** a `Comparison`: print it for tables of parameters with errors (clustered by trial where the residuals
+    are correlated), sums of squares on both sides, as a whole, by channel and by trial, and what is not plausible.
+
+    **Raises:** `TypeError` for what is no `Fit`; `ValueError` for none, and two of the same name.
+    """
+    if isinstance(fits, Fit):
+        raise TypeError("compare takes fits by name, as in compare({'first': one, 'second': other}); got one Fit.")
+    if isinstance(fits, Mapping):
+        named = dict(fits)
+    else:
+        for fit in fits:
+            refuse_other(fit, Fit, "compare", "compare({'first': fit(...), 'second': fit(...)})")
+        names = [", ".join(fit.names) for fit in fits]
+        if len(set(names)) < len(names):
+            raise ValueError("Two of these fits have the same free parameters: name them, compare({'first': ...}).")
+        named = dict(zip(names, fits, strict=True))
+    if not named:
+        raise ValueError("There is no fit to compare.")
+    for fit in named.values():
+        refuse_other(fit, Fit, "compare", "compare({'first': fit(...), 'second': fit(...)})")
+    said = plausible or {}
+    free = {name for fit in named.values() for name in fit.names}
+    if not free & set(said):  # of a table that served a search, names that no fit frees are no slip
+        refuse_unknown(said, free, "`plausible` names")
+    return Comparison(
+        fits=named,
+        held_out={} if held_out is None else {name: applied_to(fit, held_out) for name, fit in named.items()},
+        objections={
+            name: tuple(plausible_of(fit.parameters, said).objections(fit.estimates)) for name, fit in named.items()
+        },
+    )

@@ -1,1 +1,0 @@
-"""Measured motion: trials, files, windows. Knows no optimizer."""

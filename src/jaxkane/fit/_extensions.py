@@ -1,0 +1,526 @@
+"""What a model may lack: candidates ranked by score tests, refitted, and decided on."""
+
+from __future__ import annotations
+
+import dataclasses
+import html
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from tqdm import tqdm
+
+from .._common.lookup import refuse_unknown
+from ._block_lsq import Blocks, eliminate
+from ._candidates import Candidate, Extended, candidates_of, carried, extended, groups_of, posed_with
+from ._compare import Plausible, plausible_of
+from ._fit import solve
+from ._linearize import Linearization, linearize
+from ._model import Unknowns
+from ._optimize import minimize, uninterrupted, usable
+from ._optimizers import LeastSquares
+from ._problem import Problem, refuse_other
+from ._result import Fit
+from ._score_test import Rows, beside_zero, bic_change, chance, independent_share, is_clustered, score, solved
+from ._statistics import check_level, slopes_of, values_of
+from ._tables import html_table, plain
+from ._validate import folds_of
+
+Folds = Sequence[Sequence[int]] | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Standing:
+    """Where a search stands: at a minimum of a problem of whose parameters `names` are free, the others held. `rows`
+    is its linearization there, in the columns of all its parameters; `freedom`: residuals less unknowns."""
+
+    problem: Problem
+    point: Unknowns
+    names: tuple[str, ...]
+    cost: float
+    freedom: int
+    correlation: float
+    rows: Rows
+
+    @classmethod
+    def of(cls, fit: Fit) -> Standing:
+        problem, at = fit.problem, fit.linearization
+        if np.any(np.isfinite(np.asarray(fit.parameters.prior_deviation))):
+            again = linearize(without_priors(problem), fit.point)
+            assert again is not None
+            at = again
+        n_r, n_unknown = problem.size
+        rows = rows_of(problem, at, fit.point, range(fit.point.b.shape[1]))
+        return cls(problem, fit.point, fit.names, fit.cost, n_r - n_unknown, fit.autocorrelation, rows)
+
+    @property
+    def places(self) -> list[int]:
+        return [self.problem.parameters.names.index(name) for name in self.names]
+
+    @property
+    def values(self) -> dict[str, float]:
+        values = np.asarray(values_of(self.problem.parameters, self.point.x))
+        return {name: float(values[i]) for name, i in zip(self.names, self.places, strict=True)}
+
+    def left_out(self, folds: Folds) -> float:
+        """The sum of squares of trials left out in turn, with the parameters that the others say; NaN without folds."""
+        return self.rows.left_out(self.places, folds) if folds is not None else float("nan")
+
+    def carried_to(self, problem: Problem) -> Unknowns:
+        """The same point of a problem that has all these unknowns, and others."""
+        return carried(self.problem, self.point, problem, self.names)
+
+
+def without_priors(problem: Problem) -> Problem:
+    """The same without priors of parameters; nothing is compiled anew."""
+    return problem.with_priors(dict.fromkeys(problem.parameters.names, (0.0, float("inf"))))
+
+
+def rows_of(problem: Problem, at: Linearization, point: Unknowns, b: Sequence[int]) -> Rows:
+    """A linearization without priors, starts and these unknowns of trials eliminated, the others held."""
+    blocks, parameters = at.blocks, problem.parameters
+    first = blocks.n_z + blocks.n_next
+    kept = [*range(first), *(first + i for i in b), *range(first + blocks.n_b, blocks.R.shape[-1])]
+    R = blocks.R[:, :, jnp.asarray(kept, dtype=jnp.int32)]
+    reduced = Blocks(R, blocks.windows, blocks.n_z, blocks.n_next, len(list(b)))
+    deviation, norms = np.asarray(parameters.prior_deviation, float)[:, None], np.asarray(blocks.column_norms, float)
+    slopes, off = np.asarray(slopes_of(parameters, point.x)), np.asarray(parameters.prior_residuals(point.x))
+    return Rows(np.asarray(eliminate(reduced, 0.0).R, float), np.column_stack([slopes / deviation, off]), norms)
+
+
+HEAD = ("candidate", "estimate", "std. error", "promised", "fitted", "p", "criterion", "left out", "verdict")
+
+
+@dataclasses.dataclass(frozen=True)
+class Suspect:
+    """One candidate.
+
+    - `parameters`: what it frees; `values`: by name, of these and of all that was free; `errors`: of these. Fitted
+        where `cost` is a number, else as the linearization has them.
+    - `promised`, `cost`: the sum of squares by the linearization, and fitted (NaN where it was not). `p`: the
+        probability that chance promises as much, of what is nested. `criterion`: what decides beside the trials left
+        out: "score test" before it is fitted, "F test" or "t test" after; of what is not nested "trials left out"
+        alone, or "BIC" where none can be left out.
+    - `predicted`: the sum of squares of trials that are left out in turn; unknowns of the trials' own, which those that
+        are left out find too, count twice the variance of a residual each.
+    - `objections`: what is not plausible, in words. `verdict`: why it does not stand, or "stands"; `stands`.
+    """
+
+    name: str
+    parameters: tuple[str, ...] = ()
+    values: Mapping[str, float] = dataclasses.field(default_factory=dict, hash=False)
+    errors: Mapping[str, float] = dataclasses.field(default_factory=dict, hash=False)
+    promised: float = math.nan
+    cost: float = math.nan
+    p: float = math.nan
+    criterion: str = ""
+    predicted: float = math.nan
+    objections: tuple[str, ...] = ()
+    verdict: str = ""
+    stands: bool = False
+
+    @property
+    def least(self) -> float:
+        """What is known of the sum of squares with it; infinite where nothing is."""
+        known = [x for x in (self.cost, self.promised) if not math.isnan(x)]
+        return known[0] if known else math.inf
+
+    @property
+    def cells(self) -> tuple[str, ...]:
+        number = lambda x, form=".5g": "" if math.isnan(x) else f"{x:{form}}"  # noqa: E731
+        known = [name for name in self.parameters if not math.isnan(self.errors[name])]
+        estimates = ", ".join(f"{self.values[name]:.4g}" for name in known)
+        errors = ", ".join(f"{self.errors[name]:.2g}" for name in known)
+        tested = (number(self.promised), number(self.cost), number(self.p, ".2g"), self.criterion)
+        return (self.name, estimates, errors, *tested, number(self.predicted), self.verdict)
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Suspects:
+    """What `suspects` found; print it for the tables.
+
+    - `rows`: of the first round, those that stand first; `best`: the one that was taken there, or None. `rounds`: the
+        rows of all rounds; `costs`, `left_out`: the sums of squares with which each began, fitted and of trials left
+        out in turn.
+    - `taken`: names of what was taken, in that order. `fit`: with all of it free; where nothing was, the one `before`.
+    - `level`: of the test.
+    """
+
+    before: Fit
+    rounds: tuple[tuple[Suspect, ...], ...]
+    costs: tuple[float, ...]
+    left_out: tuple[float, ...]
+    taken: tuple[str, ...]
+    level: float
+    fit: Fit
+
+    @property
+    def rows(self) -> tuple[Suspect, ...]:
+        return self.rounds[0]
+
+    @property
+    def best(self) -> Suspect | None:
+        return self.rows[0] if self.taken else None
+
+    @property
+    def headings(self) -> tuple[str, ...]:
+        """Of every round, in words."""
+        found = []
+        for i, (cost, out) in enumerate(zip(self.costs, self.left_out, strict=True)):
+            beside = f" with {', '.join(self.taken[:i])}" if i else ""
+            left = "one trial, nothing is left out" if math.isnan(out) else f"{out:.5g} of trials left out in turn"
+            found.append(f"Sum of squares{beside} {cost:.6g}; {left}.")
+        return tuple(found)
+
+    @property
+    def conclusion(self) -> str:
+        if not self.taken:
+            return f"Nothing is taken: no candidate stands at a level of {self.level:g}."
+        left = "" if math.isnan(self.left_out[0]) else f" (of trials left out: {self.left_out[0]:.5g} before)"
+        best = zip(self.taken, self.rounds, strict=False)
+        taken = [f"{name} (not nested: by {r[0].criterion})" if math.isnan(r[0].p) else name for name, r in best]
+        return f"Taken: {', '.join(taken)}. Sum of squares {self.before.cost:.6g} -> {self.fit.cost:.6g}{left}."
+
+    def __str__(self) -> str:
+        parts = [
+            f"{heading}\n{plain(_lines(rows), (0, len(HEAD) - 1))}"
+            for heading, rows in zip(self.headings, self.rounds, strict=True)
+        ]
+        return "\n\n".join([*parts, self.conclusion])
+
+    __repr__ = __str__
+
+    def _repr_html_(self) -> str:
+        parts = [
+            f"<p>{html.escape(heading)}</p>{html_table(_lines(rows))}"
+            for heading, rows in zip(self.headings, self.rounds, strict=True)
+        ]
+        return "".join([*parts, f"<p>{html.escape(self.conclusion)}</p>"])
+
+
+def _lines(rows: Sequence[Suspect]) -> list[tuple[str, ...]]:
+    return [HEAD, *(row.cells for row in rows)]
+
+
+NEUTRAL = 1e-6
+"""By what part of it the sum of squares may differ where a candidate changes nothing at first."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Trying:
+    """What is the same for all candidates of a round."""
+
+    fit: Fit
+    standing: Standing
+    taken: tuple[Candidate, ...]
+    order: tuple[str, ...]  # of all candidates
+    share: float  # of the level, for each
+    said: Mapping[str, Any]
+    folds: Folds
+
+    def all_of(
+        self, left: Sequence[Candidate], refits: int | None, bar: Any
+    ) -> tuple[tuple[Suspect, ...], dict[str, Standing]]:
+        """What every candidate promises, and of the promising ones what they keep; with where the search stands then.
+        Those that stand come first, the best at the top."""
+        promises = [promise for group in groups_of(self.fit, left) for promise in self._linearized(group, bar)]
+        rows, found = {promise.row.name: promise.row for promise in promises}, {}
+        able = [h for h in promises if h.extended is not None and not h.row.verdict]
+        nested, others = ([h for h in able if h.nested is nested] for nested in (True, False))
+        if refits is not None:
+            nested = [h for h in nested if h.row.p < self.share]
+            nested = sorted(nested, key=lambda h: (bool(h.objections), h.row.promised))[:refits]
+        for promise in nested + (others if refits != 0 else []):  # what is not nested promises nothing before its fit
+            bar.set_postfix_str(promise.row.name)
+            rows[promise.row.name], after = self._fitted(promise)
+            found |= {} if after is None else {promise.row.name: after}
+            bar.update()
+        done = [self._judged(row) for row in rows.values()]
+        best = lambda row: (not row.stands, row.predicted if row.stands and self.folds else row.least)  # noqa: E731
+        return tuple(sorted(done, key=best)), found
+
+    def _linearized(self, group: Sequence[Candidate], bar: Any) -> list[Promise]:
+        """The candidates of one system, by one linearization."""
+        bar.set_postfix_str(f"{len(group)} linearized")
+        try:
+            more = extended(self.fit, (self.standing.problem, self.standing.point), group, self.taken, self.order)
+            at, why = linearize(without_priors(more.problem), more.point), "cannot be simulated where it starts"
+        except ValueError as error:
+            more, at, why = None, None, str(error)
+        bar.update()
+        if more is None or at is None or not usable(at):
+            return [Promise(c, Suspect(c.name, verdict=why)) for c in group]
+        said = {name: value for c in group for name, value in c.plausible.items()}
+        said |= {name: value for name, value in self.said.items() if name in more.names}
+        # What was free has started where the fit did, whatever another system begins with.
+        ranges = {
+            p: r
+            for of in (more.problem.parameters, self.fit.parameters)
+            for p, r in plausible_of(of, said).ranges.items()
+        }
+        common = Common(more, at, _held(at), Plausible(ranges))
+        return [self._promised(candidate, common) for candidate in group]
+
+    def _promised(self, candidate: Candidate, common: Common) -> Promise:
+        more, (x, b) = common.extended, common.extended.owned([candidate])
+        new = [i for i in x if i not in more.base_x]
+        rows, was = rows_of(more.problem, common.at, more.point, b), self.standing
+        count = self._unknowns(candidate, more)
+        without = None
+        if count:  # what the fit has without them, in its own rows
+            without = rows_of(more.problem, common.at, more.point, more.base_b).least(more.base_x)[1]
+        found = score(
+            rows, more.base_x, new, freedom=was.freedom, more=count, correlation=was.correlation, without=without
+        )
+        A, r = rows.of(x)
+        here = common.at.cost + float(np.sum(rows.priors[x, -1] ** 2))
+        nested = abs(here - was.cost) <= NEUTRAL * was.cost + 1e-9
+        slopes = np.asarray(slopes_of(more.problem.parameters, more.point.x))
+        moved = np.zeros(len(more.names))
+        moved[x] = solved(A, r)
+        values = np.asarray(values_of(more.problem.parameters, more.point.x)) + slopes @ moved
+        left_out = float("nan")
+        if nested and self.folds is not None:
+            freedom = was.freedom - len(new) - count
+            left_out = rows.left_out(x, self.folds) + _own_share(count, found.least, freedom, was.correlation)
+        row_names = tuple(more.names[i] for i in new)
+        row = Suspect(
+            name=candidate.name,
+            parameters=row_names,
+            values={more.names[i]: float(values[i]) for i in x},
+            errors=_errors(row_names, slopes[np.ix_(new, new)], found.covariance),
+            promised=was.cost - found.drop if nested else float("nan"),
+            p=found.p if nested else float("nan"),
+            criterion="score test" if nested else "",
+            predicted=left_out,
+            verdict=_undetermined(more, new, found) if nested else "",
+        )
+        objections = common.plausible.objections(row.values)
+        return Promise(candidate, row, more, common, nested, tuple(objections))
+
+    def _fitted(self, promise: Promise) -> tuple[Suspect, Standing | None]:
+        """After a fit of all that is free and this."""
+        more, was, row, common = promise.extended, self.standing, promise.row, promise.common
+        assert more is not None
+        assert common is not None
+        problem, start = more.with_only([promise.candidate], common.held)
+        try:
+            found = uninterrupted(minimize(problem, LeastSquares(), start=start))
+            at = linearize(without_priors(problem), found.point)
+        except ValueError as error:
+            return dataclasses.replace(row, verdict=str(error)), None
+        if at is None or not usable(at) or found.status != "converged":
+            return dataclasses.replace(row, verdict=f"its fit has not converged ({found.status})"), None
+        n, count = len(more.base_x), self._unknowns(promise.candidate, more)
+        k = len(found.names) - n + count
+        rows = rows_of(problem, at, found.point, more.owned([promise.candidate])[1])
+        after = Standing(problem, found.point, found.names, found.cost, was.freedom - k, found.autocorrelation, rows)
+        now = score(
+            rows, range(n), range(n, len(found.names)), freedom=was.freedom, more=count, correlation=after.correlation
+        )
+        slopes = np.asarray(slopes_of(problem.parameters, found.point.x))
+        p, criterion, verdict = float("nan"), "trials left out", ""
+        if promise.nested:
+            p, criterion = chance(was.cost - after.cost, k, after.cost, after.freedom, after.correlation), "F test"
+            if not count and is_clustered(rows, len(found.names), after.correlation):
+                p = beside_zero(np.asarray(found.point.x - start.x)[n:], now.covariance, len(rows.data))
+                criterion = "t test"
+        elif self.folds is None:
+            change, criterion = bic_change(was.cost, after.cost, k, self.fit.problem.size[0], after.correlation), "BIC"
+            verdict = "" if change < 0 else f"its BIC is higher by {change:.3g}"
+        before = set(common.plausible.objections(was.values))
+        row = dataclasses.replace(
+            row,
+            values=after.values,
+            errors=_errors(found.names[n:], slopes[n:, n:], now.covariance),
+            cost=after.cost,
+            p=p,
+            criterion=criterion,
+            verdict=verdict,
+            predicted=after.left_out(self.folds) + _own_share(count, after.cost, after.freedom, after.correlation),
+            objections=tuple(o for o in common.plausible.objections(after.values) if o not in before),
+        )
+        return row, after
+
+    def _unknowns(self, candidate: Candidate, more: Extended) -> int:
+        """How many of the trials' and windows' own come with a candidate."""
+        n_b = len(set(more.own_b[candidate.name]) - set(more.base_b)) * more.problem.clusters
+        return n_b + more.point.z.size - self.standing.point.z.size
+
+    def _judged(self, row: Suspect) -> Suspect:
+        """With the verdict, in the order in which doubts are raised."""
+        was, fitted = self.standing, np.isfinite(row.cost)
+        doubts = (
+            (bool(row.verdict), row.verdict),
+            (not np.isnan(row.p) and row.p >= self.share, "no more than chance"),
+            (not fitted and np.isnan(row.p), "not nested, not fitted"),
+            (not fitted, "promising, not fitted"),
+            (fitted and not row.cost < was.cost, "its fit lowers nothing"),
+            (bool(row.objections), f"not plausible: {', '.join(row.objections)}"),
+            (row.predicted >= was.left_out(self.folds), "does not predict trials left out"),
+        )
+        verdict = next((words for doubted, words in doubts if doubted), "")
+        return dataclasses.replace(row, verdict=verdict or "stands", stands=not verdict)
+
+
+@dataclasses.dataclass(frozen=True)
+class Common:
+    """Of the candidates of one system: their problem, linearized, how unknowns of trials are held, what is believed."""
+
+    extended: Extended
+    at: Linearization
+    held: np.ndarray
+    plausible: Plausible
+
+
+@dataclasses.dataclass(frozen=True)
+class Promise:
+    """A candidate and what it promises; `nested`: whether it changes nothing where it starts."""
+
+    candidate: Candidate
+    row: Suspect
+    extended: Extended | None = None
+    common: Common | None = None
+    nested: bool = True
+    objections: tuple[str, ...] = ()
+
+
+def _held(at: Linearization) -> np.ndarray:
+    """Deviations of priors that hold unknowns of trials (n_b,) much closer than any data could tell."""
+    blocks, first = at.blocks, at.blocks.n_z + at.blocks.n_next
+    norms = np.linalg.norm(np.asarray(blocks.R)[:, :, first : first + blocks.n_b], axis=(0, 1))
+    return float(jnp.finfo(blocks.R.dtype).eps) ** 0.4 / np.where(norms > 0, norms, 1.0)
+
+
+def _own_share(count: int, cost: float, freedom: int, correlation: float) -> float:
+    """What unknowns of the trials' own flatter a prediction by: trials that are left out find theirs, which takes away
+    a variance each, and adds one to what comes after (as in Akaike's criterion)."""
+    return 2.0 * count * cost / freedom / independent_share(correlation) if count and freedom > 0 else 0.0
+
+
+def _errors(names: Sequence[str], slopes: np.ndarray, covariance: np.ndarray) -> dict[str, float]:
+    deviations = np.sqrt(np.diagonal(slopes @ covariance @ slopes.T)) if names else []
+    return {name: float(deviation) for name, deviation in zip(names, deviations, strict=True)}
+
+
+def _undetermined(more: Extended, new: Sequence[int], found: Any) -> str:
+    """What the data do not determine, in words."""
+    unseen = [more.names[i] for i, seen in zip(new, found.seen, strict=True) if not seen]
+    if unseen:
+        return f"{', '.join(unseen)} is not seen by these data"
+    lost = [more.names[i] for i, apart in zip(new, found.apart, strict=True) if not apart]
+    return f"{', '.join(lost)} cannot be distinguished from what is free" if lost else ""
+
+
+def suspects(
+    fit: Fit,
+    candidates: Any,
+    *,
+    depth: int = 1,
+    refits: int | None = 3,
+    level: float = 0.05,
+    plausible: Mapping[str, Any] | None = None,
+    folds: int | Sequence[Sequence[int]] | None = None,
+    progress: bool = False,
+) -> Suspects:
+    """Which of these extensions a model lacks: what each would lower the sum of squares by, whether it can be believed,
+    and whether it predicts trials that were left out.
+
+        found = suspects(fit, ["dry_friction", Gain("torque"), Offset("angle"), Candidate("lag", system=Lagging())])
+        print(found)
+        found.fit                                           # with what was taken
+
+    All candidates of a system are linearized together, once, where the fit ended; what is free and unknown already is
+    eliminated. That says how much each promises, its estimate with its error, and by a score test (Rao 1948) whether
+    chance promises as much. Residuals that are correlated count as what they are (see the page on identification).
+    The most promising ones are then fitted, together with all that is free, from the same compiled program.
+
+    A nested candidate, which changes nothing where it starts, stands where (1) chance promises so much with a
+    probability below `level`, over all candidates together (Bonferroni); (2) fitted, it keeps that; (3) no parameter
+    becomes implausible, its own or one that was free; (4) trials left out in turn are predicted better with it.
+    Of those that stand, the one that predicts best is taken; with `depth` above one the others are tried again beside
+    it, and so on, until none stands.
+
+    What is not nested, as another system whose motion differs from the start, promises nothing before it is fitted, and
+    always is, besides the `refits`. In the place of (1) nothing is asked where trials can be left out, and where there
+    is one alone, whether the Bayesian information criterion is lower. The `criterion` of each says what decided.
+
+    **Arguments:**
+
+    - `fit`: one that has converged. `candidates`: a list of names of parameters, `Free`, `Gain`, `Offset`, `Delay`,
+        `Inertia`, and `Candidate`, which may be several of these together, what every trial has its own of, or another
+        system. Each starts where it is neutral.
+    - `depth`: how many may be taken, one after the other. `refits`: how many that are nested are fitted in each round;
+        None for all that the data can distinguish, 0 for none at all. `level`: of the test.
+    - `plausible`: by name, (lower, upper), or a share of the start such as 0.2. Else what `Candidate.plausible` says,
+        three deviations of a prior, and two bounds, of which it must stay away. What starts on a bound, given
+        or declared, as friction at zero, is searched for on both sides and believed on one.
+    - `folds`: trials that are left out together, as in `cross_validate`. `progress`: a bar.
+
+    **Returns:** `Suspects`: print it for the table.
+
+    **Raises:** `ValueError` for a fit that has not converged, no candidate, two of the same name, one that is free
+    already, and names that do not exist.
+    """
+    refuse_other(fit, Fit, "suspects", "suspects(fit(...), candidates)")
+    _check(fit, depth, refits, level)
+    left = list(candidates_of(fit, candidates))
+    order = tuple(candidate.name for candidate in left)
+    said = dict(plausible or {})
+    T, groups = len(fit.problem.trials), None
+    if T >= 2:
+        groups = folds_of((T if T <= 10 else 5) if folds is None else folds, T)
+    elif folds is not None:
+        raise ValueError("`folds`: one trial alone cannot be left out: cut it with `Trial.between`.")
+    standing, taken, rounds = Standing.of(fit), [], []
+    with tqdm(disable=not progress, desc="suspects", unit=" step") as bar:
+        for _ in range(depth):
+            round = Trying(fit, standing, tuple(taken), order, level / len(left), said, groups)
+            rows, ways = round.all_of(left, refits, bar)
+            best = next((row for row in rows if row.stands), None)
+            rounds.append((standing.cost, standing.left_out(groups), rows))
+            if best is None:
+                break
+            taken.append(next(c for c in left if c.name == best.name))
+            left = [c for c in left if c.name != best.name]
+            standing = ways[best.name]
+            if not left:
+                break
+    names = {name for _, _, rows in rounds for row in rows for name in row.values}
+    refuse_unknown(said, (*fit.names, *names), "`plausible` names")
+    return Suspects(
+        before=fit,
+        rounds=tuple(rows for *_, rows in rounds),
+        costs=tuple(cost for cost, *_ in rounds),
+        left_out=tuple(out for _, out, _ in rounds),
+        taken=tuple(c.name for c in taken),
+        level=level,
+        fit=_fitted(fit, taken, standing) if taken else fit,
+    )
+
+
+def _check(fit: Fit, depth: Any, refits: Any, level: float) -> None:
+    if fit.problem.specification.noise is not None:
+        raise ValueError(
+            "suspects asks fits of least squares, whose sum of squares candidates lower; this one has process noise, "
+            "which stands in for what is missing. Ask without `noise`, or compare `marginal_likelihood` of two fits."
+        )
+    if fit.status != "converged":
+        raise ValueError(
+            f"The fit has not converged ({fit.status}): what is asked beside it is asked at a minimum. Go on with "
+            "`minimize(fit.problem, LeastSquares(), start=fit.point)`."
+        )
+    for name, value, least in (("depth", depth, 1), ("refits", refits, 0)):
+        if value is None and name == "refits":
+            continue
+        if not isinstance(value, int) or value < least:
+            raise ValueError(f"`{name}` is a whole number of {least} at least, got {value!r}.")
+    check_level(level)
+
+
+def _fitted(fit: Fit, taken: Sequence[Candidate], standing: Standing) -> Fit:
+    """The fit with what was taken, as a user would pose it."""
+    problem = fit.problem.asking(posed_with(fit, taken))
+    return solve(problem, LeastSquares(), start=standing.carried_to(problem))

@@ -1,0 +1,255 @@
+"""What the data determine: singular values of the sensitivity, and the directions in which nothing changes."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+
+from ._block_lsq import eliminate
+from ._linearize import Linearization
+from ._model import Unknowns
+from ._problem import Problem
+from ._statistics import formal_covariance, infinite_along, priors_of
+
+
+@dataclasses.dataclass(frozen=True)
+class Direction:
+    """A combination of parameters, and how well it is known.
+
+    Attributes: `singular_value`: by how many standard deviations of one measurement all residuals together move for a
+    step of one along it; `deviation`: its own standard deviation, in scaled units (1 is a change by the whole scale,
+    for a positive parameter by all of itself); `parts`: the parameters in it with their shares; `text`: in words.
+    """
+
+    singular_value: float
+    deviation: float
+    parts: tuple[tuple[str, float], ...]
+    text: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Identifiability:
+    """The sensitivity of all residuals to the free parameters, nuisance values eliminated.
+
+    - `names`, `units` (p,); `scales` (p,): what parameters are counted in, each in its unit.
+    - `singular_values` (p,), largest first; `vectors` (p, p), a row for each, in scaled parameters.
+    - `deviations` (p,): standard deviation along each row, in scaled units.
+    - `without_influence`: names of the parameters that change no residual at all. `at_bound`: of those that went as far
+        as their bounds let them.
+    - `undetermined`: the directions that the data do not determine, weakest first. Where several change nothing at
+        all, so does every sum of them: those are taken in which the fewest parameters move.
+    - `variance` of a residual, by which `covariance` and `deviations` count the data: of a `Fit` what is left there, by
+        `freedom`, the residuals less the unknowns that they and not priors determine; else one, as `sigma` says.
+    - `covariance` (p, p) of the parameters in their units, infinite for those that are not determined.
+    - `covariance_of_x` (p, p) of the free numbers x behind them, with `sigma` as it was given (Laplace); `directions`
+        (p, k): steps of x, of one along each row of `vectors` that the data determine.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    scales: np.ndarray
+    singular_values: np.ndarray
+    vectors: np.ndarray
+    deviations: np.ndarray
+    without_influence: tuple[str, ...]
+    at_bound: tuple[str, ...]
+    undetermined: tuple[Direction, ...]
+    variance: float
+    freedom: float
+    covariance: np.ndarray
+    covariance_of_x: np.ndarray
+    directions: np.ndarray
+
+    @property
+    def ok(self) -> bool:
+        """Whether every parameter is determined."""
+        return not self.undetermined
+
+    @property
+    def count(self) -> int:
+        """How many numbers the data determine: parameters, or combinations of them."""
+        return len(self.names) - len(self.undetermined)
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        return tuple(direction.text for direction in self.undetermined)
+
+    @property
+    def how_many(self) -> str:
+        """In words, where combinations are determined and not the parameters themselves; else ""."""
+        if all(len(direction.parts) == 1 for direction in self.undetermined):
+            return ""
+        return f"Of {len(self.names)} parameters {self.count} combinations are determined."
+
+    @property
+    def information(self) -> np.ndarray:
+        """Fisher information (p, p) of the scaled parameters, for residuals of variance one."""
+        return (self.vectors.T * self.singular_values**2) @ self.vectors
+
+    @property
+    def given_errors(self) -> np.ndarray:
+        """Standard errors (p,) with `sigma` as it was given, whatever is left; infinite where nothing determines."""
+        known = self.singular_values > 0
+        parts = np.where(known[:, None], self.vectors / np.where(known, self.singular_values, 1.0)[:, None], 0.0)
+        errors = self.scales * np.linalg.norm(parts, axis=0)
+        return np.sqrt(infinite_along(np.diag(errors**2), self.vectors[~known]).diagonal())
+
+    def in_units(self, covariance: np.ndarray) -> np.ndarray:
+        """The covariance (p, p) of the parameters from one (k, k) along the rows of `vectors` that are determined."""
+        known = self.singular_values > 0
+        to_units = self.scales[:, None] * self.vectors[known].T
+        return infinite_along(to_units @ covariance @ to_units.T, self.vectors[~known])
+
+    @property
+    def table(self) -> str:
+        """Singular values, deviations and directions."""
+        lines = ["singular value   deviation   direction (scaled parameters)"]
+        for s, deviation, row in zip(self.singular_values, self.deviations, self.vectors, strict=True):
+            lines.append(f"{s:14.4g}   {deviation:9.2g}   {combination(self.names, row)}")
+        return "\n".join(lines)
+
+    def __str__(self) -> str:
+        return "\n".join([self.table, *filter(None, [self.how_many]), *self.messages])
+
+
+def identifiability_at(
+    problem: Problem, point: Unknowns, at: Linearization, flat: float = 0.5, given: bool = False
+) -> Identifiability:
+    """Identifiability at a point where the problem has been linearized. `given`: the residuals' variance is one, as
+    `sigma` says, whatever is left there."""
+    parameters = problem.parameters
+    names, p = parameters.names, len(parameters.names)
+    to_values = np.asarray(parameters.slopes(point.x))
+    # What a step of one in the free numbers does; at a bound, nothing at all.
+    scales = np.maximum(np.linalg.norm(to_values, axis=1), 1e-100)
+    # From scaled parameters; at the edge of what a body can have, a free number moves nothing any more.
+    to_x = np.linalg.pinv(to_values / scales[:, None], rcond=1e-9)
+    eliminated = eliminate(at.blocks, 0.0)
+    A = np.asarray(eliminated.rows[0]) @ to_x
+    before = np.linalg.norm(np.asarray(at.blocks.R)[:, :, -1 - p : -1] @ to_x, axis=(0, 1))
+    eps = float(jnp.finfo(eliminated.R.dtype).eps)
+    no_influence = before <= 1e4 * eps * before.max()
+    s, V = _by_singular_values(A, no_influence, 1e3 * eps * before.max())
+    inverse = (V[s > 0].T / s[s > 0] ** 2) @ V[s > 0]
+    priors = priors_of(problem, point, eliminated)
+    of_priors = to_x.T @ priors.information @ to_x
+    freedom = problem.size[0] - priors.number - problem.size[1] + priors.determined + np.sum(inverse * of_priors)
+    variance = 1.0
+    if not given and problem.model.noise is None:  # a likelihood knows how large residuals are
+        variance = (at.cost - priors.squares) / freedom if freedom > 1e-3 else np.nan
+    # Without a degree of freedom nothing says that `sigma` is wrong.
+    along = V @ formal_covariance(inverse, of_priors, 1.0 if np.isnan(variance) else variance) @ V.T
+    covariance = formal_covariance(inverse, of_priors, variance) * np.outer(scales, scales)
+    # Beside a bound nothing moves any more: that is not a parameter which the data do not see.
+    alone = np.count_nonzero(to_values, axis=1) <= 1
+    at_bound = alone & (scales < 1e-3 * np.asarray(parameters.scale))
+    named = lambda which: tuple(name for name, there in zip(names, which, strict=True) if there)  # noqa: E731
+    found = Identifiability(
+        names=names,
+        units=parameters.units,
+        scales=scales,
+        singular_values=s,
+        vectors=V,
+        deviations=np.where(s > 0, np.sqrt(np.maximum(along.diagonal(), 0.0)), np.inf),
+        without_influence=named(no_influence & ~at_bound),
+        at_bound=named(at_bound),
+        undetermined=(),
+        variance=float(variance),
+        freedom=float(freedom),
+        covariance=infinite_along(covariance, V[s == 0]),
+        covariance_of_x=to_x @ inverse @ to_x.T,
+        directions=to_x @ V[s > 0].T,
+    )
+    return dataclasses.replace(found, undetermined=_undetermined(found, np.array(parameters.learned) == "", flat))
+
+
+def _undetermined(found: Identifiability, physical: np.ndarray, flat: float) -> tuple[Direction, ...]:
+    """Directions whose deviation exceeds `flat`, weakest first. `physical` (p,): which parameters are no numbers of a
+    learned function, which need not be determined one by one."""
+    V, names = found.vectors, found.names
+    weak = [
+        i
+        for i in reversed(range(len(names)))
+        if not found.deviations[i] <= flat and np.any(np.abs(V[i, physical]) > 0.1)
+    ]
+    rows = V.copy()
+    nothing = [
+        i
+        for i in weak
+        if found.singular_values[i] == 0 and names[int(np.abs(V[i]).argmax())] not in found.without_influence
+    ]
+    if len(nothing) > 1 and physical.all():
+        rows[nothing] = _with_fewest_parts(V[nothing])
+    return tuple(_direction(found, i, rows[i]) for i in weak)
+
+
+def _with_fewest_parts(V: np.ndarray, most: int = 20_000) -> np.ndarray:
+    """Rows (k, p) of length one that span what the rows of V span, with as many zeros as can be.
+
+    Reduced echelon forms, of which each is given by k places where all rows but one are zero: the one with the fewest
+    entries, of all if these are no more than `most`, else V.
+    """
+    k, p = V.shape
+    if math.comb(p, k) > most:
+        return V
+    places = np.array(list(itertools.combinations(range(p), k)))
+    parts = np.moveaxis(V[:, places], 1, 0)  # (c, k, k)
+    places = places[np.linalg.cond(parts) < 1e4]
+    rows = np.linalg.solve(np.moveaxis(V[:, places], 1, 0), V[None])  # (c, k, p)
+    rows /= np.linalg.norm(rows, axis=2, keepdims=True)
+    rows = np.where(np.abs(rows) > 1e-6, rows, 0.0)
+    best = rows[np.argmin(np.count_nonzero(rows, axis=(1, 2)))]
+    return best * np.sign(best[np.arange(k), np.abs(best).argmax(axis=1)])[:, None]
+
+
+def _by_singular_values(A: np.ndarray, no_influence: np.ndarray, rounding: float) -> tuple[np.ndarray, np.ndarray]:
+    """Singular values (p,) of a sensitivity (m, p), and a row (p, p) for each, whose largest entry is positive.
+
+    Values below `rounding` are zero: elimination leaves rounding errors of what it removed. Each parameter without
+    influence is a direction of its own.
+    """
+    p, seen = A.shape[1], np.flatnonzero(~no_influence)
+    s, V = np.zeros(p), np.zeros((p, p))
+    if seen.size:
+        # Columns that belong to free numbers without influence are left out of the elimination: nothing is lost.
+        _, s[: seen.size], V[: seen.size, seen] = np.linalg.svd(A[:, seen], full_matrices=False)
+    V[np.arange(seen.size, p), np.flatnonzero(no_influence)] = 1.0
+    return np.where(s <= rounding, 0.0, s), V * np.sign(V[np.arange(p), np.abs(V).argmax(axis=1)])[:, None]
+
+
+def _direction(seen: Identifiability, i: int, row: np.ndarray) -> Direction:
+    s, deviation = seen.singular_values[i], seen.deviations[i]
+    order = [j for j in np.argsort(-np.abs(row), kind="stable") if abs(row[j]) > 0.1]
+    parts = tuple((seen.names[j], float(row[j])) for j in order)
+    first = parts[0][0]
+    if len(parts) == 1 and first in seen.at_bound:
+        text = f"{first} has gone to its bound: the data want it beyond. It may be making up for what the model lacks."
+    elif len(parts) == 1 and first in seen.without_influence:
+        text = f"{first} has no influence on these data; it stays at its start."
+    elif len(parts) == 1 and s == 0:
+        text = f"{first} cannot be distinguished from the unknown starts and biases."
+    elif len(parts) == 1:
+        unit = f" {seen.units[order[0]]}" * bool(seen.units[order[0]])
+        error = deviation * seen.scales[order[0]]
+        text = f"{first} is undetermined: its standard deviation is {error:.2g}{unit}, {deviation:.2g} of its scale."
+    else:
+        size = min(deviation, 1.0)
+        together = ", ".join(
+            f"{name} by {share * size * seen.scales[j]:+.2g}{' ' * bool(seen.units[j])}{seen.units[j]}"
+            for j, (name, share) in zip(order, parts, strict=True)
+        )
+        how = "changes nothing" if s == 0 else f"changes the fit by {size / deviation:.2g} standard deviations"
+        text = f"{', '.join(name for name, _ in parts)} trade off: moving {together} together {how}."
+    return Direction(float(s), float(deviation), parts, text)
+
+
+def combination(names: Sequence[str], row: np.ndarray) -> str:
+    """`0.71 mB - 0.70 zB`."""
+    order = [i for i in np.argsort(-np.abs(row), kind="stable") if abs(row[i]) > 0.1]
+    text = " ".join(f"{'-' if row[i] < 0 else '+'} {abs(row[i]):.2f} {names[i]}" for i in order)
+    return text.removeprefix("+ ")

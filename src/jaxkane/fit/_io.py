@@ -1,0 +1,106 @@
+"""Numbers of a fit in a file, with a description of the problem that they belong to. Knows files; knows no method."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from .._common.files import digest, write_whole
+from .._system.parameters import leaf_name
+from ._kalman import filtered
+from ._problem import Problem
+
+
+def write_state(path: Path, key: Mapping[str, Any], trees: Mapping[str, Any]) -> None:
+    """Write the arrays of trees, whole or not at all: a crash while writing leaves the file that was there."""
+    arrays: dict[str, Any] = {"key": np.array(json.dumps(key))}
+    for name, tree in trees.items():
+        leaves = jax.tree.leaves(eqx.filter(tree, eqx.is_array_like))
+        arrays |= {f"{name}/{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, lambda file: np.savez(file, **arrays))
+
+
+def read_state(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """The description and the arrays in a file.
+
+    **Raises:** `ValueError` where it cannot be read.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = dict(file)
+        return dict(json.loads(str(arrays.pop("key")))), arrays
+    except (MemoryError, FileNotFoundError):
+        raise
+    except Exception as error:  # whatever a decoder says of bytes that are not its own
+        raise ValueError(
+            f"{path} cannot be read as the state of a fit ({type(error).__name__}: {error}): it is damaged, "
+            "was written by an earlier version of jaxkane, or is no file of a fit. Delete it, or name another file."
+        ) from None
+
+
+def tree_of(path: Path, arrays: Mapping[str, np.ndarray], name: str, like: Any) -> Any:
+    """One of the trees that were written, which has the structure and the shapes of `like`.
+
+    **Raises:** `ValueError` where a part of it is missing.
+    """
+    like, rest = eqx.partition(like, eqx.is_array_like)
+    leaves, structure = jax.tree.flatten(like)
+    found = [arrays.get(f"{name}/{i}") for i in range(len(leaves))]
+    if any(x is None for x in found) or f"{name}/{len(leaves)}" in arrays:
+        raise ValueError(f"{path} lacks a part of the state of this fit ({name}): delete it.")
+    return eqx.combine(jax.tree.unflatten(structure, [jax.numpy.asarray(x) for x in found]), rest)
+
+
+def described(problem: Problem) -> dict[str, Any]:
+    """All that residuals and their derivatives depend on, by name."""
+    model, settings = problem.model, problem.model.settings
+    numbers, rest = eqx.partition(model, eqx.is_array)
+    window = jax.tree.map(lambda x: x[0], problem.windows)
+    point = problem.start
+    fixed, guessed = _fixed_and_guessed(problem)
+
+    def residuals(numbers, window, z, b, x):
+        model = eqx.combine(numbers, rest)
+        start = model.consistent(window, z, x)
+        if model.noise is not None:
+            return filtered(model, window, start, b, x)[:2], model.priors(window, z, b, x)
+        return model.residuals(window, start, z, b, x)[0]
+
+    return {
+        "system": type(problem.system).__name__,
+        "free parameters": ", ".join(problem.parameters.names),
+        "unknown starts": ", ".join(model.nuisance.start) or "none",
+        "unknowns of trials": ", ".join(" ".join(pair) for pair in model.nuisance.trial) or "none",
+        "channels": ", ".join(model.channels),
+        "process noise": ", ".join(model.noise.names) or "zero" if model.noise is not None else "none",
+        "windows": len(problem.places),
+        "rtol": settings.rtol,
+        "atol": settings.atol,
+        "max_steps": settings.max_steps,
+        "solver": type(settings.solver).__name__,
+        "fixed parameter": {name: _described_value(x) for name, x in fixed.items()},
+        "initial guesses, priors": digest(jax.tree.leaves(dataclasses.replace(numbers, system=guessed))),
+        "data": digest(jax.tree.leaves(problem.windows)),
+        "program": digest(jax.make_jaxpr(residuals)(numbers, window, point.z[0], point.b[0], point.x)),
+    }
+
+
+def _fixed_and_guessed(problem: Problem) -> tuple[dict[str, Any], list[Any]]:
+    """Of the numbers of the system: those that the fit leaves as they are, by name; those that it starts from."""
+    moved = {number for entry in problem.parameters.entries for number, *_ in entry.targets}
+    leaves = jax.tree_util.tree_leaves_with_path(problem.system)
+    arrays = [(i, leaf_name(path), x) for i, (path, x) in enumerate(leaves) if eqx.is_array(x)]
+    return {name: x for i, name, x in arrays if i not in moved}, [x for i, _, x in arrays if i in moved]
+
+
+def _described_value(x: Any) -> Any:
+    """A number as it is, an array by its digest."""
+    return digest(x) if np.ndim(x) else float(x)

@@ -1,0 +1,293 @@
+"""Kalman filters: in square-root form for linear models, and extended for the motion of a trial.
+
+Knows matrices and `Model`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from .._integrate.inputs import with_one_times
+from .._integrate.integrate import solve
+from .._kane.consistency import configuration_residual
+from .._kane.constraints import has_configuration_constraints, projected
+from .._system.system import System, packed, unpacked
+from ._process_noise import MODES, Disturbance, Noise
+from ._windows import Windows, state_names
+
+
+def root(A: Float[Array, "n k"]) -> tuple[Float[Array, "n n"], Float[Array, "k n"]]:
+    """S (n, n) = A Q with S S^T = A A^T, k >= n, and Q (k, n), whose columns are orthonormal.
+
+    Q is held when this is differentiated: dS = dA Q is one of the many dS with d(S S^T) = d(A A^T), since the rows of A
+    are combinations of the columns of Q, and unlike that of a triangle it exists where A has no full rank.
+    """
+    Q = jax.lax.stop_gradient(jnp.linalg.qr(jax.lax.stop_gradient(A).T)[0])
+    return A @ Q, Q
+
+
+class Update(NamedTuple):
+    """The update of a state m + S x, with x (n,) standard normal before, by the measurements of one instant.
+
+    - `innovation`, `deviation` (n_c,): measured less predicted, each after those before it, and its standard deviation;
+        zero and one where nothing was measured.
+    - `known` (n_c,): by how much those before it raise what is predicted of a measurement.
+    - `shift` (n,), `left` (n, n): x is Gaussian with this mean and the covariance left left^T after.
+    """
+
+    innovation: Float[Array, " n_c"]
+    deviation: Float[Array, " n_c"]
+    known: Float[Array, " n_c"]
+    shift: Float[Array, " n"]
+    left: Float[Array, "n n"]
+
+
+def update(
+    error: Float[Array, " n_c"], F: Float[Array, "n_c n"], sigma: Float[Array, " n_c"], seen: Bool[Array, " n_c"]
+) -> Update:
+    """Measurements with independent errors, one after the other.
+
+    `error`: measured less predicted at m; `F`: its sensitivity to x; `sigma`: the measurements' standard deviations;
+    `seen`: which there are.
+
+        s^2 = f f^T + sigma^2,   S+ = S (1 - f f^T / (s (s + sigma)))
+
+    (Potter's form of the update; Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, Chapter V.)
+    """
+    n = F.shape[1]
+    shift, left = jnp.zeros(n, F.dtype), jnp.eye(n, dtype=F.dtype)
+    innovations, deviations, known = [], [], []
+    for c in range(F.shape[0]):
+        there = seen[c]
+        f = jnp.where(there, left.T @ F[c], 0.0)
+        r = jnp.where(there, sigma[c], 1.0)
+        known.append(F[c] @ shift)
+        e = jnp.where(there, error[c] - known[-1], 0.0)
+        s = jnp.sqrt(f @ f + r**2)
+        moved = left @ f
+        shift = shift + moved * e / s**2
+        left = left - jnp.outer(moved, f) / (s * (s + r))
+        innovations.append(e)
+        deviations.append(s)
+    return Update(jnp.stack(innovations), jnp.stack(deviations), jnp.stack(known), shift, left)
+
+
+class Step(NamedTuple):
+    """What a smoother needs of one instant of a filter.
+
+    `mean` (n,), `S` (n, n): before its measurements. `shift`, `left`: as of an `Update`. `back` (n, n): how the x after
+    the measurements before enters that of here, less what the noise in between adds.
+    """
+
+    mean: Float[Array, " n"]
+    S: Float[Array, "n n"]
+    shift: Float[Array, " n"]
+    left: Float[Array, "n n"]
+    back: Float[Array, "n n"]
+
+
+def smoothed(steps: Step) -> tuple[Float[Array, "n_t n"], Float[Array, "n_t n n"]]:
+    """Mean and a root of the covariance of every instant, all measurements known; `steps` has a leading axis (n_t).
+
+    The smoother of Bryson and Frazier in the coordinates x, where the adjoint variable a and 1 - its matrix, here G,
+    are of order one, and no covariance is inverted or subtracted from another:
+
+        a = left a+ - shift,   G = left G+ left^T,   m + S (-a),   S G S^T
+    """
+    n = steps.S.shape[-1]
+    one = jnp.eye(n, dtype=steps.S.dtype)
+
+    def go_back(after: Any, step: Step) -> tuple[Any, Any]:
+        a, G = after
+        a, G = step.left @ a - step.shift, step.left @ G @ step.left.T
+        found = step.mean - step.S @ a, step.S @ _symmetric_root(G)
+        return (step.back @ a, one - step.back @ (one - G) @ step.back.T), found
+
+    _, found = jax.lax.scan(go_back, (jnp.zeros(n, one.dtype), one), steps, reverse=True)
+    return found
+
+
+def _symmetric_root(G: Array) -> Array:
+    values, vectors = jnp.linalg.eigh((G + G.T) / 2)
+    return vectors * jnp.sqrt(jnp.maximum(values, 0.0))[None, :]
+
+
+LOG_2PI = 1.8378770664093453
+
+
+class Filtered(NamedTuple):
+    """One trial, filtered.
+
+    - `innovation`, `deviation` (n_c, n_t): measured less predicted from all that was measured before, and the standard
+      deviation of that; zero and one in gaps. `predicted` (n_c, n_t).
+    - `unknowns` (n_b,): the trial's own, in the end. `status`: of the first simulation that failed.
+    - `steps`: what a smoother needs.
+    """
+
+    innovation: Array
+    deviation: Array
+    predicted: Array
+    unknowns: Array
+    status: Array
+    steps: Step
+
+
+def filtered(model: Any, window: Windows, start: Array, b: Array, x: Array, begin: Array | None = None) -> Filtered:
+    """The filter along one trial from `start` (n_q + n_u + n_x,).
+
+    `begin` (n,): standard deviations of v there, by default those that were given, and zero of what has none.
+    """
+    system, roles = model.parameters.apply(model.system, x)
+    y, weight, t = window.measured.T, window.weight.T, window.t  # (n_t, n_c), (n_t,)
+    factor = jnp.stack([jnp.asarray(roles.get(("sigma", c), 1.0), x.dtype) for c in model.channels])
+    begin = _given_deviations(model, start.shape[0]) if begin is None else begin
+    S = jnp.diag(begin)
+    if has_configuration_constraints(system, t[0], start[: len(system.coordinates)]):
+        S = _tangent(system, t[0], start, S, model.moved)
+
+    def go_on(known: tuple[Array, Array], now: Any) -> tuple[Any, Any]:
+        before, t, y, weight = now
+        v, S, h, F, back, status = _predicted(model, system, roles, window, known, before, t)
+        seen = weight > 0
+        sigma = factor / jnp.where(seen, weight, 1.0)
+        new = update(jnp.where(seen, y - h, 0.0), F, sigma, seen)
+        mean, after = brought_back(system, t, v + S @ new.shift, S @ new.left)
+        step = Step(v, S, new.shift, new.left, back)
+        return (mean, after), (new.innovation, new.deviation, h + new.known, status, step)
+
+    began = (jnp.concatenate([start, _fixed(model, b)]), S)
+    # The first sample is met where the motion begins, after no time at all.
+    times = (jnp.concatenate([t[:1], t[:-1]]), t)
+    (mean, _), (e, s, predicted, status, steps) = jax.lax.scan(go_on, began, (*times, y, weight))
+    return Filtered(e.T, s.T, predicted.T, mean[start.shape[0] :], jnp.max(status), steps)
+
+
+def _predicted(model: Any, system: System, roles: Any, window: Windows, known: Any, t0: Array, t1: Array):
+    """Mean v and root S at t1, what is predicted there h (n_c,), its sensitivity F (n_c, n) in units of S, the rotation
+    of that unit, and the worst status; by steps of at most the window's."""
+    noise: Noise = model.noise
+    v, S = known
+    n, n_w, n_c, dtype = v.shape[0], len(noise.names), len(model.channels), v.dtype
+    intensity, named = noise.intensities(roles), (system.speeds, system.states)
+    lasts = intensity > 0
+    amplitude = jnp.where(lasts, jnp.sqrt(jnp.where(lasts, intensity, 1.0)), 0.0)
+    moving = t1 > t0
+    number = jnp.maximum(jnp.ceil((t1 - t0) / window.step - 1e-6), 1.0)
+    length = jnp.where(moving, (t1 - t0) / number, window.step)
+    of_noise = jnp.tile(jnp.diag(amplitude), (MODES, 1)).reshape(MODES * n_w, n_w)
+    xi_directions = jnp.zeros((MODES * n_w, MODES, n_w), dtype)
+    places = jnp.arange(MODES * n_w, dtype=jnp.int32)
+    xi_directions = xi_directions.at[places, places // max(n_w, 1)].set(of_noise)
+    xi_directions = jnp.concatenate([jnp.zeros((n, MODES, n_w), dtype), xi_directions])
+
+    def piece(i: Array, so_far: Any) -> Any:
+        v, S, _, _, back, status = so_far
+        i = i.astype(dtype)
+        begun = t0 + i * length
+        ended = jnp.where(moving & (i + 1 >= number), t1, begun + length)
+
+        def flow(v: Array, xi: Array) -> Any:
+            return _flow(model, system, roles, window, v, Disturbance(begun, ended, xi, noise.names, *named))
+
+        v_directions = jnp.concatenate([S.T, jnp.zeros((MODES * n_w, n), dtype)])
+        along = lambda *direction: jax.jvp(flow, (v, jnp.zeros((MODES, n_w), dtype)), direction, has_aux=True)  # noqa: E731
+        (v1, h), (A, g), code = jax.vmap(along, out_axes=(None, -1, None))(v_directions, xi_directions)
+        v1 = jnp.where(moving, v1, v)
+        A = jnp.where(moving, A, v_directions.T)
+        h, g = (jnp.where(moving, x[:, 1], x[:, 0]) for x in (h, g))  # (n_c,), (n_c, k)
+        S, Q = root(A)
+        return v1, S, h, g @ Q, back @ Q[:n], jnp.where(status > 0, status, code)
+
+    nothing = jnp.zeros(n_c, dtype), jnp.zeros((n_c, n), dtype), jnp.eye(n, dtype=dtype), jnp.zeros((), jnp.int32)
+    return jax.lax.fori_loop(jnp.int32(0), number.astype(jnp.int32), piece, (v, S, *nothing))
+
+
+def _flow(model: Any, system: System, roles: Any, window: Windows, v: Array, disturbance: Disturbance):
+    """v at the end of a step, what is measured at its two ends (n_c, 2); and the simulation's status."""
+    n = len(state_names(system))
+    b, ts = v[n:], jnp.stack([disturbance.t0, disturbance.t1])
+    settings = model.settings
+    if settings.step is not None:
+        settings = dataclasses.replace(settings, step=ts[1] - ts[0])
+    signals = with_one_times(model.signals(window, b, roles))
+    ride = solve(system, unpacked(system, v[:n]), ts, signals, settings, disturbance)
+    return (jnp.concatenate([packed(ride.state()), b]), model.simulated(ride, b, roles)), ride.status
+
+
+def brought_back(system: System, t: Array, v: Array, S: Array) -> tuple[Array, Array]:
+    """The nearest coordinates that meet the constraints, and deviations that are tangent to them there."""
+    n_q = len(system.coordinates)
+    if not has_configuration_constraints(system, t, v[:n_q]):
+        return v, S
+    v = v.at[:n_q].set(projected(system, t, v[:n_q]))
+    return v, _tangent(system, t, v, S, tuple(range(n_q)))
+
+
+def _tangent(system: System, t: Array, v: Array, S: Array, moved: tuple[int, ...]) -> Array:
+    """Deviations S (n, k) that meet the constraints to first order: `moved` coordinates by as little as that takes."""
+    n_q, at = len(system.coordinates), jnp.asarray(moved, dtype=jnp.int32)
+    G = jax.jacfwd(lambda q: configuration_residual(system, t, q))(v[:n_q])  # (h, n_q)
+    own = G[:, at]
+    return S.at[at].add(-own.T @ jnp.linalg.solve(own @ own.T, G @ S[:n_q]))
+
+
+def _given_deviations(model: Any, n: int) -> Array:
+    """Of v (n + n_b,) at the start, zero of what has none."""
+    nuisance = model.nuisance
+    finite = lambda x: jnp.where(jnp.isfinite(x), x, 0.0)  # noqa: E731
+    y = jnp.zeros(n, nuisance.start_deviation.dtype).at[model.unknown_places].set(finite(nuisance.start_deviation))
+    return jnp.concatenate([y, finite(nuisance.trial_deviation)])
+
+
+def _fixed(model: Any, b: Array) -> Array:
+    """The trial's own unknowns where the filter begins: those that are random variables with the mean zero."""
+    return jnp.where(jnp.isfinite(model.nuisance.trial_deviation), 0.0, b)
+
+
+def information_of(model: Any, window: Windows, start: Array, start_dot: Array, z: Array, b: Array, x: Array):
+    """Rows [J, r] of one trial, for which J^T r is the gradient of half of what `minus_twice_log_likelihood` says, and
+    J^T J the information that is expected (Fisher's); that sum; what was predicted, its deviation, the trial's own
+    unknowns, and the status.
+
+        e_dot / s,   e / s;      sqrt(2) s_dot / s,   (1 - e^2 / s^2) / sqrt(2)
+
+    Each innovation e is Gaussian with the standard deviation s, given those before it. A step of least squares with
+    these rows is one of Fisher's scoring.
+    """
+    n_z, n_b, k = z.shape[0], b.shape[0], z.shape[0] + b.shape[0] + x.shape[0]
+    # What is a random variable of the filter is no unknown: nothing else moves with it.
+    moves = np.array([j for j in range(k) if j >= n_z + n_b or not model.noise.random[j]], dtype=np.int32)
+    unit = jnp.eye(k, dtype=z.dtype)[moves]
+    directions = (start_dot.T[moves], unit[:, n_z : n_z + n_b], unit[:, n_z + n_b :])
+
+    def along(*direction):
+        def of(start, b, x):
+            found = filtered(model, window, start, b, x)
+            return (found.innovation, found.deviation), found
+
+        return jax.jvp(of, (start, b, x), direction, has_aux=True)
+
+    (e, s), dots, found = jax.vmap(along, out_axes=(None, -1, None))(*directions)
+    priors = model.priors(window, z, b, x)
+    priors_dot = jnp.concatenate(jax.jacfwd(model.priors, argnums=(1, 2, 3))(window, z, b, x), axis=1)
+    seen = (window.weight > 0).ravel()
+    e, s = e.ravel(), s.ravel()
+    dots = (jnp.where(seen[:, None], d.reshape(e.size, -1), 0.0) for d in dots)
+    e_dot, s_dot = (jnp.zeros((e.size, k), e.dtype).at[:, moves].set(d) for d in dots)
+    r = jnp.where(seen, e / s, 0.0)
+    of_size = jnp.where(seen, (1 - r**2) / 2**0.5, 0.0)
+    J = jnp.concatenate([e_dot / s[:, None], 2**0.5 * s_dot / s[:, None], priors_dot])
+    value = minus_twice_log_likelihood(found, window) + jnp.sum(priors**2)
+    return J, jnp.concatenate([r, of_size, priors]), value, found
+
+
+def minus_twice_log_likelihood(found: Filtered, window: Windows) -> Array:
+    """Of the measurements of one trial."""
+    seen, s = window.weight > 0, found.deviation
+    return jnp.sum(jnp.where(seen, (found.innovation / s) ** 2 + 2 * jnp.log(s) + LOG_2PI, 0.0))

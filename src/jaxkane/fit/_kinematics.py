@@ -1,0 +1,249 @@
+"""Coordinates, speeds and accelerations at instants: of a simulation, or of measurements by splines."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.interpolate import make_interp_spline, make_lsq_spline
+
+from .._common.lookup import refuse_unknown
+from .._integrate.trajectory import Trajectory, refuse_other_system
+from .._kane.equations import coordinate_rates
+from .._scalarjit.cache_key import compiled
+from .._system.system import System
+from ._trial import Trial
+
+DEGREE = 5
+_MOST_OF_A_SAMPLE = 4.0  # knots are no closer than so many samples
+_RATIO = 1.25  # between spacings that are tried
+
+
+@compiled
+def speeds_and_rates(system, t, q, q_dot, q_ddot):
+    """Independent speeds and their rates (n, n_u), from the coordinates' rates, which are affine in them."""
+    zero = jnp.zeros(len(system.speeds), q.dtype)
+
+    def speeds(t, q, q_dot):
+        rates = lambda u: coordinate_rates(system, t, q, u)  # noqa: E731
+        return jnp.linalg.pinv(jax.jacfwd(rates)(zero)) @ (q_dot - rates(zero))
+
+    def along(t, q, q_dot, q_ddot):
+        return jax.jvp(speeds, (t, q, q_dot), (jnp.ones_like(t), q_dot, q_ddot))
+
+    return jax.vmap(along)(t, q, q_dot, q_ddot)
+
+
+def max_spacing(trial: Trial, channels: Mapping[str, np.ndarray]) -> float:
+    """The largest spacing [s] of knots at which every channel is met within its standard deviation."""
+    span = trial.t[-1] - trial.t[0]
+    spacing, least = span / 2, _MOST_OF_A_SAMPLE * float(np.median(np.diff(trial.t)))
+    for name, y in channels.items():
+        seen = np.isfinite(y)
+        while spacing > least:
+            misfit = (spline(trial, name, y, spacing)(trial.t[seen]) - y[seen]) / trial.sigma[name][seen]
+            if np.mean(misfit**2) <= 1.0:
+                break
+            spacing /= _RATIO
+    return max(spacing, least)
+
+
+def spline(trial: Trial, name: str, y: np.ndarray, spacing: float) -> Any:
+    """The spline of least squares, whose knots are as far apart; without those between which nothing was measured."""
+    seen = np.isfinite(y)
+    t, y = trial.t[seen], y[seen]
+    if len(t) < 3 * (DEGREE + 1):
+        raise ValueError(
+            f"{trial.name}: {name} has {len(t)} samples; {3 * (DEGREE + 1)} are the least to take accelerations from."
+        )
+    steps = np.abs(np.diff(y))
+    usual = np.median(steps)
+    if usual < 0.8 and np.any(np.abs(steps - 2 * np.pi) < 0.2 + 2 * usual):
+        raise ValueError(
+            f"{trial.name}: {name} jumps by a whole turn at t = {t[steps.argmax()]:g} s: make it one curve by "
+            "np.unwrap."
+        )
+    weights = None if name not in trial.sigma else 1.0 / trial.sigma[name][seen]
+    n = max(1, round((t[-1] - t[0]) / spacing))
+    inner, last = [], 0
+    for knot in np.linspace(t[0], t[-1], n + 1)[1:-1]:
+        upto = int(np.searchsorted(t, knot))
+        if upto - last >= 2 and len(t) - upto >= 2:
+            inner.append(knot)
+            last = upto
+    knots = np.r_[[t[0]] * (DEGREE + 1), inner, [t[-1]] * (DEGREE + 1)]
+    return make_lsq_spline(t, y, knots, DEGREE, w=weights)
+
+
+def covered(t: np.ndarray, channels: Mapping[str, np.ndarray], spacing: float) -> np.ndarray:
+    """Where every channel was measured, and has no end nor a gap of a spacing within a spacing."""
+    fine = np.ones(t.shape, bool)
+    for y in channels.values():
+        seen = t[np.isfinite(y)]
+        fine &= (t >= seen[0] + spacing) & (t <= seen[-1] - spacing)
+        for i in np.flatnonzero(np.diff(seen) > spacing):
+            fine &= (t <= seen[i] - spacing) | (t >= seen[i + 1] + spacing)
+    return fine
+
+
+@dataclasses.dataclass(frozen=True)
+class Instants:
+    """Instants of one or several motions, for `base_parameters` and `first_guess`.
+
+        Instants(t, q, u, u_dot, {"torque": torque})
+
+    **Arguments:** `t` (n,) [s]; `q` (n, n_q); `u`, `u_dot` (n, n_u) of the independent speeds; `inputs`: by name, and
+    states of the first order with them, numbers or (n,); inputs left out are zero; `trial` (n,): which motion each is
+    of, by default all of one. Rows in which something is NaN are left out.
+
+    **Raises:** `ValueError` for shapes that do not fit together, and where no row is finite.
+    """
+
+    t: np.ndarray
+    q: np.ndarray
+    u: np.ndarray
+    u_dot: np.ndarray
+    inputs: Mapping[str, np.ndarray] = dataclasses.field(default_factory=dict)
+    trial: np.ndarray = None  # type: ignore[assignment]
+
+    def __post_init__(self) -> None:
+        t = np.asarray(self.t, float)
+        if t.ndim != 1:
+            raise ValueError(f"Instants: `t` has the shape {t.shape} instead of (n,).")
+        rows = {name: np.asarray(getattr(self, name), float) for name in ("q", "u", "u_dot")}
+        inputs = {name: np.asarray(x, float) for name, x in self.inputs.items()}
+        inputs = {name: np.full(t.shape, x) if x.ndim == 0 else x for name, x in inputs.items()}
+        trial = np.zeros(t.shape, int) if self.trial is None else np.asarray(self.trial)
+        wrong = [f"`{k}` {x.shape}" for k, x in rows.items() if x.ndim != 2 or len(x) != len(t)]
+        wrong += [f"`{k}` {x.shape}" for k, x in {"trial": trial, **inputs}.items() if x.shape != t.shape]
+        if wrong or rows["u"].shape != rows["u_dot"].shape:
+            raise ValueError(
+                f"Instants: for `t` ({len(t)},), `q`, `u` and `u_dot` have a row for each time, and inputs a number: "
+                f"{', '.join(wrong) or 'u ' + str(rows['u'].shape) + ', u_dot ' + str(rows['u_dot'].shape)}."
+            )
+        columns = np.column_stack([t, *rows.values(), *inputs.values()])
+        finite = np.all(np.isfinite(columns), axis=1)
+        if not finite.any():
+            raise ValueError("Instants: there is no instant at which all numbers are finite.")
+        keep = {"t": t, **rows, "trial": trial}
+        for name, x in keep.items():
+            object.__setattr__(self, name, x[finite])
+        object.__setattr__(self, "inputs", {name: x[finite] for name, x in inputs.items()})
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    def __repr__(self) -> str:
+        return f"Instants({len(self)} of {len(np.unique(self.trial))} motions)"
+
+
+Motions = Instants | Trial | Trajectory | Sequence[Trial | Trajectory | Instants]
+
+
+def instants_of(system: System, motions: Motions, *, spacing: float | None = None) -> Instants:
+    """Coordinates, speeds and accelerations of measured or simulated motions.
+
+    **Arguments:**
+
+    - `motions`: a `Trial`, a `Trajectory`, `Instants`, or several of these. A trajectory's accelerations are those of
+        splines through its speeds: save enough times. A trial's channels are approximated by splines: coordinates,
+        which give speeds and accelerations by their derivatives; a speed that was measured gives its own.
+    - `spacing` [s]: of the splines' knots, which hold what is slower than a period of two of them; by default the
+        largest at which every channel is met within its `sigma`, in root mean square.
+
+    **Returns:** `Instants`. A spacing at the ends of a trial, and around gaps in a channel, is left out.
+
+    **Raises:** `ValueError` that names a coordinate, or a state of the first order, that a trial has not measured, and
+    for a trial or a trajectory that is too short.
+    """
+    if isinstance(motions, (Instants, Trial, Trajectory)):
+        motions = [motions]
+    found = [_of_one(system, motion, spacing) for motion in motions]
+    if not found:
+        raise ValueError("There is no motion: give a Trial, a Trajectory, or Instants.")
+    n_q, n_u = len(system.coordinates), len(system.speeds)
+    for one in found:
+        if (one.q.shape[1], one.u.shape[1]) != (n_q, n_u):
+            raise ValueError(
+                f"{type(system).__name__} has {n_q} coordinates and {n_u} independent speeds; the instants have "
+                f"{one.q.shape[1]} and {one.u.shape[1]}."
+            )
+        known = (*system.inputs, *system.states)
+        refuse_unknown(one.inputs, known, f"{type(system).__name__} has no input or state named", "it has")
+        lacking = [name for name in system.states if name not in one.inputs]
+        if lacking:
+            raise ValueError(
+                f"{type(system).__name__}: loads may follow {', '.join(lacking)}, of which the instants say nothing: "
+                "give its values among the `inputs` of Instants, or measure it."
+            )
+    if len(found) == 1:
+        return found[0]
+    joined = lambda of: np.concatenate([of(one) for one in found])  # noqa: E731
+    return Instants(
+        joined(lambda one: one.t),
+        joined(lambda one: one.q),
+        joined(lambda one: one.u),
+        joined(lambda one: one.u_dot),
+        {name: joined(lambda one, name=name: one.inputs.get(name, 0.0 * one.t)) for name in known},
+        np.unique(
+            np.concatenate([1000 * i + np.unique(one.trial, return_inverse=True)[1] for i, one in enumerate(found)]),
+            return_inverse=True,
+        )[1],
+    )
+
+
+def _of_one(system: System, motion: Any, spacing: float | None) -> Instants:
+    if isinstance(motion, Instants):
+        return motion
+    if isinstance(motion, Trajectory):
+        return _of_trajectory(system, motion)
+    if isinstance(motion, Trial):
+        return _of_trial(system, motion, spacing)
+    raise TypeError(f"A motion is a Trial, a Trajectory or Instants, got {type(motion).__name__}.")
+
+
+def _of_trajectory(system: System, ride: Trajectory) -> Instants:
+    """Accelerations by a spline through the speeds: those of the system would be what is to be found."""
+    refuse_other_system("Instants", system, ride)
+    if np.ndim(ride.status) > 0:
+        raise ValueError("A batch of trajectories: give them one by one, or as Instants.")
+    t, q, u = (np.asarray(x) for x in (ride.t, ride.q, ride.u))
+    there = np.all(np.isfinite(np.column_stack([t, q, u])), axis=1)
+    if there.sum() < 3 * (DEGREE + 1):
+        raise ValueError(
+            f"A trajectory of {there.sum()} times; {3 * (DEGREE + 1)} are the least to take accelerations from: save "
+            "more of them."
+        )
+    u_dot = np.full(u.shape, np.nan)
+    u_dot[there] = make_interp_spline(t[there], u[there], DEGREE)(t[there], 1)
+    u_dot[np.flatnonzero(there)[[*range(3), *range(-3, 0)]]] = np.nan  # at its ends a spline is worst
+    return Instants(t, q, u, u_dot, {name: np.asarray(ride[name]) for name in (*system.inputs, *system.states)})
+
+
+def _of_trial(system: System, trial: Trial, spacing: float | None) -> Instants:
+    names = [*system.coordinates, *system.speeds, *system.states]
+    channels = {name: y for name, y in trial.measured.items() if name in names}
+    missing = [name for name in system.coordinates if name not in channels]
+    if missing:
+        raise ValueError(
+            f"{trial.name}: {', '.join(missing)} was not measured, which the equations of motion ask for: give "
+            "Instants(t, q, u, u_dot, inputs) with what is known otherwise."
+        )
+    refuse_unknown(trial.inputs, system.inputs, f"{trial.name}: {type(system).__name__} has no input named", "it has")
+    if spacing is None:
+        spacing = max_spacing(trial, channels)
+    splines = {name: spline(trial, name, y, spacing) for name, y in channels.items()}
+    inputs = {name: spline(trial, name, y, spacing)(trial.t) for name, y in trial.inputs.items()}
+    inputs |= {name: splines[name](trial.t) for name in system.states if name in splines}
+    at = lambda order: np.column_stack([splines[name](trial.t, order) for name in system.coordinates])  # noqa: E731
+    q, q_dot, q_ddot = at(0), at(1), at(2)
+    u, u_dot = (np.array(x) for x in speeds_and_rates(system, *map(jnp.asarray, (trial.t, q, q_dot, q_ddot))))
+    for i, name in enumerate(system.speeds):
+        if name in splines:
+            u[:, i], u_dot[:, i] = splines[name](trial.t), splines[name](trial.t, 1)
+    u_dot[~covered(trial.t, channels, spacing)] = np.nan
+    return Instants(trial.t, q, u, u_dot, inputs)

@@ -1,1 +1,0 @@
-"""The optimizers, and what they share: initial guesses, steps, checkpoints."""

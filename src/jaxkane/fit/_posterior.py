@@ -1,0 +1,227 @@
+"""The posterior of a fit: its density for samplers, Laplace's approximation, and the evidence of a model."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy.optimize
+
+from .._common.lookup import as_names, refuse_unknown
+from ._block_lsq import Eliminated, eliminate
+from ._optimize import minimize, uninterrupted
+from ._optimizers import LeastSquares
+from ._problem import Problem, refuse_other
+from ._result import Fit
+from ._trial import Trial
+
+LOG_2PI = math.log(2 * math.pi)
+
+
+@dataclasses.dataclass(frozen=True)
+class Laplace:
+    """A Gaussian for the posterior of the free numbers x, at the fit's minimum.
+
+    - `mean` (p,), `covariance` (p, p): of x.
+    - `log_evidence`: the logarithm of the density of the measurements, all unknowns integrated out. Twice the
+        difference of two models' is what a prior's width (Occam's factor) leaves of the difference of their costs.
+    - `message`: why there is no evidence where it is NaN, in words; else empty.
+    """
+
+    fit: Fit
+    mean: np.ndarray
+    covariance: np.ndarray
+    log_evidence: float
+    message: str = ""
+
+    def sample(self, n: int, seed: int = 0) -> dict[str, np.ndarray]:
+        """Parameters (n,) by name, in their units: never outside their bounds."""
+        if not isinstance(n, (int, np.integer)) or n < 0:
+            raise ValueError(f"`n` is how many are drawn, a whole number that is not negative; got {n!r}.")
+        rng = np.random.default_rng(seed)
+        x = jnp.asarray(rng.multivariate_normal(self.mean, self.covariance, size=n), self.fit.point.x.dtype)
+        values = np.asarray(jax.vmap(self.fit.parameters.values)(x))
+        return dict(zip(self.fit.names, values.T, strict=True))
+
+
+def laplace(fit: Fit) -> Laplace:
+    """The Laplace approximation: `sigma` is taken as it was given, priors count, nuisance values are integrated out.
+
+        log evidence = log p(measurements | unknowns) + log p(unknowns) + 1/2 log det(2 pi C)
+
+    at the minimum, with C the covariance of all unknowns in their own units: of parameters in theirs, so that neither
+    `Free.scale` nor the choice of bounds for the search's sake changes it (MacKay, Bayesian interpolation, Neural
+    Computation 4, 1992). Exact where the motion is linear in all unknowns.
+
+    What a parameter's prior is: the Gaussian it was given, cut off at its bounds; without one, with two `bounds`, the
+    uniform density between them; else it is improper, and the evidence is NaN. Starts and biases without a standard
+    deviation have a density of one per unit: compare only models that have the same of these, or give deviations.
+
+    **Raises:** `ValueError` that names the parameters that the data do not determine (nothing bounds their posterior),
+    and for a fit that is not at a minimum.
+    """
+    refuse_other(fit, Fit, "laplace", "laplace(fit(...))")
+    undetermined = [name for name, error in fit.standard_errors.items() if np.isinf(error)]
+    if undetermined:
+        raise ValueError(
+            f"These data do not determine {', '.join(undetermined)}: give a prior, or leave something out."
+        )
+    eliminated = eliminate(fit.linearization.blocks, 0.0)
+    to_gain = fit.linearization.squares - float(eliminated.step(1e-9)[1])
+    if fit.status == "applied" or not to_gain < 0.1:
+        raise ValueError(
+            f"This is no minimum ({fit.status}): a step would lower the sum of squares by {to_gain:.3g}. Go on with "
+            "`minimize(fit.problem, LeastSquares(), start=fit.point)`."
+        )
+    s = np.linalg.svd(np.asarray(eliminated.rows[0], float), compute_uv=False)
+    log_prior, message = _log_priors(fit)
+    message = message or _undetermined_nuisance(fit.problem, eliminated)
+    evidence = log_likelihood(fit.problem, fit.cost) + log_prior + _log_volume(fit, eliminated, s)
+    covariance = fit.identifiability.covariance_of_x
+    return Laplace(fit, np.asarray(fit.point.x), covariance, math.nan if message else evidence, message)
+
+
+def log_likelihood(problem: Problem, cost: float) -> float:
+    """-cost/2 with the constants of the measurements' densities, so that they integrate to one."""
+    if problem.model.noise is not None:
+        return -0.5 * cost
+    weight = np.asarray(problem.windows.weight, float)
+    return -0.5 * cost + float(np.sum(np.log(weight[weight > 0]) - 0.5 * LOG_2PI))
+
+
+def _log_priors(fit: Fit) -> tuple[float, str]:
+    """The logarithm of all priors' densities, but for the squares in the cost; and what is improper, in words."""
+    constants = fit.parameters.log_prior_constants
+    improper = [name for name, constant in zip(fit.names, constants, strict=True) if np.isnan(constant)]
+    total = float(constants.sum()) + log_nuisance_priors(fit.problem)
+    if not improper:
+        return total, ""
+    return total, (
+        f"No evidence: without a prior, or both bounds, any value of {', '.join(improper)} is as likely as any other, "
+        "and no data are expected more than others. Give `prior` or `bounds`."
+    )
+
+
+def log_nuisance_priors(problem: Problem) -> float:
+    """Of starts, links of windows and trials' unknowns, the logarithm of their densities, but for the squares."""
+    n, total = problem.model.nuisance, 0.0
+    counts = (  # how many densities of each nuisance value there are, whose squares are in the cost
+        (n.start_deviation, np.asarray(problem.windows.first).sum() if n.chained else len(problem.places)),
+        (n.trial_deviation, np.asarray(problem.windows.first).sum()),
+        (n.jump, np.asarray(problem.windows.linked).sum()),
+    )
+    for deviations, count in counts:
+        known = np.asarray(deviations, float)[np.isfinite(deviations)]
+        total -= float(count) * float(np.sum(np.log(known) + 0.5 * LOG_2PI))
+    return total
+
+
+def _log_volume(fit: Fit, eliminated: Eliminated, s: np.ndarray) -> float:
+    """1/2 log det(2 pi C) of all unknowns in their units; those that have no density at all are left out."""
+    z, b = (np.asarray(x) for x in eliminated.informed)
+    number = s.size + np.count_nonzero(z) + np.count_nonzero(b)
+    log_information = 2 * np.sum(np.log(s)) + float(eliminated.log_determinant)
+    to_units = float(fit.parameters.log_determinant(fit.point.x))
+    return 0.5 * number * LOG_2PI - 0.5 * log_information + to_units
+
+
+def _undetermined_nuisance(problem: Problem, eliminated: Eliminated) -> str:
+    """The starts and biases that have neither data nor a prior, in words: nothing bounds their posterior."""
+    z, b = (np.asarray(x) for x in eliminated.informed)  # (T, m, n_z), (T, n_b)
+    counts, n = np.append(problem.seen, False)[np.asarray(problem.by_trial)], problem.model.nuisance  # (T, m)
+    names = [name for j, name in enumerate(n.start) if np.any(counts & ~z[..., j])]
+    names += [" ".join(pair) for j, pair in enumerate(n.trial) if np.any(counts.any(axis=1) & ~b[:, j])]
+    if not names:
+        return ""
+    return f"No evidence: the data do not determine {', '.join(names)} of every window. Give a standard deviation."
+
+
+SMALLEST = 1e-4
+"""By what factor a deviation may fall, or its inverse may rise, from where the search begins."""
+
+
+def marginal_likelihood(fit: Fit) -> float:
+    """The logarithm of the density of the measurements, with the parameters as they were found; starts, jumps between
+    windows, biases and gains are integrated out.
+
+        log p = -1/2 sum of squares + log priors - 1/2 log det (J^T J / 2 pi)
+
+    with J by the starts of all windows and the trials' unknowns. With process noise that is what its filter computes.
+    Of windows as short as the samples, linked by `continuity`, both are the same number where the motion is linear and
+    the noise of a step is that of the links. Starts and biases without a deviation have a density of one per unit.
+
+    **Raises:** `TypeError` for what is no `Fit`.
+    """
+    refuse_other(fit, Fit, "marginal_likelihood", "marginal_likelihood(fit(...))")
+    problem, priors = fit.problem, float(np.sum(np.asarray(fit.parameters.prior_residuals(fit.point.x)) ** 2))
+    eliminated = eliminate(fit.linearization.blocks, 0.0)
+    number = sum(int(np.count_nonzero(x)) for x in eliminated.informed)
+    volume = 0.5 * number * LOG_2PI - 0.5 * float(eliminated.log_determinant)
+    return log_likelihood(problem, fit.cost - priors) + log_nuisance_priors(problem) + volume
+
+
+def find_continuity(fit: Fit, sigma: Sequence[str] = ()) -> Fit:
+    """A fit of linked windows with the `continuity`, and the `sigma` of the channels that are named, for which the
+    measurements are most likely: how much a motion is disturbed, and how well it was measured, found and not given.
+
+        found = find_continuity(fit(..., window=0.1, continuity={"roll_rate": 0.1}), sigma=("roll",))
+        found.problem.specification.continuity
+
+    The deviations are varied by the simplex of Nelder and Mead, each from what was given; for each the parameters are
+    found anew. Those of `sigma` are multiplied by one factor in all trials. For noise in continuous time, whatever the
+    rate of the samples, fit with `noise` instead.
+
+    **Returns:** the `Fit` with these deviations: of another `problem`, whose trials have the `sigma` that was found.
+
+    **Raises:** `ValueError` for windows that are not linked, or a channel that is not measured.
+    """
+    refuse_other(fit, Fit, "find_continuity", "find_continuity(fit(..., continuity={...}))")
+    problem = fit.problem
+    links = dict(problem.specification.continuity or {})
+    if not links:
+        raise ValueError("find_continuity: no windows are linked here: give `window`, and `continuity` to begin with.")
+    sigma = as_names(sigma)
+    refuse_unknown(sigma, problem.channels, "find_continuity: `sigma` names")
+    now, limit = fit, -np.log(SMALLEST)
+
+    def cost(x: np.ndarray) -> float:
+        nonlocal now
+        x = np.clip(x, -limit, limit)
+        now = _again(_scaled(problem, links, sigma, np.exp(x)), now)
+        return -2 * marginal_likelihood(now)
+
+    start = np.zeros(len(links) + len(sigma))
+    simplex = np.vstack([start, start + 0.7 * np.eye(start.size)])
+    options = {"initial_simplex": simplex, "xatol": 1e-3, "fatol": 1e-4}
+    best = scipy.optimize.minimize(cost, start, method="Nelder-Mead", options=options)
+    factors = np.exp(np.clip(best.x, -limit, limit))
+    continuity = {name: float(x * factor) for (name, x), factor in zip(links.items(), factors, strict=False)}
+    of_channels = dict(zip(sigma, factors[len(links) :], strict=True))
+    trials = [_with_sigma(trial, of_channels) for trial in problem.trials]
+    return _again(Problem.posed(dataclasses.replace(problem.specification, continuity=continuity), trials), now)
+
+
+def _again(problem: Problem, near: Fit) -> Fit:
+    return uninterrupted(minimize(problem, LeastSquares(rtol=1e-9), start=near.point))
+
+
+def _scaled(problem: Problem, links: dict[str, float], sigma: Sequence[str], factors: np.ndarray) -> Problem:
+    """The same problem with deviations multiplied by factors, those of links first; nothing is compiled anew."""
+    jump, weight = problem.model.nuisance.jump, problem.windows.weight
+    for name, factor in zip(links, factors, strict=False):
+        i = problem.model.nuisance.start.index(name)
+        jump = jump.at[i].multiply(float(factor))
+    for name, factor in zip(sigma, factors[len(links) :], strict=True):
+        weight = weight.at[:, problem.channels.index(name)].divide(float(factor))
+    model = eqx.tree_at(lambda m: m.nuisance.jump, problem.model, jump)
+    return dataclasses.replace(problem, model=model, windows=eqx.tree_at(lambda w: w.weight, problem.windows, weight))
+
+
+def _with_sigma(trial: Trial, factors: dict[str, float]) -> Trial:
+    sigma = {name: x * factors.get(name, 1.0) for name, x in trial.sigma.items()}
+    return Trial(trial.t, trial.measured, trial.inputs, sigma=sigma, initial=trial.initial, name=trial.name)

@@ -1,0 +1,331 @@
+"""The equations of motion as a matrix times the bodies' parameters, in which they are linear. Knows no data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from .._common.lru_cache import LRUCache
+from .._kane.arguments import as_array, check_is_system, check_time, checked_values, refuse_incomplete
+from .._kane.checks import check_system
+from .._kane.equations import InputValues
+from .._kane.evaluate import structure_of, with_trial_numbers
+from .._kane.regressor import UNITS, Bodies, Carried, Described, carried, columns_of, described, unbalanced, values_of
+from .._scalarjit.cache_key import compiled
+from .._scalarjit.compat import concretely
+from .._system.parameters import declared, leaf_name
+from .._system.system import System
+from ._parameters import find_leaves
+
+Names = str | Callable[[Any], Any] | Sequence[str | Callable[[Any], Any]]
+
+
+class Regressor(eqx.Module):
+    """Kane's equations as a matrix times parameters: matrix @ values = forces, in the motion.
+
+    - `matrix` (n, p): a row for each independent speed, a column for each parameter.
+    - `values` (p,): the parameters as the system has them, in `units` (p).
+    - `forces` (n,): generalized forces of all that is not in the matrix [N or N m, as the speeds have it].
+    - `names` (p): "link2.m", "link2.mx", "link2.Izz", ...; `about`: by body, the point that its first moment and
+        inertia are about. `speeds` (n).
+    """
+
+    matrix: Float[Array, "*batch n p"]
+    values: Float[Array, "*batch p"]
+    forces: Float[Array, "*batch n"]
+    names: tuple[str, ...] = eqx.field(static=True)
+    units: tuple[str, ...] = eqx.field(static=True)
+    about: tuple[tuple[str, str], ...] = eqx.field(static=True)
+    speeds: tuple[str, ...] = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        about = "".join(f"; {body} about {point}" for body, point in self.about)
+        return f"Regressor(shape={self.matrix.shape}: {', '.join(self.names)}{about})"
+
+
+def values_by_name(system: System) -> tuple[str, ...]:
+    """What a system's loads read by name: inputs, and states of the first order."""
+    return (*system.inputs, *system.states)
+
+
+class Chosen(eqx.Module):
+    """What has columns: bodies of a system, and entries (leaf, place) of other parameters."""
+
+    described: Described
+    places: tuple[tuple[int, int], ...] = eqx.field(static=True)
+    own_names: tuple[str, ...] = eqx.field(static=True)
+    own_units: tuple[str, ...] = eqx.field(static=True)
+
+    @property
+    def system(self) -> System:
+        return self.described.system
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (*(name for part in self.described.parts for name in part.names), *self.own_names)
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        return (*(UNITS[i] for part in self.described.parts for i in part.kind), *self.own_units)
+
+    def of(self, system: System) -> Chosen:
+        """The same of a system with other values."""
+        return eqx.tree_at(lambda c: c.described.system, self, system)
+
+    def values(self, t: Array, q: Array) -> Array:
+        """The parameters themselves, which are the same at all times and coordinates."""
+        n = len(self.system.speeds) + len(self.system.dependent_speeds)
+        of_bodies = values_of(self.described, t, q, jnp.zeros(n, q.dtype))
+        return jnp.concatenate([of_bodies, self.own().astype(q.dtype)])
+
+    def own(self) -> Array:
+        """Of the other parameters."""
+        leaves = jax.tree.leaves(self.system)
+        entries = [jnp.ravel(leaves[leaf])[place] for leaf, place in self.places]
+        return jnp.stack(entries) if entries else jnp.zeros(0, jnp.result_type(float))
+
+    def with_values(self, values: Array) -> System:
+        """The system with other values of the other parameters."""
+        leaves, structure = jax.tree.flatten(self.system)
+        for i, (leaf, place) in enumerate(self.places):
+            flat = jnp.ravel(leaves[leaf]).at[place].set(values[i].astype(leaves[leaf].dtype))
+            leaves[leaf] = flat.reshape(leaves[leaf].shape)
+        return jax.tree.unflatten(structure, leaves)
+
+    def at(self, t: Array, q: Array, u: Array, inputs: Mapping[str, Array], u_dot: Array) -> Regressor:
+        return self.carried_at(t, q, u, inputs, u_dot)[0]
+
+    def carried_at(
+        self, t: Array, q: Array, u: Array, inputs: Mapping[str, Array], u_dot: Array
+    ) -> tuple[Regressor, Carried]:
+        parts = self.described.parts
+        now, own = carried(self.described, t, q, u, inputs, u_dot), self.own().astype(q.dtype)
+        Y, values = columns_of(now, parts), self.values(t, q)
+        along = lambda own: unbalanced(self.with_values(own), t, q, u, inputs, u_dot)  # noqa: E731
+        if self.places:
+            Y = jnp.concatenate([Y, jax.jacfwd(along)(own)], axis=1)
+        # Y pi - tau = -(F_r + F*_r), at any accelerations
+        forces = Y @ values - along(own)
+        about = tuple((part.name, part.about) for part in parts)
+        return Regressor(Y, values, forces, self.names, self.units, about, self.system.speeds), now
+
+
+def chosen_of(system: System, bodies: Bodies, parameters: Names) -> Chosen:
+    """**Raises:** `ValueError` for names that are none, or given twice."""
+    check_is_system(system)
+    parameters = (parameters,) if isinstance(parameters, str) or callable(parameters) else tuple(parameters)
+    places, names, units = [], [], []
+    for where in parameters:
+        chosen, leaves = find_leaves(system, where)
+        for i in chosen:
+            path, leaf = leaves[i]
+            for place, index in enumerate(np.ndindex(leaf.shape)):
+                places.append((i, place))
+                names.append(leaf_name(path) + (str(list(index)) if leaf.ndim else ""))
+                units.append(declared(system, path).unit)
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"`parameters` names {', '.join(twice)} twice.")
+    found = Chosen(described(system, bodies), tuple(places), tuple(names), tuple(units))
+    if not found.names:
+        raise ValueError(f"{type(system).__name__}: no body with a mass is named in `bodies`, and no `parameters`.")
+    return found
+
+
+@compiled
+def regressor_at(chosen: Chosen, t, q, u, inputs, u_dot):
+    return chosen.carried_at(t, q, u, inputs, u_dot)
+
+
+# ---- whether the equations are linear in what was chosen
+
+
+_CHECKED = LRUCache()  # structures, with what is chosen
+
+
+def check_linear(chosen: Chosen, t: Any, q: Any) -> None:
+    """Refuse what would make tau or Y depend on the parameters themselves; once for each structure and choice."""
+    key = (structure_of(chosen.system), chosen.described.parts, chosen.places)
+    if key in _CHECKED:
+        return
+    # What is differentiated alone has a value; what is traced has none.
+    value = lambda x: jax.lax.stop_gradient(x) if isinstance(x, Tracer) else x  # noqa: E731
+    system, t, q = jax.tree.map(value, (chosen.system, t, q))
+    with concretely():
+        if _Linearity(chosen, system, t, q).check():
+            _CHECKED[key] = None
+
+
+class _Linearity:
+    """The equations at a trial state, with other values of one parameter after another."""
+
+    def __init__(self, chosen: Chosen, system: System, t: Any, q: Any):
+        rng = np.random.default_rng(0)
+        self.system, t, q = with_trial_numbers((system, t, q), rng)
+        self.name = type(system).__name__
+        # Of the bodies that are named every parameter: what is known of them moves with the others.
+        every = described(system, [part.name for part in chosen.described.parts])
+        self.chosen = eqx.tree_at(lambda c: c.described, chosen, every)
+        self.chosen_columns = np.array([name in chosen.names for name in self.chosen.names], bool)
+        self.of_bodies = np.arange(len(self.chosen_columns)) < len(self.chosen_columns) - len(chosen.places)
+        dtype = q.dtype
+        q = (np.nan_to_num(q) + rng.uniform(-0.1, 0.1, q.shape)).astype(dtype)  # beside what is often zero
+        n = len(system.speeds)
+        rows = [jnp.asarray(rng.uniform(0.5, 1.5, n) * rng.choice((-1.0, 1.0), n), dtype) for _ in range(2)]
+        inputs = {name: jnp.asarray(0.7, dtype) for name in values_by_name(system)}
+        self.state = jnp.asarray(t, dtype), jnp.asarray(q), rows[0], inputs, rows[1]
+        self.tolerance = float(jnp.finfo(dtype).eps) ** 0.5
+
+    def read(self, system: System) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        found, now = jax.device_get(regressor_at(self.chosen.of(system), *self.state))
+        Y, values = found.matrix, found.values
+        known = ~self.chosen_columns
+        pieces = {
+            "Y": Y,
+            "tau": found.forces,
+            "pi": values[self.of_bodies],
+            "own": values[self.chosen_columns & self.of_bodies],
+            "right": found.forces - Y[:, known] @ values[known],
+            "of bodies": Y[:, self.of_bodies],
+            "moving": np.concatenate([x.ravel() for x in (now.V, now.W, now.a, now.alpha, now.omega)]),
+        }
+        return pieces, now.g
+
+    def check(self) -> bool:
+        """**Returns:** whether there were finite numbers to judge by."""
+        now, g = self.read(self.system)
+        if not all(np.all(np.isfinite(x)) for x in now.values()):
+            return False
+        self._check_weights(g)
+        for path, is_own, changes in self._changes(now):
+            if is_own:
+                self._judge_own(leaf_name(path), changes)
+            elif "pi" in changes and "moving" not in changes:
+                self._judge_of_body(leaf_name(path), changes)
+        return True
+
+    def _changes(self, now: Mapping[str, np.ndarray]) -> Iterator[tuple[Any, bool, set[str]]]:
+        """What changes with each number of the system; those of the other parameters first."""
+        with_path, structure = jax.tree_util.tree_flatten_with_path(self.system)
+        leaves = [leaf for _, leaf in with_path]
+        size = np.abs(now["Y"]).max() + np.abs(now["tau"]).max()
+        own = list(self.chosen.places)
+        others = [(i, place) for i, leaf in enumerate(leaves) for place in range(np.size(leaf))]
+        for i, place in [*own, *(each for each in others if each not in own)]:
+            path, leaf = with_path[i]
+            moved = np.array(leaf)
+            moved.flat[place] = 1.3 * moved.flat[place] + (0.1 if moved.flat[place] >= 0 else -0.1)
+            other = [*leaves[:i], jnp.asarray(moved), *leaves[i + 1 :]]
+            then, _ = self.read(jax.tree.unflatten(structure, other))
+            changes = {k for k in now if self._differs(then[k], now[k], size if k in ("tau", "right") else 0.0)}
+            yield path, (i, place) in own, changes | ({"mass"} if i in self.chosen.described.leaves else set())
+
+    def _differs(self, x: np.ndarray, y: np.ndarray, size: float) -> bool:
+        """Whether a number, or a column of a matrix, has changed by more than rounding."""
+        if not x.size:
+            return False
+        own = np.abs(y).max(axis=0) if y.ndim == 2 else np.abs(y)
+        size = np.maximum(size, own + 1e-6 * np.abs(y).max())
+        return not bool(np.all(np.abs(x - y) <= self.tolerance * size))
+
+    def _judge_own(self, parameter: str, changes: set[str]) -> None:
+        if "own" in changes:
+            raise ValueError(
+                f"{self.name}: {parameter} belongs to a body that has columns of its own: leave it out of "
+                "`parameters`, or the body out of `bodies`."
+            )
+        if changes & {"Y", "right"}:
+            raise ValueError(
+                f"{self.name}: the equations of motion are not linear in {parameter} (beside the other columns): with "
+                "another value its column, or what is left on the right side, changes. A product of two parameters, as "
+                "of a stiffness and the angle at rest, is linear in one of them alone."
+            )
+
+    def _judge_of_body(self, parameter: str, changes: set[str]) -> None:
+        if "of bodies" in changes:
+            raise ValueError(
+                f"{self.name}: with another {parameter}, which moves no point but a mass centre, the weight by mass "
+                "changes: a gravity that is not uniform is not linear in a body's first moment. Leave the body out of "
+                "`bodies`."
+            )
+        # The right side may depend on lengths as it may, but on no mass.
+        if "mass" not in changes or not changes & {"Y", "tau"}:
+            return
+        raise ValueError(
+            f"{self.name}: {parameter} changes the parameters of a body, and loads beside them that are no weight at "
+            "the body's mass centre: the right side would depend on what is to be found. Write weights as "
+            "jk.weight(motion, gravity), give other loads, as friction that grows with the mass, parameters of their "
+            "own, or leave the body out of `bodies`."
+        )
+
+    def _check_weights(self, g: np.ndarray) -> None:
+        """A weight that is written as a number, of a mass that is one too, cannot be distinguished from other loads."""
+        weightless = ~np.any(g != 0, axis=1)
+        lone = [part.name for part, none in zip(self.chosen.described.parts, weightless, strict=True)
+                if none and part.has_number]  # fmt: skip
+        if lone and not weightless.all():
+            raise ValueError(
+                f"{self.name}: other bodies have a weight, and for {', '.join(lone)}, whose mass is a number in the "
+                "description, none is found: write jk.weight(motion, gravity), or leave it out of `bodies`."
+            )
+
+
+def regressor(
+    system: System,
+    t: Any,
+    q: Any,
+    u: Any,
+    u_dot: Any,
+    inputs: InputValues = None,
+    *,
+    bodies: Bodies = None,
+    parameters: Names = (),
+) -> Regressor:
+    """The equations of motion as a matrix Y times the parameters pi of rigid bodies, in which they are linear.
+
+        Y(t, q, u, u_dot) pi = tau
+
+    A body has ten: its mass `m`, its first moment `mx`, `my`, `mz` (mass times the place of its centre) and its inertia
+    `Ixx`, `Iyy`, `Izz`, `Ixy`, `Ixz`, `Iyz` (products as matrix entries), along the axes of its frame and about the
+    point of its frame from which its mass centre was built, as a joint; where there is none, the mass centre. Inertia
+    and weight are in Y: Y pi = -F*_r - (weights). All other loads are tau, on the right: torques, springs, friction,
+    and the inertia and weight of bodies that are not named. (Atkeson, An and Hollerbach 1986; Khalil and Dombre 2002.)
+
+    **Arguments:**
+
+    - `system`, `t`, `q`, `u`, `inputs`: as of `equations_of_motion`. `u_dot` (n,): accelerations of the independent
+        speeds, those of the motion or any others.
+    - `bodies`: names of those whose parameters are columns; by default all that have a mass. Or a dict that says which
+        of a body's parameters are: {"link2": ("m", "my", "Izz")}; the others have the system's values. A particle has
+        its mass alone; an axisymmetric body that spins in its frame has its mass, the first moment along the axis, and
+        two moments of inertia, along the axis and across it (`Iacross`).
+    - `parameters`: names, paths or functions to leaves of other parameters in which the equations are linear, as those
+        of dampers, springs, dry friction and rotors: columns too. What they do is not in tau any more.
+
+    **Returns:** a `Regressor`, under `jax.vmap` with leading axes. It is differentiable, and traced where its arguments
+    are. In the motion, and at the system's own values, Y pi - tau is zero; at other accelerations it is -(F_r + F*_r).
+
+    **Raises:** `ValueError` as `equations_of_motion`; for names that are none; for a parameter in which the equations
+    are not linear, or which belongs to a body of its own columns; where loads that are no weight at a body's mass
+    centre depend on its mass or inertia, so that tau would too.
+    """
+    chosen = chosen_of(system, bodies, parameters)
+    name = type(system).__name__
+    refuse_incomplete(system, q, u)
+    q = as_array(q, system.coordinates, f"{name}: q")
+    u = as_array(u, system.speeds, f"{name}: u")
+    u_dot = as_array(u_dot, system.speeds, f"{name}: u_dot").astype(q.dtype)
+    check_time(name, t)
+    t = jnp.asarray(t, q.dtype)
+    checked_values(system, inputs)
+    given = {name: jnp.asarray((inputs or {}).get(name, 0.0), q.dtype) for name in values_by_name(system)}
+    check_system(system, t, q)
+    check_linear(chosen, t, q)
+    return regressor_at(chosen, t, q, u, given, u_dot)[0]

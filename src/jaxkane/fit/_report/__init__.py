@@ -1,1 +1,0 @@
-"""What a fit looks like: tables, text, pictures, a page."""

@@ -1,0 +1,363 @@
+"""What a fit gives: estimates, how sure they are, and what the data do not determine; saved and loaded."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import importlib.metadata
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from .._common.files import differences
+from .._integrate.trajectory import Trajectory
+from .._system.system import System
+from . import _diagnostics as notes
+from . import _statistics as covariance
+from . import _statistics as residuals
+from ._block_lsq import Blocks
+from ._identifiability import Identifiability, identifiability_at
+from ._io import described, read_state, tree_of, write_state
+from ._linearize import STEP_TOLERANCE, Linearization, all_of, cost
+from ._model import Seen, Unknowns
+from ._parameters import Parameters
+from ._problem import Problem, refuse_other
+from ._statistics import ByTrial, ResidualTest, residual_test
+from ._tables import STATUS, nuisance_by_trial, summary, table, title
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Fit:
+    """The result of a fit; print it for a table, `jaxkane.fit.report(fit)` for more, and `jaxkane.fit.save_report(fit,
+    path)` for a page with pictures.
+
+    It holds numbers: to look at it simulates nothing and fits nothing.
+
+    - `system`: with the estimates in it. `estimates`, `start`: values by name. Gains and delays are among them.
+    - `standard_errors`: by name, formal: from the inverse of J^T J with the nuisance values eliminated, the data
+        counted by the residuals' variance and priors by their own deviations. They hold for independent residuals of
+        equal scaled size, and a right model.
+    - `clustered_errors`: by name, cluster-robust, for residuals that are correlated within a trial (jackknife, each
+        trial left out in turn, linearized). With fewer trials than parameters plus two: within a window that starts
+        freely; NaN with too few of both. `clusters` says which. `errors`: those of the two that intervals are from.
+    - `intervals(level)`: by name. `correlation` (p, p) of the estimates, in the order of `names`.
+    - `cost`: sum of squared residuals, with process noise minus twice the log likelihood; `history`: of the cost.
+        `status`, `message`: how it ended, in a word and in words.
+    - `identifiability`: singular values and directions of the sensitivity, and what the data do not determine.
+    - `residuals`: by trial and channel, (simulated - measured) / sigma (n_t,), NaN in gaps; `fitted`: simulated (n_t,).
+        With process noise: predicted, from all that was measured before, and the normalized innovations.
+        `tests`: by trial and channel, a `ResidualTest`. `variance_accounted_for`: by channel, over all trials.
+    - `nuisance`: by trial, values of the biases and of the windows' starts by name; with process noise, starts that
+        were given a deviation are part of the filter (`jaxkane.fit.smoothed`).
+    - `step_error`: by how much halving the step of integration moves the residuals.
+    - `failed`: by name, trials that could not be simulated and are not among these, with the reason (`applied_to`).
+    - `notes`: what a reader should know, in words.
+    """
+
+    problem: Problem
+    point: Unknowns
+    linearization: Linearization
+    step_errors: np.ndarray  # (W,), see `Problem.step_errors`
+    history: tuple[float, ...]
+    status: str
+    method: str
+    failed: Mapping[str, str] = dataclasses.field(default_factory=dict, hash=False)
+
+    @classmethod
+    def of(
+        cls, problem: Problem, point: Unknowns, at: Linearization, history: Sequence[float], status: str, method: str
+    ) -> Fit:
+        """The result at a point where the problem has been linearized.
+
+        With a fixed step of integration all windows are simulated once more, with half of it; not after Ctrl-C.
+        """
+        errors = np.full(len(problem.places), np.nan)
+        if status != "interrupted":
+            try:
+                errors = problem.step_errors(point, all_of(at.seen))
+            except KeyboardInterrupt:
+                status = "interrupted"
+        return cls(problem, point, at, errors, tuple(history), status, method)
+
+    @property
+    def parameters(self) -> Parameters:
+        return self.problem.parameters
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return self.parameters.names
+
+    @property
+    def cost(self) -> float:
+        return self.linearization.cost
+
+    @property
+    def variance(self) -> float:
+        """Of a residual: the data's sum of squares by residuals less the unknowns that they and not priors determine;
+        one where `sigma` and the model are right, NaN where nothing is left. With process noise it is taken to be one.
+        """
+        return self.identifiability.variance
+
+    @property
+    def innovation(self) -> float:
+        """The mean square of the normalized residuals; with process noise one where all noise is as it was taken."""
+        flat = np.concatenate([r for channels in self.residuals.values() for r in channels.values()])
+        return float(np.nanmean(flat**2))
+
+    @property
+    def system(self) -> System:
+        return self.parameters.apply(self.problem.system, self.point.x)[0]
+
+    @property
+    def start(self) -> dict[str, float]:
+        return dict(zip(self.names, np.asarray(self.parameters.start).tolist(), strict=True))
+
+    @property
+    def estimates(self) -> dict[str, float]:
+        return dict(zip(self.names, np.asarray(self.parameters.values(self.point.x)).tolist(), strict=True))
+
+    @functools.cached_property
+    def identifiability(self) -> Identifiability:
+        return identifiability_at(self.problem, self.point, self.linearization)
+
+    @property
+    def message(self) -> str:
+        words = STATUS[self.status]
+        if self.status == "converged" and not self.identifiability.ok:
+            words = "the cost has converged, but not every parameter is determined"
+        more = (*self.identifiability.messages, *notes.no_freedom(self), *notes.coarse_steps(self))
+        return "; ".join([words, *(note.rstrip(".") for note in more)])
+
+    @property
+    def ok(self) -> bool:
+        """Whether it converged, every parameter is determined, and the steps of integration are fine enough."""
+        return self.status == "converged" and self.identifiability.ok and not self.too_coarse
+
+    @property
+    def step_error(self) -> float:
+        """By how much halving the fixed step of integration moves all residuals together, in standard deviations: about
+        by as many of its standard errors an estimate can be off at most. NaN where the step follows from tolerances,
+        and after Ctrl-C."""
+        return float(np.linalg.norm(self.step_errors))
+
+    @property
+    def too_coarse(self) -> bool:
+        """Whether halving the fixed step moves all residuals together by more than a quarter of what noise does: by as
+        much of its standard errors an estimate may be off."""
+        noise = max(1.0, np.nan_to_num(self.variance, nan=1.0)) ** 0.5
+        return bool(self.step_error > noise * STEP_TOLERANCE[1])
+
+    @property
+    def singular_values(self) -> np.ndarray:
+        return self.identifiability.singular_values
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(p, p), in the parameters' units; NaN of parameters that are those of another fit (`applied_to`)."""
+        return self._of_estimates(self.identifiability.covariance)
+
+    def _of_estimates(self, covariance: np.ndarray) -> np.ndarray:
+        return np.full_like(covariance, np.nan) if self.status == "applied" else covariance
+
+    @property
+    def standard_errors(self) -> dict[str, float]:
+        return dict(zip(self.names, np.sqrt(self.covariance.diagonal()).tolist(), strict=True))
+
+    @functools.cached_property
+    def clustered_covariance(self) -> np.ndarray:
+        """(p, p), in the parameters' units, robust to residuals that are correlated within a trial, or a window: see
+        `clusters`."""
+        seen = self.identifiability
+        along = covariance.covariance_by_cluster(self.problem, self.point, self.linearization, seen.directions)
+        return self._of_estimates(seen.in_units(along))
+
+    @property
+    def clustered_errors(self) -> dict[str, float]:
+        return dict(zip(self.names, np.sqrt(self.clustered_covariance.diagonal()).tolist(), strict=True))
+
+    @property
+    def robust(self) -> bool:
+        """Whether `errors` are the cluster-robust ones: residuals are no noise, and trials or windows are enough."""
+        return bool(self.clusters[1] and abs(self.autocorrelation) > residuals.CORRELATED)
+
+    @property
+    def errors(self) -> dict[str, float]:
+        """Those of all intervals: the cluster-robust ones where `robust`, else the formal ones."""
+        return self.clustered_errors if self.robust else self.standard_errors
+
+    @property
+    def clusters(self) -> tuple[str, int]:
+        """Within what the cluster-robust errors take residuals to be correlated, "trial" or "window", and how many
+        there are; ("", 0) where there are too few."""
+        return covariance.clusters_of(self.problem)
+
+    @property
+    def freedom(self) -> float:
+        """Degrees of freedom of all intervals: trials (or windows) less one where `robust`, else residuals less the
+        unknowns that they and not priors determine."""
+        return self.clusters[1] - 1 if self.robust else self.identifiability.freedom
+
+    def quantile(self, level: float = 0.95) -> float:
+        """Of Student's distribution, two-sided, with as many degrees of freedom as `freedom`."""
+        return covariance.t_quantile(level, self.freedom)
+
+    def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Confidence intervals by name, inside a parameter's bounds: symmetric in the free numbers.
+
+        From `errors`; `freedom` says with how many degrees.
+
+        **Raises:** `ValueError` for a level that is not between 0 and 1.
+        """
+        half = self.quantile(level) * np.array(list(self.errors.values()))
+        return dict(zip(self.names, covariance.intervals(self.parameters, self.point.x, half), strict=True))
+
+    @property
+    def correlation(self) -> np.ndarray:
+        deviation = np.sqrt(self.covariance.diagonal())
+        with np.errstate(invalid="ignore"):
+            return self.covariance / np.outer(deviation, deviation)
+
+    @functools.cached_property
+    def fitted(self) -> ByTrial:
+        return residuals.by_trial(self.problem, np.asarray(self.linearization.simulated))
+
+    @functools.cached_property
+    def residuals(self) -> ByTrial:
+        deviation = self.linearization.seen.deviation
+        known = None if deviation is None else residuals.by_trial(self.problem, np.asarray(deviation))
+        return residuals.scaled_residuals(self.problem, self.fitted, known)
+
+    @functools.cached_property
+    def tests(self) -> dict[str, dict[str, ResidualTest]]:
+        return {
+            name: {
+                channel: residual_test(trial.measured[channel], self.fitted[name][channel], r)
+                for channel, r in self.residuals[name].items()
+            }
+            for name, trial in zip(self.trial_names, self.problem.trials, strict=True)
+        }
+
+    @property
+    def variance_accounted_for(self) -> dict[str, float]:
+        return residuals.variance_accounted_for(self.problem, self.fitted)
+
+    @functools.cached_property
+    def autocorrelation(self) -> float:
+        """Of neighbouring residuals, over all channels, each weighted by its size."""
+        every = (r for channels in self.residuals.values() for r in channels.values())
+        return float(residuals.autocorrelations(every, 1)[0])
+
+    @property
+    def trial_names(self) -> tuple[str, ...]:
+        """Names of the trials, numbered where they repeat."""
+        return residuals.trial_names(self.problem)
+
+    @property
+    def nuisance(self) -> dict[str, dict[str, Any]]:
+        return nuisance_by_trial(self.problem, self.point, self.linearization.seen)
+
+    @functools.cached_property
+    def notes(self) -> tuple[str, ...]:
+        """What a reader should know, in words."""
+        return notes.notes_of(self)
+
+    def save(self, path: str | os.PathLike[str]) -> Path:
+        """Write the numbers of this fit to one file, whole or not at all; `jaxkane.fit.load(path, problem)` reads it.
+
+        **Returns:** the path.
+        """
+        path, versions = Path(path).expanduser(), ("jaxkane", "jax", "diffrax")
+        key = {
+            "fit": {"status": self.status, "method": self.method, "failed": dict(self.failed)},
+            "versions": ", ".join(f"{name} {importlib.metadata.version(name)}" for name in versions),
+            **described(self.problem),
+        }
+        at, step = self.linearization, self.problem.windows.step
+        numbers = {"R": at.blocks.R, "seen": at.seen, "step_errors": self.step_errors}
+        write_state(path, key, {"point": self.point, "step": step, "history": np.array(self.history), **numbers})
+        return path
+
+    def table(self, truth: Mapping[str, float] | System | None = None) -> str:
+        """Name, start, estimate and standard error of every parameter; and the truth, where it is known."""
+        return table(self, truth)
+
+    def __str__(self) -> str:
+        return summary(self)
+
+    @property
+    def title(self) -> str:
+        """How much was fitted, in a line."""
+        return title(self)
+
+    __repr__ = __str__
+
+
+SAME_COST = 1e-6
+"""By what part of it the cost may differ where the code has changed since."""
+
+
+def load(path: str | os.PathLike[str], problem: Problem) -> Fit:
+    """A fit that `Fit.save` has written.
+
+        problem = Problem.of(system, trials, free, unknown=("roll",))  # as it was posed
+        result = load("fit.npz", problem)
+
+    A file holds numbers only: no code, and no trials. `problem` is posed again from the same system, trials and
+    options (for `fit_bicycle` by `bicycle_problem`); steps of integration that the fit has chosen come from the file.
+    Where the code has changed since (the system's, jaxkane's or JAX's), the cost is computed anew, and a fit that no
+    longer has it is refused.
+
+    **Returns:** the same `Fit`: what it says are the numbers of the one that was saved.
+
+    **Raises:** `ValueError` that says in what the problem differs, that the code gives another cost, or that the file
+    is damaged; `FileNotFoundError`.
+    """
+    refuse_other(problem, Problem, "load", "load(path, Problem.of(system, trials, free))")
+    path = Path(path).expanduser()
+    there, arrays = read_state(path)
+    of_fit: dict[str, Any] = there.pop("fit", {})
+    if not of_fit:
+        raise ValueError(f"{path} is the checkpoint of a fit, not a fit that was saved: give it as `checkpoint=`.")
+    step = tree_of(path, arrays, "step", problem.windows.step)
+    if problem.chooses_steps and step.shape == problem.windows.step.shape:
+        problem = problem.with_steps(step)
+    here = described(problem)
+    wrong = differences(*({key: d[key] for key in d if key not in ("program", "versions")} for d in (there, here)))
+    if wrong:
+        raise ValueError(f"{path} is the fit of another problem. It differs in {wrong}. Pose the problem as it was.")
+    like: dict[str, Any] = {"point": problem.start, "R": 0.0, "step_errors": 0.0, "history": 0.0}
+    there_too = jnp.zeros(()) if problem.model.noise is not None else None
+    like["seen"] = Seen(jnp.zeros(()), jnp.zeros(()), there_too, there_too, there_too)
+    found = {name: tree_of(path, arrays, name, tree) for name, tree in like.items()}
+    point, n_z, n_b = found["point"], found["point"].z.shape[1], found["point"].b.shape[1]
+    blocks = Blocks(found["R"], problem.by_trial, n_z, n_z if problem.model.nuisance.chained else 0, n_b)
+    at = Linearization(blocks, found["seen"])
+    if there["program"] != here["program"]:
+        _refuse_changed(path, problem, point, at, there["versions"])
+    errors, history = np.asarray(found["step_errors"]), tuple(float(c) for c in found["history"])
+    return Fit(problem, point, at, errors, history, of_fit["status"], of_fit["method"], of_fit["failed"])
+
+
+def _refuse_changed(path: Path, problem: Problem, point: Unknowns, at: Linearization, versions: str) -> None:
+    """`ValueError` where what the code computes today is not what was computed for the fit."""
+    now = cost(problem, point)
+    if not abs(now - at.cost) <= SAME_COST * at.squares:
+        raise ValueError(
+            f"{path}: the code has changed since this fit was saved (by {versions}), and {problem.cost_name} with it: "
+            f"{at.cost:.6g} then, {now:.6g} now. Fit anew, from `start=` if you like, or go back to that code."
+        )
+
+
+def trajectories(fit: Fit) -> list[tuple[str, Trajectory]]:
+    """The fitted motion of every window, with the name of its trial, in their order.
+
+    **Raises:** `ValueError` for a fit with process noise, whose motion is no simulation.
+    """
+    if fit.problem.model.noise is not None:
+        raise ValueError("trajectories: process noise disturbs this fit's motion, which `smoothed(fit)` gives.")
+    rides = fit.problem.trajectories(fit.point)
+    return [(fit.trial_names[k], ride) for (k, _, _), ride in zip(fit.problem.places, rides, strict=True)]

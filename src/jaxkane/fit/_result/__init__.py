@@ -1,1 +1,0 @@
-"""What a fit found: estimates, errors, identifiability, tests of the residuals. Numbers only."""

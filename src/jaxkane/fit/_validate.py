@@ -1,0 +1,186 @@
+"""Parameters on trials that they were not estimated from: cross validation."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+
+from ._model import Unknowns
+from ._optimize import Unsimulated, minimize, solve_nuisance, uninterrupted
+from ._optimizers import LeastSquares
+from ._problem import Problem, refuse_other
+from ._result import Fit
+from ._statistics import trial_names
+from ._trial import Trial
+
+
+def applied_to(fit: Fit, trials: Sequence[Trial] | Trial) -> Fit:
+    """The parameters of a fit on other trials, of which only starts and biases are found (held-out data).
+
+        jk.fit.applied_to(result, others).variance_accounted_for
+
+    **Returns:** a `Fit` of these trials, with the status "applied": its `cost`, `variance_accounted_for`, `tests` and
+    report are those of these trials; its parameters were not fitted to them, and have no errors here (NaN). Trials that
+    cannot be simulated with these parameters are left out: `failed` says by name why, and so do the `notes`.
+
+    **Raises:** `ValueError` as `fit` does, for trials that do not suit the system, and where none can be simulated.
+    """
+    refuse_other(fit, Fit, "applied_to", "applied_to(fit(...), trials)")
+    problem, failed = fit.problem.with_trials(trials), {}
+    names = trial_names(problem)
+    while True:
+        first = dataclasses.replace(problem.start, x=fit.point.x)
+        if problem.chooses_steps:
+            problem = problem.finer(first)
+        try:
+            point, at = solve_nuisance(problem, first, steps=20, rtol=1e-6)
+            break
+        except Unsimulated as error:
+            failed |= {names[k]: words for k, words in error.reasons.items()}
+            kept = [k for k in range(len(names)) if k not in error.reasons]
+            if not kept:
+                words = next(iter(failed.items()))
+                raise ValueError(
+                    f"None of these trials can be simulated with these parameters: {words[0]}, {words[1]}."
+                ) from None
+            problem, names = fit.problem.with_trials([problem.trials[k] for k in kept]), [names[k] for k in kept]
+    try:
+        before = solve_nuisance(problem, problem.start)[1].cost
+    except Unsimulated:  # with the initial guesses, which is no fault of the fit
+        before = float("nan")
+    return dataclasses.replace(Fit.of(problem, point, at, (before, at.cost), "applied", fit.method), failed=failed)
+
+
+@dataclasses.dataclass(frozen=True)
+class CrossValidation:
+    """Trials left out in turn: sums of squares of each, its own starts and biases found with the parameters held; of
+    fits with process noise, minus twice the log likelihoods.
+
+    - `trials`: their names; `n`: numbers of residuals; `at_start`, `fitted`, `held_out` (T,): with the parameters of
+        the start, of the fit of all, and of the fit of the others; infinite where these cannot simulate a trial.
+    - `spread` (T,): sums of squares of the measurements about the mean of each channel, in their `sigma`.
+    - `estimates`: by parameter, of each fold.
+    """
+
+    trials: tuple[str, ...]
+    n: np.ndarray
+    at_start: np.ndarray
+    fitted: np.ndarray
+    held_out: np.ndarray
+    spread: np.ndarray
+    estimates: dict[str, np.ndarray]
+    cost_name: str = "sum of squares"
+
+    @property
+    def score(self) -> float:
+        """1 - held out / spread, over all trials: the share of the measurements' variance that parameters found from
+        other trials account for (the predictive R^2; one is perfect, below zero is worse than a constant). The initial
+        guess has no part in it. NaN of likelihoods, which have no zero."""
+        if self.cost_name != "sum of squares":
+            return float("nan")
+        return float(1 - self.held_out.sum() / self.spread.sum())
+
+    @property
+    def verdict(self) -> str:
+        """How well trials are predicted that a fit has not seen, in words."""
+        lost = [name for name, cost in zip(self.trials, self.held_out, strict=True) if not np.isfinite(cost)]
+        if lost:
+            return f"{', '.join(lost)} cannot be simulated with the parameters of the others."
+        if self.cost_name != "sum of squares":
+            less = self.at_start.sum() - self.held_out.sum()
+            return f"held out, the {self.cost_name} of all is {less:.4g} below that of the start."
+        return f"held-out score: {100 * self.score:.1f} % of the measurements' variance is accounted for."
+
+    def __str__(self) -> str:
+        lines = [f"{'trial':<28}{'residuals':>10}{'spread':>12}{'start':>12}{'fitted':>12}{'held out':>12}"]
+        columns = (self.n, self.spread, self.at_start, self.fitted, self.held_out)
+        rows = [*zip(self.trials, *columns, strict=True), ("all", *(column.sum() for column in columns))]
+        lines += [f"{name:<28}{n:>10}" + "".join(f"{x:>12.5g}" for x in costs) for name, n, *costs in rows]
+        lines.append(self.verdict)
+        return "\n".join(lines)
+
+
+def cross_validate(fit: Fit, folds: int | Sequence[Sequence[int]] | None = None) -> CrossValidation:
+    """Cross-validation: fit some of the trials, and predict the others with the parameters that were found.
+
+    **Arguments:** `folds`: how many, or the numbers of the trials that are left out together; by default each trial
+    alone, and five folds from eleven trials on.
+
+    **Raises:** `ValueError` with fewer than two trials.
+    """
+    refuse_other(fit, Fit, "cross_validate", "cross_validate(fit(...))")
+    T = len(fit.problem.trials)
+    if T < 2:
+        raise ValueError("Leaving trials out needs two at least: cut a long one with `Trial.between`.")
+    if folds is None:
+        folds = T if T <= 10 else 5
+    groups = folds_of(folds, T)
+    held, estimates = np.full(T, np.nan), {name: [] for name in fit.names}
+    for group in groups:
+        others = fit.problem.only(set(range(T)) - set(group))
+        found = uninterrupted(minimize(others, LeastSquares(), start=fit.point))
+        held[group] = costs_by_trial(fit.problem, found.point)[group]
+        for name, value in found.estimates.items():
+            estimates[name].append(value)
+    owner = np.asarray(fit.problem.windows.trial)
+    counts = np.asarray(jnp.sum(fit.problem.windows.weight > 0, axis=(1, 2)))
+    return CrossValidation(
+        trials=fit.trial_names,
+        n=np.array([counts[owner == k].sum() for k in range(T)]),
+        at_start=costs_by_trial(fit.problem, fit.problem.start),
+        fitted=costs_by_trial(fit.problem, fit.point),
+        held_out=held,
+        spread=spread_by_trial(fit.problem),
+        estimates={name: np.array(values) for name, values in estimates.items()},
+        cost_name=fit.problem.cost_name,
+    )
+
+
+def folds_of(folds: int | Sequence[Sequence[int]], T: int) -> list[list[int]]:
+    if isinstance(folds, int):
+        if not 2 <= folds <= T:
+            raise ValueError(f"`folds`: {T} trials can be left out in 2 to {T} parts, not in {folds}.")
+        return [list(range(k, T, folds)) for k in range(folds)]
+    groups = [[int(k) for k in group] for group in folds]
+    if sorted(k for group in groups for k in group) != list(range(T)) or not all(groups) or len(groups) < 2:
+        raise ValueError(f"`folds` must leave out each of the trials 0 to {T - 1} once, in two groups at least.")
+    return groups
+
+
+def costs_by_trial(problem: Problem, point: Unknowns) -> np.ndarray:
+    """Sums of squares (T,) with these parameters, starts and biases found for them.
+
+    With the priors of a trial's starts and biases, and without those of the parameters, which belong to no trial.
+    Infinite of trials that cannot be simulated.
+    """
+    windows = eqx.tree_at(lambda w: w.very_first, problem.windows, jnp.zeros_like(problem.windows.very_first))
+    problem = dataclasses.replace(problem, windows=windows)
+    try:
+        _, at = solve_nuisance(problem, point, rtol=1e-5)
+    except Unsimulated as error:
+        costs, kept = np.full(len(problem.trials), np.inf), np.delete(np.arange(len(problem.trials)), [*error.reasons])
+        if kept.size:
+            others = problem.with_trials([problem.trials[k] for k in kept])
+            costs[kept] = costs_by_trial(others, dataclasses.replace(others.start, x=point.x))
+        return costs
+    value = at.seen.value
+    costs = np.sum(np.asarray(at.blocks.R)[:, :, -1] ** 2, axis=1) if value is None else np.asarray(value)
+    return np.bincount(np.asarray(problem.windows.trial), costs, minlength=len(problem.trials))
+
+
+def spread_by_trial(problem: Problem) -> np.ndarray:
+    """Sums of squares (T,) of the measurements about the mean of each channel, in their standard deviations: what a
+    constant leaves of them."""
+    windows, owner = problem.windows, np.asarray(problem.windows.trial)
+    y, weight = np.asarray(windows.measured), np.asarray(windows.weight) ** 2  # (W, n_c, n_t)
+    spread = []
+    for k in range(len(problem.trials)):
+        y_k, w_k = y[owner == k], weight[owner == k]
+        total = w_k.sum(axis=(0, 2), keepdims=True)
+        mean = np.sum(w_k * y_k, axis=(0, 2), keepdims=True) / np.where(total > 0, total, 1.0)
+        spread.append(np.sum(w_k * (y_k - mean) ** 2))
+    return np.array(spread)

@@ -1,0 +1,202 @@
+"""Trials cut into windows of one shape, with zero weight where there is nothing. Knows arrays; knows no dynamics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .._system.system import System
+from ._trial import Trial
+
+Reach = tuple[float, float]
+"""By how much inputs may act late and early [s]."""
+
+Place = tuple[int, int, int]
+"""Of a window: trial, first sample, number of samples."""
+
+
+class Windows(eqx.Module):
+    """All windows of all trials, stacked; a short one repeats its last time with weight zero.
+
+    - `t` (W, n_t) [s]; where windows are chained, the last is the next window's first.
+    - `measured`, `weight` (W, n_c, n_t): samples, and 1/sigma or zero.
+    - `t_input` (W, n_in) [s], `inputs` (W, inputs, n_in): samples of the inputs, from before and after too where they
+      are delayed. At most `n_acting` of them act within a window.
+    - `step` (W,) [s]: of the integration. `start`, `next_start` (W, n_q + n_u + n_x): the start as far as it is known
+        or measured, and that of the next window.
+    - `linked` (W,): one where the next window goes on from this one, else zero.
+    - `trial` (W,): whose window it is; `first` (W,): whether it is its trial's first, `very_first` of all.
+    """
+
+    t: Float[Array, "W n_t"]
+    measured: Float[Array, "W n_c n_t"]
+    weight: Float[Array, "W n_c n_t"]
+    t_input: Float[Array, "W n_in"]
+    inputs: Float[Array, "W inputs n_in"]
+    step: Float[Array, " W"]
+    start: Float[Array, "W n"]
+    next_start: Float[Array, "W n"]
+    linked: Float[Array, " W"]
+    trial: Int[Array, " W"]
+    first: Bool[Array, " W"]
+    very_first: Bool[Array, " W"]
+    n_acting: int = eqx.field(static=True)
+
+    def acting(self, delay: Array | float) -> tuple[Array, Array]:
+        """Of one window: the times (n,) [s] at which samples act that are late by `delay` [s], and samples (inputs, n).
+
+        What acts long before or after the window is left out: a signal costs as much as it has samples.
+        """
+        times = self.t_input + delay
+        if self.n_acting == times.shape[0]:
+            return times, self.inputs
+        first = jnp.maximum(jnp.searchsorted(times, self.t[0] - self.step, side="right") - 1, 0)
+        chosen = lambda x: jax.lax.dynamic_slice_in_dim(x, first, self.n_acting, axis=-1)  # noqa: E731
+        return chosen(times), chosen(self.inputs)
+
+    @property
+    def by_trial(self) -> Array:
+        """The windows of every trial (T, m), padded with W."""
+        owner = np.asarray(self.trial)
+        own = [np.flatnonzero(owner == k) for k in range(owner.max() + 1)]
+        most = max(map(len, own))
+        return jnp.asarray([np.append(i, np.full(most - len(i), len(owner))) for i in own], dtype=jnp.int32)
+
+
+def cut(
+    system: System,
+    trials: Sequence[Trial],
+    window: float | None,
+    channels: Sequence[str],
+    *,
+    chained: bool = False,
+    reach: Reach | None = None,
+    step: float | None = None,
+    guess: Mapping[str, float] | None = None,
+) -> tuple[Windows, tuple[Place, ...]]:
+    """Windows of `window` [s], or one a trial; and the place of each.
+
+    A last piece shorter than half a window is joined to the one before, a lone sample to what follows. `reach`: of
+    delays, None where there are none. `step` [s]: of the integration, by default that of the samples. `guess`: by name,
+    where coordinates start of which nothing is known, if not at zero.
+    """
+    places = [(k, i, n) for k, trial in enumerate(trials) for i, n in _pieces(trial, window, chained)]
+    if not chained:  # a window without one measurement would only add unknowns
+        places = [place for place in places if any(np.isfinite(_take(trials, place, c)).any() for c in channels)]
+    linked = [chained and place[0] == after[0] for place, after in zip(places, [*places[1:], (-1, 0, 0)], strict=True)]
+    n_t = max(n + more for (_, _, n), more in zip(places, linked, strict=True))
+    found: dict[str, list[np.ndarray]] = {key: [] for key in ("t", "measured", "weight", "t_input", "inputs", "step")}
+    kept: list[tuple[int, int]] = []  # the first sample of the inputs, and the one behind the last
+    for (k, i, n), more in zip(places, linked, strict=True):
+        trial, last = trials[k], i + n - 1 + more
+        found["t"].append(trial.t[np.minimum(np.arange(i, i + n_t), last)])
+        between, lasts = np.median(np.diff(trial.t[i : last + 1])), trial.t[last] - trial.t[i]
+        found["step"].append(between if step is None else min(step, lasts))  # no longer, so that it can be halved
+        kept.append((i, last + 1) if reach is None else _reached(trial.t, i, last, reach, float(found["step"][-1])))
+        y = np.stack([_take(trials, (k, i, n), c) for c in channels])  # (n_c, n)
+        sigma = np.stack([trial.sigma.get(c, np.ones_like(trial.t))[i : i + n] for c in channels])
+        seen = np.isfinite(y)
+        found["measured"].append(_fill(np.where(seen, y, 0.0), n_t))
+        found["weight"].append(_fill(np.where(seen, 1.0 / sigma, 0.0), n_t))
+    n_in = max(stop - begin for begin, stop in kept)
+    for (k, _, _), (begin, _), h in zip(places, kept, found["step"], strict=True):
+        trial, wanted = trials[k], np.arange(begin, begin + n_in)
+        there = np.minimum(wanted, len(trial.t) - 1)
+        found["t_input"].append(trial.t[there] + h * (wanted - there))  # what lies outside takes the last sample
+        rows = [trial.inputs.get(name, np.zeros_like(trial.t))[there] for name in system.inputs]
+        found["inputs"].append(np.array(rows).reshape(len(system.inputs), n_in))
+    names = state_names(system)
+    guesses = [(guess or {}).get(name, 0.0) for name in names]
+    pairs = tuple(zip(names, guesses, strict=True))
+    start = np.array([[_start(trials[k], i, n, *pair) for pair in pairs] for k, i, n in places])
+    owner = np.array([k for k, _, _ in places])
+    span = np.ptp(found["t"], axis=1) + 2 * np.array(found["step"])
+    longest = {k: span[owner == k].max() for k in owner.tolist()}
+    array = lambda x: jnp.asarray(np.array(x), dtype=jnp.result_type(float))  # noqa: E731
+    windows = Windows(
+        **{key: array(value) for key, value in found.items()},
+        start=array(start),
+        next_start=array(np.append(start[1:], start[-1:], axis=0)),
+        linked=array(np.array(linked, float)),
+        trial=jnp.asarray(owner, dtype=jnp.int32),
+        first=jnp.asarray(np.append(True, owner[1:] != owner[:-1])),
+        very_first=jnp.asarray(np.arange(len(owner)) == 0),
+        n_acting=min(n_in, max(_most_within(trials[k].t, lasts) for k, lasts in longest.items())),
+    )
+    return windows, tuple(places)
+
+
+def state_names(system: System) -> tuple[str, ...]:
+    """Of what a motion starts with: coordinates, independent speeds and states of the first order."""
+    return (*system.coordinates, *system.speeds, *system.states)
+
+
+def _pieces(trial: Trial, window: float | None, chained: bool) -> list[tuple[int, int]]:
+    """First sample and number of samples of every window of a trial."""
+    t = trial.t
+    if window is None:
+        return [(0, len(t))]
+    # A sample at the end of a window belongs to the next; a little slack lets 0.1 + 0.2 be 0.3.
+    number = np.floor((t - t[0]) / window + 1e-9).astype(int)
+    starts = np.flatnonzero(np.append(True, np.diff(number) > 0))
+    if len(starts) > 1 and (t[-1] - t[starts[-1]] < 0.5 * window or starts[-1] == len(t) - 1):
+        starts = starts[:-1]
+    if not chained:  # one sample says nothing about motion, unless the next window goes on from it
+        between = np.median(np.diff(t))
+        if window < between * (1 - 1e-9):
+            raise ValueError(
+                f"{trial.name}: its times are {between:.6g} s apart, so a `window` of {window:.6g} s holds one sample, "
+                "from which no motion follows. Give a longer one, or bind the windows together by `continuity`."
+            )
+        starts = np.array(_without_lone(starts.tolist(), len(t)))
+    return [(int(i), int(n)) for i, n in zip(starts, np.diff(np.append(starts, len(t))), strict=True)]
+
+
+def _without_lone(starts: list[int], n: int) -> list[int]:
+    """Where windows begin, of which each has two samples at least: one alone is joined to what follows."""
+    kept = [0]
+    for start in starts[1:]:
+        if start - kept[-1] > 1 and start < n - 1:
+            kept.append(start)
+    return kept
+
+
+def _reached(t: np.ndarray, i: int, last: int, reach: Reach, step: float) -> tuple[int, int]:
+    """The first of a trial's samples that may act within a window, and the one behind the last."""
+    late, early = reach
+    begin = np.searchsorted(t, t[i] - late - step, side="right") - 1
+    stop = np.searchsorted(t, t[last] + early + step) + 1
+    return max(int(begin), 0), min(int(stop), len(t))
+
+
+def _most_within(t: np.ndarray, lasts: float) -> int:
+    """How many samples act within a time [s] that may begin anywhere, with the last before it and the first after."""
+    return int(np.max(np.searchsorted(t, t + lasts * (1 + 1e-9), side="right") - np.arange(len(t)))) + 2
+
+
+def _take(trials: Sequence[Trial], place: Place, channel: str) -> np.ndarray:
+    """Samples (n,) of one window, NaN where the trial has no such channel."""
+    k, i, n = place
+    return trials[k].measured.get(channel, np.full_like(trials[k].t, np.nan))[i : i + n]
+
+
+def _fill(rows: np.ndarray, n_t: int) -> np.ndarray:
+    """(n, some) to (n, n_t) by zeros."""
+    return np.pad(rows, ((0, 0), (0, n_t - rows.shape[1])))
+
+
+def _start(trial: Trial, i: int, n: int, name: str, guess: float) -> float:
+    """What is known of a coordinate or speed where a window starts, else its first measurement there, else a guess."""
+    if name in trial.initial:
+        return float(trial.initial[name][i])
+    if name in trial.measured:
+        seen = trial.measured[name][i : i + n]
+        seen = seen[np.isfinite(seen)]
+        if seen.size:
+            return float(seen[0])
+    return guess

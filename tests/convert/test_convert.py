@@ -1,0 +1,345 @@
+"""MJCF and URDF files brought over, held to MuJoCo's own accelerations. Without MuJoCo most are skipped."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+
+RTOL = 1e-10
+FIGURES = json.loads((Path(__file__).parents[1] / "data" / "mujoco_tree.json").read_text())
+needs_mujoco = pytest.mark.skipif(importlib.util.find_spec("mujoco") is None, reason="needs MuJoCo: pip install mujoco")
+
+ELBOW = """<robot name="elbow">
+ <link name="upper"><inertial><mass value="0.37"/>
+  <inertia ixx="6e-4" ixy="1e-5" ixz="0" iyy="6.2e-4" iyz="0" izz="5e-4"/></inertial>
+  <visual><geometry><mesh filename="package://nowhere/upper.stl"/></geometry></visual></link>
+ <link name="lower"><inertial><origin xyz="0.035 0 0" rpy="0.1 0.2 0.3"/><mass value="0.3"/>
+  <inertia ixx="6e-4" ixy="0" ixz="0" iyy="6e-4" iyz="0" izz="7e-4"/></inertial></link>
+ <link name="tool.tip"/>
+ <joint name="elbow" type="continuous"><parent link="upper"/><child link="lower"/>
+  <origin xyz="-0.035 0.06 0" rpy="0 0.5 0"/><axis xyz="0 1 0"/><dynamics damping="0.02"/></joint>
+ <joint name="flange" type="fixed"><parent link="lower"/><child link="tool.tip"/><origin xyz="0.1 0 0"/></joint>
+ <drake:collision_filter_group name="g"/>
+</robot>"""
+
+LOOP = """<mujoco model="fourbar"><option><flag contact="disable"/></option><worldbody>
+ <body name="a"><joint name="j1" axis="0 1 0" damping="0.1"/><geom type="capsule" fromto="0 0 0 0 0 0.3" size=".02"/>
+  <body name="b" pos="0 0 0.3"><joint name="j2" axis="0 1 0" armature="0.01"/>
+   <geom type="capsule" fromto="0 0 0 0.5 0 0.1" size=".02"/></body></body>
+ <body name="c" pos="0.5 0 0"><joint name="j3" axis="0 1 0"/>
+  <geom type="capsule" fromto="0 0 0 0 0 0.4" size=".02"/></body>
+</worldbody><equality><connect name="pin" body1="b" body2="c" anchor="0.5 0 0.1"/></equality></mujoco>"""
+
+BODY = '<body name="a"><joint name="j" axis="0 1 0"{}/><geom size=".1" mass="1"/></body>'
+
+
+@pytest.fixture(autouse=True)
+def in_a_folder_of_its_own(tmp_path, monkeypatch):
+    """MuJoCo writes a log of what it does not read where it is called."""
+    monkeypatch.chdir(tmp_path)
+
+
+def mjcf(body, rest=""):
+    return f"<mujoco><worldbody>{body}</worldbody>{rest}</mujoco>"
+
+
+@needs_mujoco
+def test_a_file_is_the_tree_that_stands_in_it():
+    system = jk.convert.from_mjcf(FIGURES["model"], strict=True)  # nothing is left out
+    assert type(system).__name__ == "tree"
+    assert set(system.mass) == {"base", "arm", "hand", "plate", "leg"}
+    assert system.inputs == ("turn", "extend_input", "hip", "twist")  # `extend` is a coordinate
+    for state in FIGURES["states"]:
+        inputs = dict(zip(system.inputs, state["inputs"], strict=True))
+        u_dot = jk.accelerations(system, 0.0, np.array(state["q"]), np.array(state["u"]), inputs)
+        np.testing.assert_allclose(u_dot, state["u_dot"], rtol=RTOL, atol=RTOL * np.abs(state["u_dot"]).max())
+
+
+@needs_mujoco
+def test_a_file_is_read_by_its_path_and_sites_are_points(tmp_path):
+    path = tmp_path / "tree.xml"
+    path.write_text(FIGURES["model"])
+    system = jk.convert.from_mjcf(path)
+    assert type(system) is type(jk.convert.from_mjcf(FIGURES["model"]))
+    import mujoco
+
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data, state = mujoco.MjData(model), FIGURES["states"][0]
+    q = np.array(state["q"])
+    data.qpos[:] = q
+    for start in (3, 9):  # Euler parameters: MuJoCo has the scalar first
+        data.qpos[start : start + 4] = np.roll(q[start : start + 4], 1)
+    mujoco.mj_kinematics(model, data)
+    tip = system.motion(0.0, q, np.zeros(len(system.speeds)))["tip"].position
+    np.testing.assert_allclose(tip.to(tip.frame.root), data.site("tip").xpos, rtol=1e-12)
+
+
+@needs_mujoco
+@pytest.mark.parametrize("floating", [True, False])
+def test_a_urdf_with_and_without_a_base_that_flies(floating):
+    import mujoco
+
+    system = jk.convert.from_urdf(ELBOW, floating=floating, strict=True)
+    assert set(system.mass) == ({"upper", "lower"} if floating else {"lower"})
+    assert "tool_tip" in system.motion(0.0, [0.1] * len(system.coordinates), [0.0] * len(system.speeds)).points
+    base = '<body name="upper"><freejoint/>' if floating else '<body name="upper">'
+    text = f"""<mujoco><compiler angle="radian" eulerseq="XYZ"/><worldbody>{base}
+     <inertial pos="0 0 0" mass="0.37" fullinertia="6e-4 6.2e-4 5e-4 1e-5 0 0"/>
+     <body name="lower" pos="-0.035 0.06 0" euler="0 0.5 0"><joint axis="0 1 0" damping="0.02"/>
+      <inertial pos="0.035 0 0" euler="0.1 0.2 0.3" mass="0.3" diaginertia="6e-4 6e-4 7e-4"/></body>
+    </body></worldbody></mujoco>"""
+    model = mujoco.MjModel.from_xml_string(text)
+    data, rng = mujoco.MjData(model), np.random.default_rng(0)
+    mujoco.mj_integratePos(model, data.qpos, rng.normal(size=model.nv), 1.0)
+    data.qvel[:] = rng.normal(size=model.nv)
+    mujoco.mj_forward(model, data)
+    q = np.array(data.qpos)
+    if floating:
+        q[3:7] = np.roll(q[3:7], -1)
+    np.testing.assert_allclose(jk.accelerations(system, 0.0, q, data.qvel), data.qacc, rtol=RTOL, atol=RTOL)
+
+
+@needs_mujoco
+def test_a_loop_is_closed_rigidly():
+    import mujoco
+
+    system = jk.convert.from_mjcf(LOOP, dependent=("j2", "j3"))
+    state = jk.assemble(system, {"j1": 0.3}, {"j1_rate": 1.2})
+    rates = jk.speed_rates(system, 0.0, state.q, state.u)
+    model = mujoco.MjModel.from_xml_string(LOOP)
+    data = mujoco.MjData(model)
+    data.qpos[:] = state.q
+    data.qvel[:] = [1.2, *jk.dependent_speeds(system, 0.0, state.q, state.u)]
+    mujoco.mj_forward(model, data)
+    J, J_dot = np.zeros((2, 3, 3)), np.zeros((2, 3, 3))
+    for k, (body, anchor) in enumerate(
+        zip((model.eq_obj1id[0], model.eq_obj2id[0]), model.eq_data[0].reshape(-1)[:6].reshape(2, 3))
+    ):
+        place = data.xpos[body] + data.xmat[body].reshape(3, 3) @ anchor
+        mujoco.mj_jac(model, data, J[k], None, place, body)
+        mujoco.mj_jacDot(model, data, J_dot[k], None, place, body)
+    J, J_dot = (J[0] - J[1])[[0, 2]], (J_dot[0] - J_dot[1])[[0, 2]]
+    M = np.zeros((3, 3))
+    for column, unit in zip(M, np.eye(3)):
+        mujoco.mj_mulM(model, data, column, unit)
+    # M a = f + J^T lambda, J a = -J_dot v: the connection without the softness that MuJoCo gives it
+    whole = np.block([[M, J.T], [J, np.zeros((2, 2))]])
+    expected = np.linalg.solve(whole, [*(M @ data.qacc_smooth), *(-J_dot @ data.qvel)])[:3]
+    np.testing.assert_allclose([rates[f"j{i}_rate"] for i in (1, 2, 3)], expected, rtol=RTOL)
+
+
+@needs_mujoco
+@pytest.mark.parametrize(
+    "equality",
+    [
+        '<weld body1="a" body2="b"/>',
+        '<weld body1="b" body2="a" anchor="0.1 0.2 0.3"/>',
+        '<connect body1="a" body2="b" anchor="0.1 0.2 0.3"/>',
+        '<connect body1="a" anchor="0.1 0.2 0.3"/>',
+        '<weld site1="s" site2="s2"/>',
+    ],
+)
+def test_a_loop_is_closed_where_the_file_places_its_bodies(equality):
+    """At qpos0 the bodies meet every equality, as MuJoCo's compiler makes it."""
+    import mujoco
+
+    bodies = '<body name="{}" pos="{}" euler="{}"><freejoint name="{}"/><geom size=".1" mass="1"/>{}</body>'
+    one = bodies.format("a", "0.1 0.2 0.3", "20 30 40", "f", '<site name="s" pos="0 0 .1"/>')
+    # the second site stands where the first does, so that the two may be welded
+    two = bodies.format("b", "0.1 0.2 0.3", "20 30 40", "g", '<site name="s2" pos="0 0 .1"/>')
+    if "site" not in equality:
+        two = bodies.format("b", "-0.3 0.5 1", "-50 10 70", "g", "")
+    text = mjcf(one + two, f"<option><flag contact='disable'/></option><equality>{equality}</equality>")
+    system = jk.convert.from_mjcf(text)
+    qpos = mujoco.MjModel.from_xml_string(text).qpos0.reshape(2, 7)
+    q = np.concatenate([qpos[:, :3], np.roll(qpos[:, 3:], -1, axis=1)], axis=1).ravel()
+    residuals = np.array([float(x) for x in system.configuration_constraints(0.0, q)])
+    assert len(residuals) == (6 if "weld" in equality else 3) + 2  # and two norms
+    np.testing.assert_allclose(residuals, 0.0, atol=1e-14)
+    assert np.abs(system.configuration_constraints(0.0, q + 0.01)[0]) > 1e-4
+
+
+@needs_mujoco
+def test_joints_that_follow_others():
+    hinge = '<link name="{0}"><inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="{1}" ixy="0" ixz="0" iyz="0"/>'
+    hinge += '</inertial></link><joint name="j{0}" type="revolute"><parent link="base"/><child link="{0}"/>'
+    hinge += '<axis xyz="0 0 1"/><limit lower="-1" upper="1" effort="1" velocity="1"/>{2}</joint>'
+    mimic = '<mimic joint="ja" multiplier="-3" offset="0.1"/>'
+    text = f'<robot name="r"><link name="base"/>{hinge.format("a", 0.2, "")}{hinge.format("b", 0.3, mimic)}</robot>'
+    with pytest.warns(UserWarning, match="left out.*limits of joints"):
+        system = jk.convert.from_urdf(text)
+    assert (system.speeds, system.dependent_speeds) == (("ja_rate",), ("jb_rate",))
+    np.testing.assert_allclose(jk.mass_matrix(system, 0.0, [0.2, 0.1 - 0.6], [0.0]), [[0.2 + 9 * 0.3]], rtol=1e-12)
+    degree = '<equality><joint joint1="k" joint2="j" polycoef="0 2 0.5 0 0"/></equality>'
+    two = BODY.format("") + BODY.replace('"a"', '"b"').replace('"j"', '"k"').format("")
+    text = mjcf(two, "<option><flag contact='disable'/></option>" + degree)
+    system = jk.convert.from_mjcf(text)
+    state = jk.assemble(system, {"j": 0.3}, {"j_rate": 1.0})
+    assert float(state.q[1]) == pytest.approx(2 * 0.3 + 0.5 * 0.09, rel=1e-12)
+
+
+@needs_mujoco
+def test_what_is_left_out_is_said():
+    text = mjcf(
+        '<geom type="plane" size="1 1 1"/>' + BODY.format(' range="-90 90" frictionloss="0.1"'),
+        '<option density="1.2"/><actuator><muscle name="m" joint="j"/><motor name="T" joint="j" ctrlrange="-1 1"/>'
+        '</actuator><tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>',
+    )
+    with pytest.warns(UserWarning, match="left out") as told:
+        system = jk.convert.from_mjcf(text)
+    words = str(told[0].message)
+    for what in ("contacts", "limits of joints", "friction of joints", "tendons", "'m', which has a state", "medium"):
+        assert what in words
+        assert any(what in each for each in system.left_out)
+    assert "limits of controls" in words
+    assert system.inputs == ("T",)
+    with pytest.raises(ValueError, match=r"no counterpart: .*contacts"):
+        jk.convert.from_mjcf(text, strict=True)
+
+
+@needs_mujoco
+def test_groups_of_actuators_that_are_switched_off_are_off():
+    motors = "".join(f'<motor name="m{i}" joint="j" group="{i}"/>' for i in (0, 2, 3))
+    off = '<option actuatorgroupdisable="0 3"><flag contact="disable"/></option>'
+    system = jk.convert.from_mjcf(mjcf(BODY.format(""), f"{off}<actuator>{motors}</actuator>"), strict=True)
+    assert system.inputs == ("m2",)
+
+
+@needs_mujoco
+def test_limits_of_what_actuators_do_to_a_joint_are_said():
+    limited = BODY.format(' actuatorfrcrange="-0.1 0.1" actuatorfrclimited="true"').replace(
+        "<geom ", '<geom contype="0" '
+    )
+    with pytest.warns(UserWarning, match="limits of controls and forces"):
+        jk.convert.from_mjcf(mjcf(limited, '<actuator><motor joint="j"/></actuator>'))
+    jk.convert.from_mjcf(mjcf(limited), strict=True)  # nothing is driven
+
+
+@needs_mujoco
+@pytest.mark.parametrize(("first", "second"), [("j_1", "j.1"), ("j.1", "j_1")])
+def test_two_names_that_become_one_are_refused(first, second):
+    links = f"""<body name="a"><joint name="{first}" axis="0 1 0"/><geom size=".1"/>
+      <body><joint name="{second}" axis="0 1 0"/><geom size=".1"/></body></body>"""
+    with pytest.raises(ValueError, match=f"the joints '{first}' and '{second}' would both be 'j_1'"):
+        jk.convert.from_mjcf(mjcf(links))
+    motors = f'<actuator><motor name="{first}" joint="j"/><motor name="{second}" joint="j"/></actuator>'
+    with pytest.raises(ValueError, match=f"the actuators '{first}' and '{second}' would both be 'j_1'"):
+        jk.convert.from_mjcf(mjcf(BODY.format(""), motors))
+    with pytest.raises(ValueError, match=r"the bodies 'tool_tip' and 'tool.tip' would both be 'tool_tip'"):
+        jk.convert.from_urdf(ELBOW.replace('"lower"', '"tool_tip"'))
+
+
+@needs_mujoco
+def test_a_name_of_the_file_is_not_given_to_what_has_none():
+    body = '<body><joint axis="0 1 0"/><geom size=".1" contype="0"/>{}</body>'
+    named = body.replace("<joint", '<joint name="joint0"')
+    system = jk.convert.from_mjcf(mjcf(body.format(named)))
+    assert system.coordinates == ("joint0_", "joint0")
+
+
+@needs_mujoco
+def test_friction_of_zero_is_none():
+    smooth = ELBOW.replace('damping="0.02"', 'damping="0.02" friction="0"')
+    assert jk.convert.from_urdf(smooth, strict=True).left_out == ()
+    with pytest.raises(ValueError, match="no counterpart: friction of joints"):
+        jk.convert.from_urdf(smooth.replace('friction="0"', 'friction="0.1"'), strict=True)
+
+
+@needs_mujoco
+def test_names_that_clash_or_are_missing():
+    off = "<option><flag contact='disable'/></option>"
+    text = mjcf(
+        '<body name="left foot.1"><joint axis="0 1 0"/><geom size=".1"/><site name="left foot.1"/>'
+        '<body><joint axis="0 1 0"/><geom size=".1"/></body></body>',
+        off,
+    )
+    system = jk.convert.from_mjcf(text)
+    assert system.coordinates == ("joint0", "joint1")
+    assert set(system.mass) == {"left foot_1", "body2"}
+    motion = system.motion(0.0, [0.1, 0.2], [0.0, 0.0])
+    assert {"left foot_1", "left foot_1_site"} <= {*motion.points, *(body.name for body in motion.bodies)}
+    assert float(system.mass["body2"]) == pytest.approx(1000 * 4 / 3 * np.pi * 0.1**3)
+
+
+@needs_mujoco
+def test_degrees_are_those_of_the_file():
+    off = "<option><flag contact='disable'/></option>"
+    spring = BODY.format(' stiffness="2" springref="30"')
+    in_degrees, in_radians = (
+        jk.convert.from_mjcf(mjcf(spring, off + f'<compiler angle="{unit}"/>')) for unit in ("degree", "radian")
+    )
+    assert float(in_degrees.rest["j"]) == pytest.approx(np.pi / 6)
+    assert float(in_radians.rest["j"]) == 30.0
+
+
+@needs_mujoco
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("<mujoco><worldbody>", "MuJoCo does not read the text"),
+        (mjcf('<body name="a"><joint/></body>'), "does not read.*mass"),
+        (mjcf('<geom size=".1"/>'), "no joint"),
+        (mjcf('<body><joint/><geom type="mesh" mesh="m"/></body>'), "does not read.*mesh"),
+    ],
+)
+def test_a_file_that_is_no_mechanism(text, words):
+    with pytest.raises(ValueError, match=words):
+        jk.convert.from_mjcf(text)
+
+
+@needs_mujoco
+def test_what_a_file_switches_off_is_off():
+    two = BODY.format(' stiffness="2" damping="1"') + BODY.replace('"a"', '"b"').replace('"j"', '"k"').format("")
+    rest = '<equality><joint joint1="k" joint2="j"/></equality><actuator><motor joint="j"/></actuator>'
+    flags = " ".join(f'{what}="disable"' for what in "contact gravity spring damper actuation equality".split())
+    system = jk.convert.from_mjcf(mjcf(two, f"<option><flag {flags}/></option>{rest}"), strict=True)
+    assert type(system).__name__ == "Mechanism"
+    there = system.stiffness, system.damping, system.gravity, system.inputs, system.dependent_speeds
+    assert not any(there)
+    with pytest.warns(UserWarning, match="contacts"):
+        on = jk.convert.from_mjcf(mjcf(two, rest))
+    assert on.stiffness
+    assert on.damping
+    assert on.gravity
+    assert on.inputs
+    assert on.dependent_speeds == ("k_rate",)
+
+
+@needs_mujoco
+def test_a_file_that_is_not_there():
+    with pytest.raises(FileNotFoundError, match=r"no file 'nowhere.xml'"):
+        jk.convert.from_mjcf("nowhere.xml")
+
+
+@needs_mujoco
+def test_a_urdf_that_is_none():
+    with pytest.raises(ValueError, match="no URDF"):
+        jk.convert.from_urdf("<robot><link>")
+    with pytest.raises(ValueError, match=r"no URDF.*<mujoco>"):
+        jk.convert.from_urdf(mjcf(""))
+    with pytest.raises(ValueError, match=r"one root link.*a, b"):
+        jk.convert.from_urdf('<robot name="r"><link name="a"/><link name="b"/></robot>')
+
+
+@pytest.mark.slow
+@needs_mujoco
+def test_a_mass_that_was_brought_over_has_a_derivative():
+    system = jk.convert.from_mjcf(FIGURES["model"])
+    q, u = (jnp.array(FIGURES["states"][0][x]) for x in ("q", "u"))
+    alpha = lambda m: jk.accelerations(system.replace({"mass.hand": m}), 0.0, q, u)[6]  # noqa: E731
+    slope = jax.jit(jax.grad(alpha))(1.4)
+    np.testing.assert_allclose(slope, (alpha(1.4 + 1e-5) - alpha(1.4 - 1e-5)) / 2e-5, rtol=1e-6)
+
+
+@pytest.mark.parametrize("read", [jk.convert.from_mjcf, jk.convert.from_urdf])
+def test_without_mujoco_the_remedy_is_named(read, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(ImportError, match="pip install mujoco"):
+        read("<mujoco/>")

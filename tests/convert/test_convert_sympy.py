@@ -1,0 +1,304 @@
+"""Models of SymPy brought over, held to SymPy's own accelerations. Without SymPy they are skipped.
+
+Figures: tests/data/sympy_kane_systems.json, which SymPy 1.14's KanesMethod computed; the models are those of its tests.
+"""
+
+import dataclasses
+import json
+import re
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+
+RTOL = 1e-12
+FIGURES = json.loads((Path(__file__).parents[1] / "data" / "sympy_kane_systems.json").read_text())["systems"]
+
+
+@pytest.fixture(scope="module")
+def me():
+    pytest.importorskip("sympy")
+    import sympy.physics.mechanics
+
+    return sympy.physics.mechanics
+
+
+def spring_mass_damper(me, sm):
+    (q, u), (m, c, k) = me.dynamicsymbols("q u"), sm.symbols("m c k")
+    N, P = me.ReferenceFrame("N"), me.Point("P")
+    P.set_vel(N, u * N.x)
+    mass = me.Particle("mass", P, m)
+    return me.KanesMethod(N, [q], [u], [q.diff() - u], bodies=[mass], forcelist=[(P, (-k * q - c * u) * N.x)])
+
+
+def rolling_disc(me, sm):
+    q1, q2, q3, u1, u2, u3 = me.dynamicsymbols("q1:4 u1:4")
+    r, m, g = sm.symbols("r m g")
+    N = me.ReferenceFrame("N")
+    Y = N.orientnew("Y", "Axis", [q1, N.z])
+    L = Y.orientnew("L", "Axis", [q2, Y.x])
+    R = L.orientnew("R", "Axis", [q3, L.y])
+    R.set_ang_vel(N, u1 * L.x + u2 * L.y + u3 * L.z)
+    C = me.Point("C")
+    C.set_vel(N, 0)
+    D = C.locatenew("D", r * L.z)
+    D.v2pt_theory(C, N, R)
+    I = me.inertia(L, m / 4 * r**2, m / 2 * r**2, m / 4 * r**2)
+    rates = [q1.diff() - u3 / sm.cos(q2), q2.diff() - u1, q3.diff() - u2 + u3 * sm.tan(q2)]
+    disc = me.RigidBody("disc", D, R, m, (I, D))
+    loads = [(D, -m * g * Y.z)]
+    return me.KanesMethod(N, [q1, q2, q3], [u1, u2, u3], rates, bodies=[disc], forcelist=loads)
+
+
+def rolling_disc_dependent(me, sm):
+    q, u, ua = me.dynamicsymbols("q:4"), me.dynamicsymbols("u:6"), me.dynamicsymbols("ua:3")
+    r, m, g, I, J = sm.symbols("r m g I J")
+    N = me.ReferenceFrame("N")
+    A = N.orientnew("A", "Axis", [q[0], N.z])
+    B = A.orientnew("B", "Axis", [q[1], A.x])
+    C = B.orientnew("C", "Axis", [q[2], B.y])
+    C.set_ang_vel(N, u[0] * B.x + u[1] * B.y + u[2] * B.z)
+    P = me.Point("P")
+    P.set_vel(N, ua[0] * A.x + ua[1] * A.y + ua[2] * A.z)
+    O = P.locatenew("O", q[3] * A.z + r * sm.sin(q[1]) * A.y)
+    O.set_vel(N, u[3] * A.x + u[4] * A.y + u[5] * A.z)
+    turning = q[0].diff() * A.z + q[1].diff() * B.x + q[2].diff() * B.y - C.ang_vel_in(N)
+    rising = O.pos_from(P).diff(me.dynamicsymbols._t, A) + A.ang_vel_in(N).cross(O.pos_from(P))
+    rates = [*(turning.dot(x) for x in B), (rising - O.vel(N)).dot(A.z)]
+    slip = O.vel(N) - (P.vel(N) + C.ang_vel_in(N).cross(O.pos_from(P)))
+    disc = me.RigidBody("disc", O, C, m, (me.inertia(B, I, J, I), O))
+    return me.KanesMethod(
+        N,
+        q[:3],
+        u[:3],
+        rates,
+        q_dependent=[q[3]],
+        configuration_constraints=[(-r * B.z).dot(A.z) - q[3]],
+        u_dependent=u[3:],
+        velocity_constraints=[slip.dot(x) for x in A],
+        u_auxiliary=ua,
+        bodies=[disc],
+        forcelist=[(O, m * g * A.z)],
+    )
+
+
+def four_bar_linkage(me, sm):
+    """A System of joints, whose loop is closed by constraints."""
+    l1, l2, l3, l4, rho = sm.symbols("l1:5 rho")
+    q, u = me.dynamicsymbols("q1:4"), me.dynamicsymbols("u1:4")
+    ground = link = me.RigidBody("ground")
+    system = me.System.from_newtonian(ground)
+    end = l1 / 2 * ground.x
+    for i, l in enumerate((l2, l3, l4)):
+        rod = me.RigidBody(f"link{i + 2}", mass=rho * l)
+        rod.central_inertia = me.inertia(rod.frame, 0, rho * l**3 / 12, rho * l**3 / 12)
+        pin = {"parent_point": end, "child_point": -l / 2 * rod.x, "joint_axis": link.z}
+        system.add_joints(me.PinJoint(f"J{i}", link, rod, q[i], u[i], **pin))
+        link, end = rod, l / 2 * rod.x
+    gap = link.masscenter.pos_from(ground.masscenter) + end + l1 / 2 * ground.x
+    system.q_ind, system.q_dep, system.u_ind, system.u_dep = [q[0]], q[1:], [u[0]], u[1:]
+    system.add_holonomic_constraints(gap.dot(ground.x), gap.dot(ground.y))
+    return system
+
+
+def cartesian_pendulum(me, sm):
+    q1, q2, u1, u2 = me.dynamicsymbols("q1:3 u1:3")
+    L, m = sm.symbols("L m")
+    N, O = me.ReferenceFrame("N"), me.Point("O")
+    O.set_vel(N, 0)
+    P = O.locatenew("P", q1 * N.x + q2 * N.y)
+    P.set_vel(N, u1 * N.x + u2 * N.y)
+    bound = sm.sqrt(q1**2 + q2**2) - L
+    return me.KanesMethod(
+        N,
+        [q2],
+        [u2],
+        [q1.diff() - u1, q2.diff() - u2],
+        q_dependent=[q1],
+        configuration_constraints=[bound],
+        u_dependent=[u1],
+        velocity_constraints=[bound.diff(me.dynamicsymbols._t)],
+        bodies=[me.Particle("bob", P, m)],
+        forcelist=[(P, 9.8 * m * N.x)],
+    )
+
+
+def pendulum_on_cart(me, sm):
+    from sympy.physics.mechanics.models import n_link_pendulum_on_cart
+
+    return n_link_pendulum_on_cart(3, True, True)  # its equations are formed already
+
+
+MODELS = {
+    "one_dof_spring_mass_damper": spring_mass_damper,
+    "rolling_disc_minimal": rolling_disc,
+    "rolling_disc_dependent_q_u_aux": rolling_disc_dependent,
+    "four_bar_linkage": four_bar_linkage,
+    "pendulum_cartesian_nonminimal": cartesian_pendulum,
+    "n_link_pendulum_on_cart_n3": pendulum_on_cart,
+}
+
+
+def brought(me, model, **more):
+    import sympy
+
+    return jk.convert.from_sympy(MODELS[model](me, sympy), FIGURES[model]["params"], **more)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_a_model_accelerates_as_in_sympy(me, name):
+    system = brought(me, name)
+    speeds = (*system.speeds, *system.dependent_speeds)
+    for state in FIGURES[name]["states"]:
+        at = [
+            np.array([state[x][name] for name in names])
+            for x, names in (("q", system.coordinates), ("u", system.speeds))
+        ]
+        found = jk.speed_rates(system, 0.0, *at, state["inputs"])
+        expected = np.array([state["udot"][x] for x in speeds])
+        np.testing.assert_allclose([found[x] for x in speeds], expected, rtol=RTOL, atol=RTOL * np.abs(expected).max())
+
+
+def test_a_model_is_a_system_as_any_other(me):
+    system = brought(me, "n_link_pendulum_on_cart_n3", name="Cart")
+    again = brought(me, "n_link_pendulum_on_cart_n3", name="Cart")
+    assert type(system) is type(again)  # one model, one class
+    assert type(system).__name__ == "Cart"
+    assert system.inputs == ("F", "T1", "T2", "T3")
+    q, u = jnp.array([0.1, 0.2, 0.3, 0.4]), jnp.array([1.0, -1.0, 0.5, 0.2])
+    alpha = lambda m: jk.accelerations(dataclasses.replace(system, m1=m), 0.0, q, u)[0]  # noqa: E731
+    m = float(system.m1)
+    slope = jax.jit(jax.grad(alpha))(m)
+    np.testing.assert_allclose(slope, (alpha(m + 1e-5) - alpha(m - 1e-5)) / 2e-5, rtol=1e-6)
+
+
+def double_pendulum(me, sm):
+    q1, q2, F = me.dynamicsymbols("q1 q2 F")
+    m, l, g, k = sm.symbols("m l g k", positive=True)
+    N, O = me.ReferenceFrame("N"), me.Point("O")
+    O.set_vel(N, 0)
+    A, B = (N.orientnew(name, "Axis", [q, N.z]) for name, q in (("A", q1), ("B", q2)))
+    P, R = O.locatenew("P", l * A.x), None
+    P.v2pt_theory(O, N, A)
+    R = P.locatenew("R", l * B.x)
+    R.v2pt_theory(P, N, B)
+    bobs = [me.Particle("p", P, m), me.Particle("r", R, m)]
+    bobs[0].potential_energy = -m * g * l * sm.cos(q1)
+    bobs[1].potential_energy = -m * g * l * (sm.cos(q1) + sm.cos(q2)) + k * (q1 - q2) ** 2 / 2
+    lagrangian = me.Lagrangian(N, *bobs)
+    return me.LagrangesMethod(lagrangian, [q1, q2], forcelist=[(R, F * N.y)], bodies=bobs, frame=N), O
+
+
+def test_a_lagrangian_with_bodies_accelerates_as_in_sympy(me):
+    import sympy as sm
+
+    lagrange, O = double_pendulum(me, sm)
+    values = {"m": 1.2, "l": 0.7, "g": 9.81, "k": 2.0}
+    system = jk.convert.from_sympy(lagrange, values, origin=O)
+    assert system.speeds == ("q1_dot", "q2_dot")
+    q, u = [0.3, 0.4], [0.5, 0.6]
+    lagrange.form_lagranges_equations()
+    at = dict(zip(lagrange._qdots, u)) | {me.dynamicsymbols("F"): 1.5}
+    at |= {
+        symbol: values[str(symbol)]
+        for symbol in lagrange.mass_matrix.free_symbols | lagrange.forcing.free_symbols
+        if str(symbol) in values
+    }
+    numbers = lambda x: np.array(me.msubs(x, at).subs(dict(zip(lagrange.q, q))), float)  # noqa: E731
+    expected = np.linalg.solve(numbers(lagrange.mass_matrix), numbers(lagrange.forcing)[:, 0])
+    np.testing.assert_allclose(jk.accelerations(system, 0.0, q, u, {"F": 1.5}), expected, rtol=RTOL)
+    place = jk.positions(system, 0.0, q, u)["R"]
+    np.testing.assert_allclose(place, [0.7 * (np.cos(0.3) + np.cos(0.4)), 0.7 * (np.sin(0.3) + np.sin(0.4)), 0.0])
+
+
+def test_what_is_prescribed_in_time_is_an_expression_of_time(me):
+    import sympy as sm
+
+    q, u, t = *me.dynamicsymbols("q u"), me.dynamicsymbols._t
+    a, w = sm.symbols("a w")
+    N, O = me.ReferenceFrame("N"), me.Point("O")
+    O.set_vel(N, 0)
+    P = O.locatenew("P", (q + a * sm.sin(w * t)) * N.x)
+    P.set_vel(N, (u + a * w * sm.cos(w * t)) * N.x)
+    kane = me.KanesMethod(N, [q], [u], [q.diff() - u], bodies=[me.Particle("P", P, 2.0)])
+    system = jk.convert.from_sympy(kane, {a: 0.3, "w": 2.0}, origin=O)
+    np.testing.assert_allclose(jk.accelerations(system, 0.4, [0.1], [0.2]), [0.3 * 4 * np.sin(0.8)], rtol=1e-13)
+
+
+def test_what_a_model_does_not_say_is_named(me):
+    import sympy as sm
+
+    params = FIGURES["rolling_disc_minimal"]["params"]
+    kane = rolling_disc(me, sm)
+    for given, words in (
+        ({}, "no value for g, m, r"),
+        (params | {"mass": 1.0}, "no symbol 'mass'"),
+        (params | {"m": -1.0, "units": 1.0}, "no symbol 'units'"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            jk.convert.from_sympy(kane, given)
+    (q, u, f), m = me.dynamicsymbols("q u f"), sm.symbols("m")
+    N, P = me.ReferenceFrame("N"), me.Point("P")
+    bob = me.Particle("bob", P, m)
+    make = lambda **more: me.KanesMethod(N, [q], [u], [q.diff() - u], **more)  # noqa: E731
+    with pytest.raises(ValueError, match="knows no bodies"):
+        jk.convert.from_sympy(make(), {})
+    with pytest.raises(ValueError, match="P has no velocity"):
+        jk.convert.from_sympy(make(bodies=[bob]), {m: 1.0})
+    P.set_vel(N, (u + f) * N.x)
+    with pytest.raises(ValueError, match=r"f\(t\) in the motion"):
+        jk.convert.from_sympy(make(bodies=[bob]), {m: 1.0})
+    P.set_vel(N, (u + f.diff()) * N.x)
+    with pytest.raises(ValueError, match=r"Derivative\(f\(t\), t\) follows from no kinematic"):
+        jk.convert.from_sympy(make(bodies=[bob]), {m: 1.0})
+    P.set_vel(N, u * N.x)
+    taken = me.Particle("bob", P, sm.Symbol("speeds"))
+    with pytest.raises(ValueError, match="cannot be called 'speeds'"):
+        jk.convert.from_sympy(make(bodies=[taken]), {"speeds": 1.0})
+    with pytest.raises(TypeError, match="takes a KanesMethod"):
+        jk.convert.from_sympy(q.diff() - u, {})
+
+
+def test_functions_are_those_of_sympy_or_refused_by_name(me):
+    import sympy as sm
+
+    q, u, m = *me.dynamicsymbols("q u"), sm.symbols("m")
+    N, P = me.ReferenceFrame("N"), me.Point("P")
+    P.set_vel(N, u * N.x)
+    make = lambda force: me.KanesMethod(  # noqa: E731
+        N, [q], [u], [q.diff() - u], bodies=[me.Particle("p", P, m)], forcelist=[(P, force * N.x)]
+    )
+    force = sm.Piecewise((-q, sm.And(q > 1, u > 0)), (2 * q, sm.Or(q > 0, u > 5)), (0, True)) + sm.Max(q, u, 0)
+    force += sm.Abs(-q) * sm.sign(u) + sm.atan2(q, u) / sm.sqrt(q) + q ** sm.Rational(3, 2) + 10**20 * q / u**2 + sm.pi
+    system = jk.convert.from_sympy(make(force), {m: sm.Rational(3, 2)})
+    expected = float(force.subs({q: 0.3, u: 0.2})) / 1.5
+    np.testing.assert_allclose(jk.accelerations(system, 0.0, [0.3], [0.2]), [expected], rtol=1e-14)
+    for bad, words in (
+        (sm.gamma(q), "gamma has no counterpart"),
+        (sm.Heaviside(q), "Heaviside has no counterpart"),
+        (sm.Symbol("m", positive=True) * q, "two symbols are called m"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            jk.convert.from_sympy(make(bad), {m: 1.0})
+
+
+def test_without_sympy_the_remedy_is_named(monkeypatch):
+    monkeypatch.setitem(sys.modules, "sympy", None)
+    with pytest.raises(ImportError, match="pip install sympy"):
+        jk.convert.from_sympy(None, {})
+
+
+@pytest.mark.slow
+def test_the_page_on_bringing_models_runs(me):
+    pytest.importorskip("mujoco")
+    page = (Path(__file__).parents[2] / "docs" / "bringing_models.md").read_text(encoding="utf-8")
+    names = {}
+    for block in re.findall(r"```py(?:thon)?\n(.*?)```", page, re.DOTALL):
+        exec(compile(block, "bringing_models.md", "exec"), names)
+    assert names["system"].coordinates == ("q",)
+    assert float(names["ride"].q[-1, 0]) != 0.5

@@ -1,0 +1,746 @@
+"""Exported equations, compiled, run or loaded elsewhere, give the library's numbers; what cannot be is named."""
+
+import ctypes
+import functools
+import importlib.util
+import os
+import re
+import shutil
+import subprocess
+import sys
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_native import ODD, OPERATIONS
+
+import jaxkane as jk
+from jaxkane._kane.formulas import JACOBIANS, Formulas
+from jaxkane._scalarjit.backends.source import as_source
+from jaxkane._scalarjit.graph import Graph, unrolled
+from jaxkane.bicycles import (
+    Arms,
+    Bicycle,
+    Drag,
+    HeadTwist,
+    LaneChange,
+    LateralSlip,
+    LeaningRider,
+    LeanSteerGains,
+    LongitudinalSlip,
+    PathFollower,
+    RigidRider,
+    Road,
+    Slope,
+    SteeringFriction,
+    SteeringMotor,
+    Trailer,
+    Tyre,
+    browser_jason,
+    schwalbe_energizer,
+    separate_rider,
+)
+from jaxkane.catalog import CATALOG
+from jaxkane.export._c import HELPERS, C
+from jaxkane.export._functions import identifiers
+from jaxkane.export._numpy import PYTHON
+
+CC = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
+needs_compiler = pytest.mark.skipif(CC is None, reason="no C compiler")
+STRICT = ("-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror")
+
+
+class Part(eqx.Module):
+    mass: jax.Array = jk.parameter(0.4, positive=True, unit="kg")
+
+
+class Odd(jk.System):
+    """Names that are words of C and of Python, Greek ones, one that stands for two things, one that ends a comment;
+    parameters with axes and in parts; a whole number; branches of which one has no value; an auxiliary speed."""
+
+    register: jk.Scalar = jk.parameter(2.0, positive=True, unit="kg */")
+    angle: jk.Scalar = jk.parameter(0.3)
+    θ0: jk.Scalar = jk.parameter(-0.2)
+    moments: jax.Array = jk.parameter([0.1, 0.2, 0.3], positive=True)
+    part: Part = Part()
+    links: int = eqx.field(static=True, default=2)
+    coordinates = ("angle", "x0")
+    speeds = ("double", "lambda")
+    auxiliary_speeds = ("while",)
+    inputs = ("for", "I")
+    units = {"angle": "rad", "x0": "m"}
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, q["angle"], u["double"])
+        P = O.moving(q["x0"] * A.x, u["lambda"] * A.x + u["while"] * A.z)
+        return jk.Motion([jk.Body(self.register, tuple(self.moments), P, A), jk.Body(self.part.mass, 0.0, P)])
+
+    def loads(self, t, q, u, motion, inputs):
+        body, x = motion.bodies[0], q["x0"]
+        reach = jnp.where(x > self.θ0, jnp.sqrt(x - self.θ0), 0.0) * self.links
+        clipped = jnp.maximum(u["lambda"], -0.5) + jnp.minimum(x, 0.25) + jnp.clip(self.angle, 0.1, 0.2)
+        ripple = jax.lax.rem(7.0 * x, jnp.asarray(0.3, x.dtype)) + jnp.sign(x) * jnp.abs(x) ** 1.5
+        push = reach + clipped * ripple + jax.nn.softplus(u["double"]) + inputs["I"] * jnp.cos(3.0 * t)
+        return [jk.Force(push * body.frame.x, body), jk.Torque(inputs["for"] * body.frame.z, body)]
+
+
+class Bob(jk.System):
+    """A pendulum in Cartesian coordinates: one dependent coordinate, one dependent speed, no input."""
+
+    length: jk.Scalar = jk.parameter(1.0, positive=True, unit="m")
+    coordinates = ("x", "y")
+    dependent_coordinates = ("y",)
+    speeds = ("vx",)
+    dependent_speeds = ("vy",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(2.0, 0.0, O.moving(N.vector(*q, 0.0), N.vector(*u, 0.0)))])
+
+    def configuration_constraints(self, t, q):
+        return [q["x"] ** 2 + q["y"] ** 2 - self.length**2]
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+
+
+def case(name):
+    """A system with a time, coordinates, speeds and inputs."""
+    if name in CATALOG:
+        entry = CATALOG[name]
+        system, q, u = entry.example(), entry.q, entry.u
+    elif name == "Odd":
+        system, q, u = Odd(), (0.4, 0.35), (0.6, -0.7)
+    else:
+        system, q, u = Bob(), (0.6, -0.8), (0.5,)
+    return system, 0.7, np.array(q), np.array(u), np.linspace(-0.4, 0.9, len(system.inputs))
+
+
+def by_library(system, t, q, u, w, functions):
+    """The library's own numbers, by its public functions and JAX's derivatives of them."""
+    given = lambda w: dict(zip(system.inputs, w, strict=True))  # noqa: E731
+
+    def rates(system, q, u, w):
+        rates = jk.coordinate_rates(system, t, q, u), jk.accelerations(system, t, q, u, given(w))
+        return jnp.concatenate(rates)
+
+    @functools.cache
+    def jacobians():
+        return jax.jit(jax.jacfwd(rates, (0, 1, 2, 3)))(system, q, u, w)
+
+    def jacobian(*places):
+        n = len(q) + len(u)
+        blocks = [np.reshape(x, (n, -1)) for i in places for x in jax.tree.leaves(jacobians()[i])]
+        return np.concatenate(blocks, axis=1)
+
+    ways = {
+        "rates": lambda: (jk.coordinate_rates(system, t, q, u), jk.accelerations(system, t, q, u, given(w))),
+        "equations": lambda: jk.equations_of_motion(system, t, q, u, given(w)),
+        "dependent_speeds": lambda: [jk.dependent_speeds(system, t, q, u)],
+        "constraint_jacobian_rate": lambda: [jk.constraint_jacobian_rate(system, t, q, u)],
+        "partial_velocities": lambda: jk.partial_velocities(system, t, q, u, given(w)),
+        "kinetic_energy": lambda: [jk.kinetic_energy(system, t, q, u)],
+        "state_jacobian": lambda: [jacobian(1, 2)],
+        "parameter_jacobian": lambda: [jacobian(0)],
+        "input_jacobian": lambda: [jacobian(3)],
+    }
+    return {function: [np.asarray(x) for x in ways[function]()] for function in functions}
+
+
+def assert_close(found, expected, rtol, what=""):
+    """To the size of the largest entry: a small one may be a difference of large ones."""
+    assert len(found) == len(expected)
+    for x, y in zip(found, expected, strict=True):
+        assert np.shape(x) == y.shape, what
+        np.testing.assert_allclose(x, y, rtol=0, atol=rtol * np.abs(y).max(initial=1e-3), err_msg=what)
+
+
+def library_of(files, folder):
+    """The functions of a C source, compiled."""
+    target = folder / f"{files.source.stem}.so"
+    subprocess.run([CC, *STRICT, "-O1", "-shared", "-fPIC", files.source, "-o", target, "-lm"], check=True)
+    return ctypes.CDLL(str(target))
+
+
+def call(library, name, t, arrays, outputs, real=ctypes.c_double):
+    pointer = lambda x: x.ctypes.data_as(ctypes.POINTER(real))  # noqa: E731
+    kind = np.dtype(real)
+    arrays = [np.ascontiguousarray(x, kind) for x in arrays]
+    found = [np.full(shape, np.nan, kind) for shape in outputs]
+    getattr(library, name)(real(t), *map(pointer, arrays), *map(pointer, found))
+    return found
+
+
+SYSTEMS = ["DoublePendulum", "Odd", "Bob"]
+# Of the catalogue those with most to go wrong; `test_symbolic` has the same formulas of all.
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("Aircraft", "SpatialDoublePendulum", "WhippleBicycle")]
+
+
+# Who is told that something makes the library slow, is told so by other tests.
+pytestmark = pytest.mark.filterwarnings("ignore:.*its description uses")
+
+
+@needs_compiler
+@pytest.mark.parametrize("name", [*SYSTEMS, *SLOW])
+def test_c_gives_the_numbers_and_derivatives_of_the_library(name, tmp_path):
+    rtol, of_derivatives = 1e-13, 1e-12
+    system, t, q, u, w = case(name)
+    files = jk.export.c(system, tmp_path / "generated" / f"{name}.c")
+    functions = Formulas(system)
+    functions = [
+        f for f in ("rates", "equations", "dependent_speeds", *JACOBIANS) if f"_{f}(" in files.header.read_text()
+    ]
+    assert ("dependent_speeds" in functions, "input_jacobian" in functions) == (
+        bool(system.dependent_speeds), bool(system.inputs)
+    )  # fmt: skip
+    library = library_of(files, tmp_path)
+    numbers = np.concatenate([x.ravel() for x in jk.export.parameters(system).values()])
+    for function, expected in by_library(system, t, q, u, w, functions).items():
+        found = call(library, f"{name}_{function}", t, [q, u, w, numbers], [x.shape for x in expected])
+        assert_close(found, expected, of_derivatives if function in JACOBIANS else rtol, function)
+
+
+@needs_compiler
+@pytest.mark.parametrize("dtype", ["float64", pytest.param("float32", marks=pytest.mark.slow)])
+def test_the_test_program_passes_and_finds_what_is_wrong(dtype, tmp_path):
+    files = jk.export.c(Odd(), tmp_path / "odd.c", dtype=dtype)
+
+    def result():
+        sources = [files.source, files.test]
+        subprocess.run([CC, *STRICT, "-O0", *sources, "-lm", "-o", tmp_path / "test"], check=True)
+        return subprocess.run([tmp_path / "test"], capture_output=True, text=True)
+
+    run = result()
+    assert run.returncode == 0, run.stdout
+    assert len(run.stdout.splitlines()) == 7
+    right = files.source.read_text()
+    wrong = right.replace("u_dot[1] = ", "u_dot[1] = 1.1 * ")
+    assert wrong != right
+    files.source.write_text(wrong)
+    assert result().returncode == 1
+
+
+@needs_compiler
+@pytest.mark.skipif(shutil.which("c++") is None, reason="no C++ compiler")
+def test_the_header_is_read_by_cpp_too(tmp_path):
+    files = jk.export.c(Odd(), tmp_path / "double.c", functions=("rates",))
+    command = ["c++", "-x", "c++", "-Wall", "-Werror", "-fsyntax-only", files.header]
+    subprocess.run(command, check=True)
+    header = files.header.read_text()
+    for line in ("double register_; /* register [kg * /] */", "double theta0; /* θ0 */", "double moments[3];"):
+        assert line in header
+    assert "double part_mass; /* part.mass [kg] */" in header
+    assert "inputs[0]: for" in header
+    assert "q[0]: angle [rad]" in header
+    assert "void double__rates(" in header
+
+
+def test_two_parameters_keep_two_names(tmp_path):
+    """ "extra[0].mass" and a field "extra_0_mass" would be one identifier."""
+
+    class Cart(jk.System):
+        extra: tuple[Part, ...] = (Part(mass=2.0), Part(mass=3.0))
+        extra_0_mass: jk.Scalar = jk.parameter(5.0)
+        extra_0__mass: jk.Scalar = jk.parameter(7.0)
+        coordinates, speeds = ("x",), ("v",)
+
+        def motion(self, t, q, u):
+            N, O = jk.inertial()
+            mass = self.extra[0].mass + 10.0 * self.extra[1].mass
+            return jk.Motion([jk.Body(mass, 0.0, O.moving(q[0] * N.x, u[0] * N.x))])
+
+        def loads(self, t, q, u, motion, inputs):
+            return jk.Force((100.0 * self.extra_0_mass + 1000.0 * self.extra_0__mass) * motion.N.x, motion.bodies[0])
+
+    header = jk.export.c(Cart(), tmp_path / "cart.c", ("equations",)).header.read_text()
+    members = re.findall(r"double (\w+);(?: /\* (\S+))?", header)
+    names = ["extra[0].mass", "extra[1].mass", "extra_0_mass", "extra_0__mass"]
+    assert list(jk.export.parameters(Cart())) == names
+    assert len(members) == len({member for member, _ in members}) == 4
+    assert [own or member for member, own in members] == names
+    module = {}
+    exec(jk.export.numpy(Cart(), functions=("equations",)), module)
+    assert [float(x.squeeze()) for x in module["equations"](0.0, [0.0], [0.0])] == [32.0, 7500.0]
+
+
+def test_names_of_other_languages():
+    names = ["θ̈", "φ", "ϕ", "a.b", "a[b]", "int", "int_", "2x", "Δ", "é", "_", "车"]
+    found = identifiers(names, {"int"})
+    assert found == ["theta", "phi", "phi_", "a_b", "a_b_", "int_", "int_2", "n2x", "Delta", "e", "n", "u8f66"]
+
+
+@pytest.mark.parametrize("name", [*SYSTEMS, *SLOW])
+def test_numpy_source_gives_the_numbers_of_the_library(name):
+    rtol = 1e-13
+    system, t, q, u, w = case(name)
+    functions = ["rates", "equations", "partial_velocities", "kinetic_energy"]
+    functions += ["dependent_speeds", "constraint_jacobian_rate"] * bool(system.dependent_speeds)
+    text = jk.export.numpy(system, functions=functions)
+    assert "jax." not in text
+    module = {}
+    exec(compile(text, name, "exec"), module)
+    for function, expected in by_library(system, t, q, u, w, functions).items():
+        found = module[function](t, q, u, w)
+        assert_close(found if isinstance(found, tuple) else [found], expected, rtol, function)
+    values = {key: float(x) if x.ndim == 0 else x.tolist() for key, x in jk.export.parameters(system).items()}
+    np.testing.assert_array_equal(
+        module["rates"](t, list(q), list(u), parameters=values)[1],
+        module["rates"](t, q, u, 0.0 * w)[1],
+        err_msg="inputs that are left out are zero, and plain numbers will do",
+    )
+
+
+def test_names_with_dots_and_spaces_of_mechanisms_of_joints():
+    bar = {"mass": 2.0, "center": (0.0, 0.0, -0.2), "inertia": (0.03, 0.03, 0.002)}
+    hinge = jk.joints.hinge("shoulder", (0, 1, 0), damping=0.1)
+    arm = jk.joints.mechanism([jk.joints.Link("upper arm", joints=hinge, **bar)])
+    module = {}
+    exec(jk.export.numpy(arm, functions=("rates",)), module)
+    heavy = {**module["PARAMETERS"], "mass.upper arm": 3.0}
+    # (I_yy + m z^2) q_ddot = m g_z z sin(q) - c q_dot, with z = -0.2 and g_z = -9.81
+    expected = (3.0 * 9.81 * 0.2 * -np.sin(0.4) - 0.1 * 0.5) / (0.03 + 3.0 * 0.04)
+    np.testing.assert_allclose(module["rates"](0.0, [0.4], [0.5], parameters=heavy)[1], [expected], rtol=1e-14)
+
+
+def test_numpy_source_in_float32_stays_there_and_is_written(tmp_path):
+    rtol = 1e-5
+    system, t, q, u, w = case("Odd")
+    text = jk.export.numpy(system, tmp_path / "new" / "odd.py", ("rates", "state_jacobian"), dtype="float32")
+    assert (tmp_path / "new" / "odd.py").read_text(encoding="utf-8") == text
+    module = {}
+    exec(text, module)
+    found = [*module["rates"](t, q, u, w), module["state_jacobian"](t, q, u, w)]
+    assert {x.dtype for x in found} == {np.dtype("float32")}
+    expected = by_library(system, t, q, u, w, ("rates", "state_jacobian"))
+    assert_close(found, [*expected["rates"], *expected["state_jacobian"]], rtol)
+
+
+def test_derivatives_where_branches_meet():
+    """Beside and on the edges of `where`, sqrt, sign, max and min: sides that are not taken have no derivative."""
+    rtol = 1e-12
+    system, t, q, u, w = case("Odd")
+    given = dict(zip(system.inputs, w, strict=True))
+    rates = lambda x: jk.accelerations(system, t, x[:2], x[2:], given)  # noqa: E731
+    jacobian = jax.jit(jax.jacfwd(rates))
+    module = {}
+    exec(jk.export.numpy(system, functions=("state_jacobian",)), module)
+    ways = [lambda q: module["state_jacobian"](t, q, u, w)[2:]]
+    if importlib.util.find_spec("casadi"):
+        f = jk.export.casadi(system)
+        J = f.jacobian()
+        numbers = np.concatenate([x.ravel() for x in jk.export.parameters(system).values()])
+
+        def by_casadi(q):
+            blocks = J(t, q, u, w, numbers, *f(t, q, u, w, numbers))
+            return np.hstack([np.array(blocks[6]), np.array(blocks[7])])
+
+        ways.append(by_casadi)
+    for x0 in (-0.4, float(system.θ0), 0.0, 0.25):
+        at = np.array([q[0], x0])
+        expected = np.asarray(jacobian(np.concatenate([at, u])))
+        assert np.all(np.isfinite(expected))
+        for way in ways:
+            assert_close([way(at)], [expected], rtol)
+
+
+# What no number comes of, and which of two zeros, in source that others compile: bit for bit as XLA has it.
+
+X = jnp.array([0.0, -0.0, 1.0, -1.0, np.inf, -np.inf, np.nan])
+TAKEN = jnp.asarray(np.random.default_rng(0).normal(size=3))
+
+
+def graph_of(f, x):
+    program, out = jax.make_jaxpr(f, return_shape=True)(x)
+    graph = Graph()
+    nodes = np.array([graph.add("input", (0, i, x.size), str(x.dtype)) for i in range(x.size)]).reshape(x.shape)
+    outputs = unrolled(program.jaxpr, program.consts, [nodes], graph)
+    return graph, nodes, outputs, jax.tree.structure(out)
+
+
+def odd(x):
+    return [y.astype(x.dtype) for f in ODD.values() for y in jax.tree.leaves(jax.vmap(f)(x))]
+
+
+def every(x, left_out=()):
+    found = {name: f(x) for name, f in OPERATIONS.items() if name not in left_out}
+    return [y.astype(x.dtype) for y in jax.tree.leaves(found)]
+
+
+def every_in_float64(x):
+    return every(x, ("other precision",))
+
+
+def in_c(f, x, folder):
+    graph, nodes, outputs, _ = graph_of(f, x)
+    lines, texts = as_source(graph, outputs, {int(k): f"x[{i}]" for i, k in enumerate(nodes.flat)}, C)
+    lines += [f"y[{i}] = {text};" for i, text in enumerate(t for array in texts for t in array)]
+    helpers = "".join(text.format(type="double") for text in HELPERS.values())
+    body = "\n".join(lines)
+    (folder / "f.c").write_text(
+        f"#include <math.h>\n{helpers}void f(const double *x, double *y);\n"
+        f"void f(const double *x, double *y) {{\n{body}\n}}\n"
+    )
+    target = folder / f"{f.__name__}.so"
+    subprocess.run([CC, *STRICT, "-O2", "-shared", "-fPIC", folder / "f.c", "-o", target, "-lm"], check=True)
+    found = np.full(sum(array.size for array in outputs), np.nan)
+    pointer = lambda x: x.ctypes.data_as(ctypes.POINTER(ctypes.c_double))  # noqa: E731
+    ctypes.CDLL(str(target)).f(pointer(np.asarray(x)), pointer(found))
+    return found
+
+
+def in_numpy(f, x, folder):
+    import math
+
+    graph, nodes, outputs, _ = graph_of(f, x)
+    lines, texts = as_source(graph, outputs, {int(k): f"x[{i}]" for i, k in enumerate(nodes.flat)}, PYTHON)
+    lines.append(f"y = np.array([{', '.join(t for array in texts for t in array)}])")
+    names = {"x": np.asarray(x), "np": np, "_erf": np.vectorize(math.erf)}
+    with np.errstate(all="ignore"):
+        exec("\n".join(lines), names)
+    return names["y"]
+
+
+LANGUAGES = [pytest.param(in_c, marks=needs_compiler), in_numpy]
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_every_operation_in_source(language, tmp_path):
+    rtol, atol = 2e-13, 1e-14
+    expected = np.concatenate([np.ravel(y) for y in jax.jit(every)(TAKEN)])
+    np.testing.assert_allclose(language(every, TAKEN, tmp_path), expected, rtol=rtol, atol=atol)
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
+def test_no_number_and_signed_zeros_in_source(language, tmp_path):
+    """Bit for bit, but for the sign of NaN, and for the zero that NumPy's maximum of two zeros is."""
+    expected = np.concatenate([np.ravel(y) for y in jax.jit(odd)(X)])
+    found = language(odd, X, tmp_path)
+    np.testing.assert_array_equal(found, expected)
+    if language is in_c:
+        signed = ~np.isnan(expected)
+        np.testing.assert_array_equal(np.signbit(found[signed]), np.signbit(expected[signed]))
+
+
+# Bicycles from parts
+
+
+def steered():
+    """Tyres that slip, one of them measured, a head that gives way, a rider, a path, a motor, drag, a grade."""
+    rider = LeaningRider(
+        mass=40.0, x=0.25, z=-1.0, Ixx=1.8, Iyy=1.8, Izz=0.9, Ixz=0.1, hinge_x=0.2, hinge_z=-0.8, stiffness=120.0
+    )  # fmt: skip
+    simple = LateralSlip(9e3, 9e2, relaxation_length=0.1, pneumatic_trail=0.02)
+    gains = LeanSteerGains(-50.0, 35.0, -13.0, 3.5, command="steer_command")
+    return separate_rider(Bicycle.benchmark(), rider).with_parts(
+        rear_tyre=Tyre(crown=0.02, lateral=simple, rolling_resistance=0.005, load_lag=0.05),
+        front_tyre=Tyre(lateral=schwalbe_energizer(relaxation_length=0.1), longitudinal=LongitudinalSlip(1e4)),
+        head=HeadTwist(5e3, 10.0, 0.4),
+        control=(PathFollower(LaneChange()), gains),
+        steering=(SteeringFriction(0.2), SteeringMotor(lag=0.02, delay=0.03, limit=20.0, rotor_inertia=1e-4)),
+        drive=Drag(),
+        road=Slope(0.05, 0.3),
+    )
+
+
+def carrying():
+    """A rider's arms, and a trailer."""
+    rider = RigidRider(mass=42.0, x=0.2, z=-1.25, Ixx=1.7, Iyy=1.5, Izz=0.9, Ixz=0.0, shoulder=[0.33, 0.2, -1.47])
+    trailer = Trailer(
+        hitch_x=-0.1, hitch_z=-0.5, length=1.2, wheel_radius=0.25, mass=20.0, center=0.1, height=0.2, Ixx=1.0, Iyy=1.0,
+        Izz=1.2,
+    )  # fmt: skip
+    return browser_jason().with_parts(
+        rider=rider, extra=[Arms.of_person(83.5, 1.83, grip=[0.55, 0.28, -1.05]), trailer]
+    )
+
+
+def over_a_bump():
+    bump = Road(lambda x, y: 0.05 * jnp.exp(-(((x - 2.0) / 0.5) ** 2)) + 0.01 * y)
+    return Bicycle.benchmark().with_parts(road=bump, rear_tyre=Tyre(crown=0.02))
+
+
+@pytest.mark.slow
+@needs_compiler
+@pytest.mark.parametrize("made", [steered, carrying, over_a_bump], ids=lambda made: made.__name__)
+def test_every_export_of_a_bicycle_from_parts_gives_the_numbers_of_the_library(made, tmp_path):
+    """At a state where nothing is zero, and with other parameters than those that were exported."""
+    rtol = 1e-12
+    bicycle, t, rng = made(), 0.7, np.random.default_rng(0)
+    of = lambda names, size: {name: float(size * rng.normal()) for name in names}  # noqa: E731
+    moving = of(bicycle.speeds, 0.1) | {"rear_wheel_rate": -15.0}
+    held = [name for name in bicycle.coordinates if name not in bicycle.dependent_coordinates]
+    start = jk.assemble(bicycle, of(held, 0.05), moving)
+    q, u = np.asarray(start.q), np.asarray(start.u)
+    values = of(bicycle.inputs, 0.3) | of(bicycle.states, 0.01)
+
+    names = [name for name in jk.export.parameters(bicycle) if name.endswith((".mass", ".stiffness", "w", "mH"))]
+    exported, bicycle = bicycle, bicycle.with_parts(
+        **{name: 1.01 * jk.export.parameters(bicycle)[name] for name in names}
+    )  # fmt: skip
+    parameters = jk.export.parameters(bicycle)
+    expected = {
+        "rates": [jk.coordinate_rates(bicycle, t, q, u), jk.accelerations(bicycle, t, q, u, values)],
+        "equations": jk.equations_of_motion(bicycle, t, q, u, values),
+        "dependent_speeds": [jk.dependent_speeds(bicycle, t, q, u)],
+    }
+    if bicycle.states:
+        rates = jk.state_rates(bicycle, t, q, u, values)
+        expected["state_rates"] = [[rates[name] for name in bicycle.states]]
+    expected = {function: [np.asarray(x) for x in numbers] for function, numbers in expected.items()}
+    functions, w = tuple(expected), np.array([*values.values()])
+
+    files = jk.export.c(exported, tmp_path / "bicycle.c", functions)
+    library, module = library_of(files, tmp_path), {}
+    exec(jk.export.numpy(exported, functions=functions), module)
+    column = np.concatenate([x.ravel() for x in parameters.values()])
+    for function, numbers in expected.items():
+        in_c = call(library, f"bicycle_{function}", t, [q, u, w, column], [x.shape for x in numbers])
+        in_numpy = module[function](t, q, u, w, parameters)
+        assert_close(in_c, numbers, rtol, f"C, {function}")
+        assert_close(in_numpy if isinstance(in_numpy, tuple) else [in_numpy], numbers, rtol, f"NumPy, {function}")
+    rates = jk.export.stablehlo(exported).call(*(np.array([x]) for x in (t, q, u, w)), parameters)
+    assert_close([x[0] for x in rates], expected["rates"], rtol, "StableHLO")
+    pytest.importorskip("casadi")
+    rates = jk.export.casadi(exported)(t, q, u, w, column)
+    assert_close([np.array(x)[:, 0] for x in rates], expected["rates"], rtol, "CasADi")
+
+
+# CasADi
+
+
+@pytest.mark.parametrize("name", [*SYSTEMS, *SLOW])
+def test_casadi_gives_the_numbers_and_derivatives_of_the_library(name):
+    rtol, of_derivatives = 1e-13, 1e-12
+    pytest.importorskip("casadi")
+    system, t, q, u, w = case(name)
+    numbers = np.concatenate([x.ravel() for x in jk.export.parameters(system).values()])
+    expected = by_library(system, t, q, u, w, ("rates", "equations", "state_jacobian"))
+    f = jk.export.casadi(system)
+    assert f.name_in() == ["t", "q", "u", "inputs", "parameters"]
+    assert f.name_out() == ["q_dot", "u_dot"]
+    args = (t, q, u, w, numbers)
+    assert_close([np.array(x)[:, 0] for x in f(*args)], expected["rates"], rtol)
+    M, right = jk.export.casadi(system, "equations")(*args)
+    assert_close([np.array(M), np.array(right)[:, 0]], expected["equations"], rtol)
+    own = f.jacobian()(*args, *f(*args))  # by CasADi: q_dot and u_dot, each by t, q, u, inputs, parameters
+    blocks = np.block([[np.array(own[1]), np.array(own[2])], [np.array(own[6]), np.array(own[7])]])
+    ours = np.array(jk.export.casadi(system, "state_jacobian")(*args))
+    for found in (blocks, ours):
+        assert_close([found], expected["state_jacobian"], of_derivatives)
+
+
+def test_every_operation_in_casadi():
+    """But for float32, which is refused: see below."""
+    rtol = 2e-13
+    ca = pytest.importorskip("casadi")
+    from jaxkane._scalarjit.backends.source import as_objects
+    from jaxkane._scalarjit.graph import needed
+    from jaxkane.export._casadi import table
+
+    graph, nodes, outputs, _ = graph_of(every_in_float64, TAKEN)
+    x = [ca.SX.sym(f"x{i}") for i in range(TAKEN.size)]
+    given = dict(zip(map(int, nodes), x, strict=True))
+    found = as_objects(graph, needed(graph.nodes, outputs), given, table(ca), lambda v, _: ca.SX(float(v)), "CasADi")
+    assert {node.operation for node in graph.nodes} - {"input", "constant"} == {*table(ca)}
+    f = ca.Function("f", x, [ca.vertcat(*(found[int(k)] for array in outputs for k in array.flat))])
+    expected = np.concatenate([np.ravel(y) for y in jax.jit(every_in_float64)(TAKEN)])
+    np.testing.assert_allclose(np.array(f(*TAKEN))[:, 0], expected, rtol=rtol, atol=1e-14)
+
+
+# StableHLO
+
+ELSEWHERE = """
+import sys
+class Refuses:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in ("jaxkane", "equinox", "llvmlite"):
+            raise ImportError(name)
+sys.meta_path.insert(0, Refuses())
+import jax, numpy as np
+jax.config.update("jax_enable_x64", True)
+f = jax.export.deserialize(bytearray(open(sys.argv[1], "rb").read()))
+given = dict(np.load(sys.argv[2]))
+t, q, u, w = (given.pop(name) for name in ("t", "q", "u", "w"))
+found = {}
+for b in (1, 3):
+    out = f.call(t[:b], q[:b], u[:b], w[:b], given)
+    found |= {f"{i} of {b}": np.asarray(x) for i, x in enumerate(out)}
+gradient = jax.grad(lambda q: f.call(t, q, u, w, given)[1].sum())(q)
+np.savez(sys.argv[3], gradient=gradient, **found)
+"""
+
+
+def test_stablehlo_is_loaded_without_jaxkane_for_any_batch_and_gives_the_same_bits(tmp_path):
+    rtol = 1e-13
+    pytest.importorskip("flatbuffers")
+    system, t, q, u, w = case("DoublePendulum")
+    exported = jk.export.stablehlo(system, tmp_path / "it.stablehlo", derivatives=1)
+    text = exported.mlir_module()
+    assert text.count("custom_call") == text.count("@shape_assertion"), "something that only this process has"
+    rng = np.random.default_rng(0)
+    batch = {"t": np.full(3, t), "w": np.tile(w, (3, 1))}
+    batch |= {"q": q + rng.normal(size=(3, 2)), "u": u + rng.normal(size=(3, 2))}
+    np.savez(tmp_path / "given.npz", **batch, **jk.export.parameters(system))
+    command = [
+        sys.executable,
+        "-c",
+        ELSEWHERE,
+        tmp_path / "it.stablehlo",
+        tmp_path / "given.npz",
+        tmp_path / "found.npz",
+    ]
+    little = {"JAX_DISABLE_MOST_OPTIMIZATIONS": str(jax.config.read("jax_disable_most_optimizations"))}
+    subprocess.run(command, env=os.environ | little, check=True)
+    found = dict(np.load(tmp_path / "found.npz"))
+
+    by_jit = jax.jit(exported.call)
+    for b in (1, 3):
+        for i, x in enumerate(
+            by_jit(*(batch[name][:b] for name in ("t", "q", "u", "w")), jk.export.parameters(system))
+        ):
+            np.testing.assert_array_equal(found[f"{i} of {b}"], x)
+    given = dict(zip(system.inputs, w, strict=True))
+    rates = jax.vmap(lambda q, u: jk.accelerations(system, t, q, u, given))
+    np.testing.assert_allclose(found["1 of 3"], rates(batch["q"], batch["u"]), rtol=rtol)
+    gradient = jax.grad(lambda q: rates(q, batch["u"]).sum())(batch["q"])
+    np.testing.assert_allclose(found["gradient"], gradient, rtol=1e-11)
+
+
+def test_stablehlo_of_many_parameters_and_of_what_formulas_cannot_hold():
+    rtol = 1e-12
+    system, t, q, u, w = case("Odd")
+    exported = jk.export.stablehlo(system, function="equations", batch_parameters=True)
+    numbers = jk.export.parameters(system)
+    twice = {name: np.stack([x, 1.5 * x]) for name, x in numbers.items()}
+    M, f = exported.call(np.full(2, t), *(np.tile(x, (2, 1)) for x in (q, u, w)), twice)
+    heavier = jax.tree.map(lambda x: 1.5 * x, system)
+    for i, each in enumerate((system, heavier)):
+        assert_close([M[i], f[i]], by_library(each, t, q, u, w, ["equations"])["equations"], rtol)
+
+
+class Tower(jk.System):
+    """More slides, one on the other, than are solved for among the scalars."""
+
+    mass: jk.Scalar = jk.parameter(1.0)
+    coordinates = tuple(f"x{i}" for i in range(13))
+    speeds = tuple(f"v{i}" for i in range(13))
+
+    def motion(self, t, q, u):
+        N, P = jk.inertial()
+        bodies = []
+        for x, v in zip(q, u, strict=True):
+            P = P.moving(x * N.x, v * N.x)
+            bodies.append(jk.Body(self.mass, 0.0, P, N))
+        return jk.Motion(bodies)
+
+    def loads(self, t, q, u, motion, inputs):
+        return [jk.Force(-x * motion.N.x, body) for x, body in zip(q, motion.bodies, strict=True)]
+
+
+def test_many_speeds_are_exported_but_for_what_lapack_does():
+    tower, q, u = Tower(), np.linspace(0.1, 0.2, 13), np.linspace(-1.0, 1.0, 13)
+    with pytest.raises(ValueError, match=r"Tower: 'rates' .* with 13 speeds .* by LAPACK.*functions=\('equations',\)"):
+        jk.export.numpy(tower)
+    module = {}
+    exec(jk.export.numpy(tower, functions=("equations",)), module)
+    expected = jk.equations_of_motion(tower, 0.0, q, u)
+    assert_close(module["equations"](0.0, q, u), [np.asarray(x) for x in expected], 1e-13)
+    rates = jk.export.stablehlo(tower).call(
+        np.zeros(1), q[None], u[None], np.zeros((1, 0)), jk.export.parameters(tower)
+    )
+    assert_close([rates[1][0]], [np.asarray(jk.accelerations(tower, 0.0, q, u))], 1e-12)
+
+
+class ByMatrix(Bob):
+    """A description that multiplies matrices too large to be written out."""
+
+    def loads(self, t, q, u, motion, inputs):
+        x = jnp.concatenate([jnp.asarray(q), jnp.zeros(70)]) @ jnp.ones((70 + len(q), 2))
+        return [jk.Force(x[0] * motion.N.x, motion.bodies[0])]
+
+
+class InHalves(Bob):
+    """A description that rounds in between."""
+
+    def loads(self, t, q, u, motion, inputs):
+        return [jk.Force(q["x"].astype(jnp.float32).astype(q["x"].dtype) * motion.N.x, motion.bodies[0])]
+
+
+class Strange(jk.System):
+    """A parameter that no number stands for, on whose batch the motion would depend."""
+
+    mass: jk.Scalar = jk.parameter(1.0)
+    coordinates = ("x",)
+    speeds = ("v",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(self.mass, 0.0, O.moving(q[0] * N.x, u[0] * N.x))])
+
+
+def test_what_cannot_be_exported_is_named(monkeypatch, tmp_path):
+    with pytest.raises(ValueError, match="no function rate; did you mean 'rates'"):
+        jk.export.c(Strange(), tmp_path / "a.c", functions=("rate",))
+    with pytest.raises(ValueError, match="no function nothing"):
+        jk.export.stablehlo(Strange(), function="nothing")
+    with pytest.raises(TypeError, match=r"one is \('rates',\)"):
+        jk.export.numpy(Strange(), functions="rates")
+    with pytest.raises(ValueError, match=r"`functions` names none"):
+        jk.export.c(Strange(), tmp_path / "a.c", functions=())
+    with pytest.raises(ValueError, match=r"platforms are of cpu, cuda, rocm, tpu; got .*gpu"):
+        jk.export.stablehlo(Strange(), platforms=("cpu", "gpu"))
+    with pytest.raises(TypeError, match=r"platforms is a sequence of names; one is \('cpu',\)"):
+        jk.export.stablehlo(Strange(), platforms="cpu")
+    with pytest.raises(ValueError, match=r"Strange has no dependent speeds.*Leave it out"):
+        jk.export.numpy(Strange(), functions=("dependent_speeds",))
+    with pytest.raises(ValueError, match="Strange is a batch"):
+        jk.export.numpy(Strange(mass=[1.0, 2.0]))
+    with pytest.raises(TypeError, match="instance of a System"):
+        jk.export.numpy(Strange)
+    with pytest.raises(ValueError, match="'float64' or 'float32'"):
+        jk.export.numpy(Strange(), dtype="float16")
+    with pytest.raises(ValueError, match=r"ends with \.c.* got '.*folder'"):
+        jk.export.c(Strange(), tmp_path / "folder")
+    with pytest.raises(TypeError, match=r"Strange is being traced"):
+        jax.jit(lambda m: jk.export.numpy(Strange(mass=m)))(1.0)
+    with pytest.raises(ValueError, match=r"ByMatrix: 'rates' .*dot_general.*export.stablehlo"):
+        jk.export.numpy(ByMatrix())
+    assert not [*tmp_path.iterdir()], "nothing was written"
+    if importlib.util.find_spec("casadi"):
+        with pytest.raises(ValueError, match="no function nothing"):
+            jk.export.casadi(Strange(), "nothing")
+        with pytest.raises(TypeError, match="one function at a time"):
+            jk.export.casadi(Strange(), ("rates",))
+        with pytest.raises(ValueError, match=r"InHalves: .* float32 in between, which CasADi has not"):
+            jk.export.casadi(InHalves())
+    monkeypatch.setitem(sys.modules, "flatbuffers", None)
+    with pytest.raises(ImportError, match=r'pip install "jaxkane\[stablehlo\]"'):
+        jk.export.stablehlo(Strange(), tmp_path / "a.stablehlo")
+    monkeypatch.setitem(sys.modules, "casadi", None)
+    with pytest.raises(ImportError, match=r'pip install "jaxkane\[casadi\]"'):
+        jk.export.casadi(Strange())
+
+
+def test_no_parameters_no_inputs(tmp_path):
+    class Bare(jk.System):
+        coordinates = ("x",)
+        speeds = ("v",)
+
+        def motion(self, t, q, u):
+            N, O = jk.inertial()
+            return jk.Motion([jk.Body(1.0, 0.0, O.moving(q[0] * N.x, u[0] * N.x))])
+
+    assert "parameter_jacobian" not in jk.export.c(Bare(), tmp_path / "bare.c").header.read_text()
+    assert "PARAMETERS = {\n}" in jk.export.numpy(Bare())
+    module = {}
+    exec(jk.export.numpy(Bare(), functions=("rates", "parameter_jacobian", "input_jacobian")), module)
+    np.testing.assert_array_equal(module["rates"](0.0, [1.0], [2.0]), [[2.0], [0.0]])
+    assert module["parameter_jacobian"](0.0, [1.0], [2.0]).shape == (2, 0)
+    if CC:
+        files = jk.export.c(Bare(), tmp_path / "bare.c", functions=("rates", "parameter_jacobian"))
+        sources = [files.source, files.test]
+        subprocess.run([CC, *STRICT, *sources, "-lm", "-o", tmp_path / "test"], check=True)
+        subprocess.run([tmp_path / "test"], check=True, stdout=subprocess.DEVNULL)

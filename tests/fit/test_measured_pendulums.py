@@ -1,0 +1,44 @@
+"""Intervals of a measured pendulum cover the truth as often as they say.
+
+That two and three arms are explained as well as elsewhere, and what cannot be told of them, is asserted by
+`examples/identify_pendulums.py`.
+"""
+
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane.fit import Free, LeastSquares, Problem, Simulation, Trial, minimize
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+@pytest.mark.slow
+def test_intervals_of_the_single_arm_cover():
+    """Twenty simulated versions of the measured swings, of which every tenth sample is taken."""
+    sigma, rng = 0.0009, np.random.default_rng(7)  # [rad], what the residuals are; another seed, another few per cent
+    Arm = runpy.run_path(str(EXAMPLES / "identify_a_pendulum.py"))["Arm"]
+    true = {"inertia": 0.0033414, "dry": 0.0005, "drag": 1.47e-5, "offset": 0.00085}
+    truth = Arm(**true)
+    free = ["inertia", Free("dry", scale=1e-4), Free("drag", scale=1e-5), Free("offset", scale=0.01)]
+    clean = []
+    for swing in jk.data.multi_arm_pendulum(1).trials:
+        start = {"angle1": float(swing.measured["angle1"][0]), "rate1": float(swing.initial["rate1"][0])}
+        ride = jk.simulate(truth, jk.State([start["angle1"]], [start["rate1"]]), swing.t[::10], rtol=1e-9, atol=1e-11)
+        clean.append((swing.t[::10], np.asarray(ride["angle1"]), start))
+    problem, covered = None, []
+    for _ in range(20):
+        noisy = [
+            Trial(t, {"angle1": angle + rng.normal(0.0, sigma, t.size)}, sigma=sigma, initial=start)
+            for t, angle, start in clean
+        ]
+        # At 1e-8 the errors of the steps are a noise of the cost, in which a fit may get stuck beside its minimum.
+        posed = {"unknown": ("angle1", "rate1"), "simulation": Simulation(rtol=1e-10)}
+        problem = Problem.of(truth, noisy, free, **posed) if problem is None else problem.with_trials(noisy)
+        found = minimize(problem, LeastSquares())
+        assert found.ok
+        covered += [low <= true[name] <= high for name, (low, high) in found.intervals().items()]
+    assert 0.9 <= np.mean(covered) <= 0.99

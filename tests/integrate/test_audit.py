@@ -1,0 +1,184 @@
+"""The audit: energy balance of every entry, its honesty about quadrature, and what it says of what went wrong."""
+
+import jax.numpy as jnp
+import matplotlib
+import numpy as np
+import pytest
+from test_events import TOP, Bead, Particle
+
+import jaxkane as jk
+from jaxkane._integrate.audit import Pieces, _cumulative_integral
+from jaxkane.catalog import CATALOG
+
+RTOL = 1e-8
+matplotlib.use("agg")
+
+
+def run(name, end=10.0, times=1001, inputs=None, **options):
+    entry = CATALOG[name]
+    system, state = entry.example(), jk.State(jnp.array(entry.q), jnp.array(entry.u))
+    return system, jk.simulate(system, state, jnp.linspace(0.0, end, times), inputs, **options)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in CATALOG if name != "BarWithPiston"])
+def test_energy_balance_of_ten_seconds(name):
+    # Conservative or not: the audit counts the work of dampers, and of the motors of Example 5's engines.
+    audit = jk.audit(*run(name, rtol=1e-10, atol=1e-10))
+    assert audit.energy_balance < RTOL
+    assert audit.work_error < RTOL * audit.kinetic_energy.max()
+    assert audit.ok
+    assert audit.reason == "completed"
+    assert audit.drift < RTOL
+
+
+@pytest.mark.slow
+def test_work_that_the_times_do_not_resolve_is_not_blamed_on_the_motion():
+    # Exercise 5.1 comes to rest within a second: 100 times a second are too few for the damper's work.
+    audit = jk.audit(*run("BarWithPiston", rtol=1e-10, atol=1e-10))
+    assert audit.energy_balance > RTOL
+    assert np.abs(audit.energy_error).max() < 3 * audit.work_error
+    assert "save more times" in str(audit)
+    # In the same program: as many times in a quarter of the time.
+    assert jk.audit(*run("BarWithPiston", end=2.5, rtol=1e-10, atol=1e-10)).energy_balance < RTOL
+
+
+@pytest.mark.slow
+def test_inputs_do_work():
+    audit = jk.audit(*run("DoublePendulum", 2.0, 401, {"shoulder_torque": lambda t, s: jnp.sin(t) - s["theta1_dot"]}))
+    assert np.abs(audit.work).max() > 0.1
+    assert audit.energy_balance < 1e-7
+
+
+@pytest.mark.slow
+def test_a_free_body_keeps_its_momenta():
+    audit = jk.audit(*run("RigidBody", 2.0, 21))
+    text = str(audit)
+    assert text.count("conserved\n") == 2
+    assert "configuration" in text  # the norm of the Euler parameters
+    np.testing.assert_allclose(audit.angular_momentum, audit.angular_momentum[:1].repeat(21, 0), atol=1e-6)
+
+
+def test_a_coarse_run_is_found_out():
+    audit = jk.audit(*run("DoublePendulum", 2.0, 11, rtol=1e-2, atol=1e-2))
+    assert not audit.ok
+    assert "bad" in str(audit)
+
+
+@pytest.mark.slow
+def test_conditioning_of_the_bicycle():
+    system, ride = run("WhippleBicycle", 1.0, 11)
+    audit = jk.audit(system, ride)
+    M = jk.mass_matrix(system, 0.0, ride.q[0], ride.u[0])
+    size = np.sqrt(np.diag(M))
+    np.testing.assert_allclose(audit.condition_M[0], np.linalg.cond(M / np.outer(size, size)), rtol=1e-10)
+    assert audit.velocity_residuals.shape == (11, 3)
+    assert 1 < audit.condition_C_dep.max() < 10
+    assert audit.plot().shape == (2, 2)
+
+
+def test_a_run_that_ended_early_is_audited_up_to_there():
+    ts = jnp.linspace(0.0, 2.0, 11)
+    audit = jk.audit(Bead(), jk.simulate(Bead(), jk.State(TOP, jnp.ones(1)), ts))
+    np.testing.assert_array_equal(audit.t, ts[np.cos(ts) > 0.3])  # until y = 0.3 on the circle of 1 m
+    assert "low" in str(audit)
+    assert audit.energy_balance < 1e-7
+
+
+def test_quadrature_is_exact_for_polynomials_at_uneven_times():
+    t = np.sort(np.random.default_rng(3).uniform(0.0, 2.0, 30))
+    integral = _cumulative_integral(t, 8 * t**7 - 1.0, 8)
+    np.testing.assert_allclose(integral, t**8 - t - (t[0] ** 8 - t[0]), rtol=0, atol=1e-10)
+    np.testing.assert_allclose(_cumulative_integral(t[:2], t[:2], 8)[1], 0.5 * (t[1] ** 2 - t[0] ** 2))
+
+
+KNOTS = np.linspace(0.0, 2.0, 21)
+TORQUE = jk.Samples(KNOTS, np.random.default_rng(5).normal(size=21), hold=True)
+
+
+@pytest.mark.parametrize(
+    "torque",
+    [
+        TORQUE,
+        pytest.param(jk.Samples(KNOTS, TORQUE.values), marks=pytest.mark.slow),
+        pytest.param(jk.Samples(KNOTS + 0.0334, TORQUE.values, hold=True), marks=pytest.mark.slow),
+        pytest.param(lambda t, s: TORQUE(t - 0.05) - 0.3 * s["theta1_dot"], marks=pytest.mark.slow),
+    ],
+    ids=["held", "linear", "between the times", "in a function"],
+)
+def test_the_work_of_inputs_with_kinks_and_jumps(torque):
+    rtol = 2e-7
+    audit = jk.audit(*run("DoublePendulum", 2.0, 201, {"shoulder_torque": torque}, rtol=1e-11, atol=1e-11))
+    assert audit.ok
+    assert np.abs(audit.work).max() > 0.1
+    assert audit.energy_balance < rtol
+    assert audit.work_error < 10 * rtol * np.abs(audit.work).max()
+
+
+@pytest.mark.slow
+def test_jumps_between_the_times_are_not_blamed_on_the_motion():
+    torque = {"shoulder_torque": jk.Samples(KNOTS, TORQUE.values, hold=True)}
+    audit = jk.audit(*run("DoublePendulum", 2.0, 6, torque, rtol=1e-11, atol=1e-11))
+    assert audit.ok
+    assert "save more times" in str(audit)
+
+
+@pytest.mark.parametrize("times", [21, 2])
+def test_a_jump_that_nobody_announces_is_not_blamed_on_the_motion(times):
+    """A function may jump where it likes: two orders of quadrature agree about that, half of the times does not."""
+    system, start = Particle(gravity=0.1, ends="none"), jk.State(np.ones(1), np.zeros(1))
+    drive = {"drive": lambda t, state: jnp.where(t > 1.03, 1.0, -1.0) * (1.0 - state["h"])}
+    audit = jk.audit(system, jk.simulate(system, start, np.linspace(0.0, 2.0, times), drive))
+    assert audit.ok
+    assert 10 * audit.work_error > np.abs(audit.energy_error).max() > 1e-4
+
+
+def test_quadrature_of_pieces_is_exact_for_cubics():
+    """Between jumps, some at the times, some beside them: cubics of random coefficients, continued by zero."""
+    rtol, rng = 1e-11, np.random.default_rng(3)
+    t, jumps = np.linspace(0.0, 2.0, 21), np.array([0.3, 0.55, 0.8, 0.9, 1.42, 2.0])
+    cubics = rng.normal(size=(7, 4))
+    pieces = Pieces(t, jumps, 1e-14)
+    at, number = pieces.t, pieces.piece
+    values = np.array([np.polyval(cubics[i], x) for i, x in zip(number, at)])
+    rates = np.array([np.polyval(np.polyder(cubics[i]), x) for i, x in zip(number, at)])
+    ends = np.concatenate([[0.0], jumps[:-1], [2.0]])
+    exact = np.zeros_like(t)
+    for cubic, start, stop in zip(cubics, ends, ends[1:]):
+        integral = np.polyint(cubic)
+        exact += np.polyval(integral, np.clip(t, start, stop)) - np.polyval(integral, start)
+    np.testing.assert_allclose(pieces.integral(t, values, rates, 0), exact, rtol=rtol, atol=rtol)
+    seven = [np.polyval(np.polyder(c), x) for c, x in zip(cubics[number], at)]
+    known = np.bincount(number)[number] > 3
+    np.testing.assert_allclose(pieces.rate(values)[known], np.array(seven)[known], rtol=1e-8, atol=1e-8)
+
+
+def test_a_batch_is_refused():
+    system, swing = run("DoublePendulum", 1.0, 11)
+    batch = jk.Trajectory(**{f: getattr(swing, f) for f in swing.__dataclass_fields__} | {"t": swing.t[None]})
+    with pytest.raises(ValueError, match="one member"):
+        jk.audit(system, batch)
+
+
+class Satellite(jk.System):
+    """A point mass on a circle, in metres and radians."""
+
+    coordinates, speeds = ("r", "angle"), ("r_dot", "rate")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, q["angle"], u["rate"], "A")
+        P = O.moving(q["r"] * A.x, u["r_dot"] * A.x)
+        return jk.Motion([jk.Body(500.0, 0.0, P, name="satellite")], frames={"A": A})
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force(-500.0 * 3.986e14 / q["r"] ** 2 * motion["A"].x, motion["satellite"])
+
+
+@pytest.mark.slow
+def test_metres_beside_radians_are_no_bad_condition():
+    rate = np.sqrt(3.986e14 / 7e6**3)
+    ride = jk.simulate(Satellite(), jk.State([7e6, 0.0], [0.0, rate]), np.linspace(0.0, 0.1, 11) / rate)
+    audit = jk.audit(Satellite(), ride)
+    np.testing.assert_allclose(audit.condition_M, 1.0)
+    assert audit.ok

@@ -1,0 +1,148 @@
+"""The audit in proportion to the right-hand side, and what it says of loads that nothing feels."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane._integrate import audit as balance
+from jaxkane._kane import kane as rates
+from jaxkane._scalarjit import linear
+from jaxkane._scalarjit.function import _Program
+
+TILTS = ((0.3, 0.5, 0.81), (0.7, -0.2, 0.4), (-0.4, 0.6, 0.5))
+
+
+class TiltedChain(jk.System):
+    """Rods on hinges, each tilted by a fixed angle in a general direction; the tip may be held in a plane."""
+
+    n: int = eqx.field(static=True, default=4)
+    held: bool = eqx.field(static=True, default=False)
+    length: jk.Scalar = jk.parameter(0.2)  # of each rod [m]
+
+    @property
+    def coordinates(self):
+        return tuple(f"q{i + 1}" for i in range(self.n))
+
+    @property
+    def speeds(self):
+        return tuple(f"u{i + 1}" for i in range(self.n - self.held))
+
+    @property
+    def dependent_speeds(self):
+        return (f"u{self.n}",) * self.held
+
+    def q_dot(self, t, q, u):
+        return tuple(u)
+
+    def motion(self, t, q, u):
+        link, joint = jk.inertial()
+        bodies = []
+        for i in range(self.n):
+            axis = np.array(TILTS[i % 3]) / np.linalg.norm(TILTS[i % 3])
+            link = link.rotate(link.vector(*axis), 0.3 + 0.1 * i, 0.0).rotate(1 + i % 2, q[i], u[i])
+            bodies.append(jk.Body(0.3, (1e-3, 1e-3, 1e-4), joint.fixed(-0.5 * self.length * link.z), link))
+            joint = joint.fixed(-self.length * link.z)
+        residuals = [joint.velocity.dot(link.root.x)] if self.held else []
+        return jk.Motion(bodies, residuals, points={"tip": joint})
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.z)
+
+
+def operations(f, system, *more):
+    """Equations of a program as it is compiled, and what it is."""
+    n, m = len(system.coordinates), len(system.speeds)
+    args = (system, jnp.array(0.4), jnp.full(n, 0.3), jnp.full(m, 0.2), {}, *more)
+    leaves, treedef = jax.tree.flatten(args)
+    program = _Program(jax.make_jaxpr(lambda *x: f.__wrapped__(*jax.tree.unflatten(treedef, x)))(*leaves))
+    return len(program.program.jaxpr.eqns), program.is_plain
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("held", [False, True])
+def test_the_audit_costs_what_the_accelerations_cost(held):
+    """It is one plain program, so that nothing is computed twice; and no longer than a right-hand side."""
+    counts = {}
+    for n in (4, 6, 8):
+        system = TiltedChain(n=n, held=held)
+        counts[n], is_plain = operations(balance._measured, system, jnp.ones(n - held))
+        assert is_plain
+    assert counts[6] < operations(rates._motion_rates, TiltedChain(n=6, held=held))[0]
+    # Linear but for the weights and the columns of the constraint, which pass all frames: less than quadratic
+    assert counts[8] - counts[6] < 1.6 * (counts[6] - counts[4])
+
+
+@pytest.mark.slow
+def test_long_and_short_chains_are_audited_alike(monkeypatch):
+    """The accelerations in one program or by columns and LAPACK: the same table, forces and multipliers."""
+    system = TiltedChain(n=3, held=True)
+    q, u = jnp.array([0.3, -0.2, 0.5]), jnp.array([1.0, -0.5])
+    ride = jk.simulate(system, jk.State(q, u), jnp.linspace(0.0, 0.05, 6))
+    found = []
+    for most in (12, 0):
+        monkeypatch.setattr(linear, "_UNROLL_UP_TO", most)
+        jax.clear_caches()
+        audit = jk.audit(system, ride)
+        at = (system, 0.0, q, u)
+        found.append(
+            (audit, jk.constraint_forces(*at), jk.constraint_multipliers(*at), jk.dependent_accelerations(*at))
+        )
+    close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-7)  # noqa: E731
+    jax.tree.map(close, *found)
+    assert found[0][0].ok
+
+
+class Rod(jk.System):
+    """A driven rod in a plane; where `anew`, its torque acts on a frame that `loads` makes itself."""
+
+    anew: bool = eqx.field(static=True, default=False)
+    coordinates = ("angle",)
+    speeds = ("rate",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        rod = N.rotate(3, q["angle"], u["rate"])
+        return jk.Motion([jk.Body(1.0, (0.1, 0.0, 0.1), O.fixed(0.5 * rod.x), rod)], frames={"rod": rod})
+
+    def loads(self, t, q, u, motion, inputs):
+        rod = motion.N.rotate(3, q["angle"], u["rate"]) if self.anew else motion["rod"]
+        return (jk.Torque(0.2 * motion.N.z, rod),)
+
+
+def test_a_load_on_a_frame_that_loads_made_is_felt_and_its_work_is_counted():
+    """0.2 N m on a rod of 0.1 kg m^2 about its end, 1 kg at 0.5 m: 0.2 / 0.35 rad/s^2."""
+    start, ts = jk.State(jnp.zeros(1), jnp.array([2.0])), jnp.linspace(0.0, 0.1, 6)
+    for anew in (False, True):
+        np.testing.assert_allclose(jk.accelerations(Rod(anew=anew), 0.0, [0.0], [2.0]), 0.2 / 0.35, rtol=1e-14)
+    audit = jk.audit(Rod(anew=True), jk.simulate(Rod(anew=True), start, ts))
+    assert audit.ok
+    np.testing.assert_allclose(audit.work, 0.2 * (2.0 * ts + 0.5 * 0.2 / 0.35 * ts**2), rtol=1e-7)
+
+
+class Geared(jk.System):
+    """Two particles on rails, 1e-9 a + b = 0 of their speeds, solved for a."""
+
+    coordinates = ("x", "y")
+    speeds = ("b",)
+    dependent_speeds = ("a",)
+
+    def q_dot(self, t, q, u):
+        return u["a"], u["b"]
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P, Q = O.moving(q["x"] * N.x, u["a"] * N.x), O.moving(q["y"] * N.y, u["b"] * N.y)
+        bodies = [jk.Body(1.0, 0.0, P, name="P"), jk.Body(1.0, 0.0, Q, name="Q")]
+        return jk.Motion(bodies, [1e-9 * u["a"] + u["b"]])
+
+
+@pytest.mark.slow
+def test_one_residual_is_conditioned_by_the_speeds_beside_it():
+    """C_dep alone is (1 x 1) and has the condition number 1, whatever it is."""
+    ride = jk.simulate(Geared(), jk.State(jnp.zeros(2), jnp.array([1e-9])), jnp.linspace(0.0, 0.1, 6))
+    audit = jk.audit(Geared(), ride)
+    np.testing.assert_allclose(audit.condition_C_dep, 1e9, rtol=1e-6)
+    assert [verdict for what, _, verdict in audit.lines() if what == "condition of C_dep"] == ["look"]

@@ -1,0 +1,542 @@
+"""The instant at which a motion ends: exact times, directions, derivatives, batches, and what does not end it."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.special import ellipk
+from slopes import differences, slopes
+
+import jaxkane as jk
+from jaxkane._integrate.events import first_crossing
+
+TS = jnp.linspace(0.0, 2.0, 11)
+
+
+class Particle(jk.System):
+    """Falls along h; `drive` is one more force."""
+
+    mass: jk.Scalar = jk.parameter(1.0)
+    gravity: jk.Scalar = jk.parameter(9.81)
+    ends: str = eqx.field(static=True, default="ground")
+    coordinates, speeds, inputs = ("h",), ("v",), ("drive",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(self.mass, 0.0, O.moving(q["h"] * N.y, u["v"] * N.y), N)])
+
+    def loads(self, t, q, u, motion, inputs):
+        body = motion.bodies[0]
+        return [*jk.weight(motion, -self.gravity * motion.N.y), jk.Force(inputs["drive"] * motion.N.y, body.center)]
+
+    def events(self, t, q, u):
+        return {
+            "ground": {"ground": jk.falling(q["h"])},
+            "either": {"ground": q["h"]},
+            "none": {},
+            "root": {"low": jk.falling(jnp.sqrt(q["h"] - 0.2) - 0.1)},  # at 0.21 m; no number below 0.2 m
+            "lost": {"low": jnp.sqrt(q["h"] - 0.2) + 1.0},
+            "roof": {"a_late": jk.falling(q["h"]), "b_early": jk.falling(q["h"] - 0.1), "c_top": jk.falling(u["v"])},
+        }[self.ends]
+
+
+def dropped(h, v=0.0, system=None, **options):
+    start = jk.State(jnp.stack([jnp.asarray(h)]), jnp.stack([jnp.asarray(v)]))
+    return jk.simulate(system or Particle(), start, TS, **options)
+
+
+def exact(h, v, g):
+    """t_end, height and velocity there."""
+    root = jnp.sqrt(v**2 + 2 * g * h)
+    return jnp.stack([(v + root) / g, 0.0 * h, -root])
+
+
+@pytest.mark.parametrize("options", [{}, {"step": 0.07}], ids=["adaptive", "fixed"])
+def test_a_dropped_particle(options):
+    atol = 1e-9
+    ride = dropped(1.0, **options)
+    t_end = np.sqrt(2.0 / 9.81)
+    assert ride.reason == "ground"
+    np.testing.assert_allclose(ride.t_end, t_end, atol=atol)
+    np.testing.assert_allclose([ride.end.q[0], ride.end.u[0]], [0.0, -9.81 * t_end], atol=atol)
+    reached = np.asarray(TS) <= t_end
+    np.testing.assert_allclose(ride["h"][reached], (1.0 - 4.905 * TS**2)[reached], atol=atol)
+    assert np.isnan(ride.q[~reached]).all()
+    assert np.isnan(ride["drive"][~reached]).all()
+
+
+@pytest.mark.slow
+def test_second_derivatives_of_the_end():
+    """By the velocity at the start, against the formula."""
+    h, g = jnp.array(1.0), jnp.array(9.81)
+
+    def end(v):
+        ride = dropped(h, v, adjoint="forward")
+        return jnp.stack([ride.t_end, ride.end.q[0], ride.end.u[0]])
+
+    second = jax.jit(jax.jacfwd(jax.jacfwd(end)))(0.3)
+    np.testing.assert_allclose(second, jax.jacfwd(jax.jacfwd(lambda v: exact(h, v, g)))(0.3), atol=1e-9)
+
+
+class Pendulum(jk.System):
+    length: jk.Scalar = jk.parameter(1.3)
+    way: int = eqx.field(static=True, default=0)
+    coordinates, speeds = ("angle",), ("rate",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        rod = N.rotate(3, q[0], u[0])
+        return jk.Motion([jk.Body(1.0, 0.0, O.fixed(-self.length * rod.y), rod)])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+
+    def events(self, t, q, u):
+        return {"vertical": {0: q["angle"], 1: jk.rising(q["angle"]), -1: jk.falling(q["angle"])}[self.way]}
+
+
+@pytest.mark.parametrize(
+    ("way", "quarters"), [(-1, 1), *(pytest.param(*x, marks=pytest.mark.slow) for x in ((0, 1), (1, 3)))]
+)
+def test_a_pendulum_through_the_vertical(way, quarters):
+    """A quarter of the period is sqrt(l / g) K(sin(a / 2)); its derivative by the length, that over 2 l."""
+
+    def t_end(length):
+        start = jk.State(jnp.array([0.9]), jnp.zeros(1))
+        return jk.simulate(Pendulum(length, way), start, 2 * TS, rtol=1e-12, atol=1e-12, adjoint="forward").t_end
+
+    expected = quarters * np.sqrt(1.3 / 9.81) * ellipk(np.sin(0.45) ** 2)
+    found, slope = jax.jit(lambda x: jax.jvp(t_end, (x,), (1.0,)))(1.3)
+    np.testing.assert_allclose(found, expected, atol=1e-9)
+    np.testing.assert_allclose(slope, expected / 2.6, rtol=1e-6)
+
+
+def test_a_start_on_zero():
+    """Thrown up from the ground it comes back; resting on it, or thrown down, it has passed it at once."""
+    ride = dropped(0.0, 3.0)
+    assert ride.reason == "ground"
+    np.testing.assert_allclose(ride.t_end, 6.0 / 9.81, atol=1e-9)
+    either = dropped(0.0, 3.0, Particle(ends="either"))
+    np.testing.assert_allclose(either.t_end, 6.0 / 9.81, atol=1e-9)
+    for v in (0.0, -1.0):
+        at_once = dropped(0.0, v)
+        assert at_once.reason == "ground"
+        assert float(at_once.t_end) == 0.0
+        assert np.isfinite(at_once.q[0]).all()
+        assert np.isnan(at_once.q[1:]).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("ends", "options"), [("ground", {}), ("either", {"step": 0.5})], ids=["falling-adaptive", "either-fixed"]
+)
+def test_down_and_up_again_within_a_step(ends, options):
+    """Both ends of the first step are above: h = 0.08 - t + 5.19 t^2 / 2 is zero at 0.0987 and 0.29 s."""
+    start = jk.State(jnp.array([0.08]), jnp.array([-1.0]))
+    ride = jk.simulate(Particle(ends=ends), start, TS, {"drive": 15.0}, **options)
+    assert ride.reason == "ground"
+    np.testing.assert_allclose(ride.t_end, (1 - np.sqrt(1 - 2 * 5.19 * 0.08)) / 5.19, atol=1e-9)
+
+
+@pytest.mark.slow
+def test_the_earlier_of_several_events_in_one_step():
+    ride = dropped(1.0, 1.0, Particle(ends="roof"), step=2.0)
+    assert ride.reason == "c top"
+    np.testing.assert_allclose(ride.t_end, 1.0 / 9.81, atol=1e-9)
+    ride = dropped(1.0, -0.1, Particle(ends="roof"), step=2.0)
+    assert ride.reason == "b early"
+    np.testing.assert_allclose(ride.t_end, exact(0.9, -0.1, 9.81)[0], atol=1e-9)
+
+
+def test_an_event_at_a_sample_and_at_the_last_time():
+    for t in (float(TS[4]), float(TS[-1])):
+        ride = dropped(0.5 * 9.81 * t**2)
+        assert ride.reason == "ground"
+        np.testing.assert_allclose(ride.t_end, t, atol=1e-9)
+        n = int(np.searchsorted(np.asarray(TS), t - 1e-9)) + 1
+        assert np.isfinite(ride.q[:n]).all()
+        assert np.isnan(ride.q[n:]).all()
+
+
+class Suction(Particle):
+    """A force that exists down to a centimetre under the ground only."""
+
+    def loads(self, t, q, u, motion, inputs):
+        force = jnp.sqrt(q["h"] + 0.01) * motion.N.y
+        return [*super().loads(t, q, u, motion, inputs), jk.Force(force, motion.bodies[0])]
+
+
+@pytest.mark.slow
+def test_trial_steps_that_are_not_finite():
+    """Steps that ended under the ground are thrown away, and leave no NaN in a derivative in either mode."""
+
+    def read(v, adjoint):
+        ride = dropped(1.0, v[0], Suction(), adjoint=adjoint, rtol=1e-10, atol=1e-10)
+        wanted = (ride.status == jk.Status.EVENT) & (ride.stats["rejected"] > 5)
+        return jnp.where(wanted, ride["h"][1] + ride.t_end, jnp.nan)
+
+    v = jnp.array([-0.2])
+    forward, reverse = (slopes(read, mode) for mode in ("forward", "reverse"))
+    numeric = differences(forward, v, 1e-5)
+    assert np.isfinite(numeric)
+    for both in (forward, reverse):
+        np.testing.assert_allclose(both(v)[0], numeric, rtol=1e-5)
+
+
+class Bead(jk.System):
+    """On a circle of 1 m, without weight: x = sin(w t). Its vertical speed depends on the horizontal one, for
+    a quarter of a turn; there it no longer does. An event ends it before."""
+
+    level: jk.Scalar = jk.parameter(0.3)
+    ends: bool = eqx.field(static=True, default=True)
+    coordinates, speeds, dependent_speeds, inputs = ("x", "y"), ("vx",), ("vy",), ("push",)
+    dependent_coordinates = ("y",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        place, velocity = q["x"] * N.x + q["y"] * N.y, u["vx"] * N.x + u["vy"] * N.y
+        body = jk.Body(1.0, 0.0, O.moving(place, velocity), N)
+        return jk.Motion([body], [q["x"] * u["vx"] + q["y"] * u["vy"]])
+
+    def configuration_constraints(self, t, q):
+        return [q["x"] ** 2 + q["y"] ** 2 - 1.0]
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force(inputs["push"] * motion.N.x, motion.bodies[0])
+
+    def events(self, t, q, u):
+        return {"low": jk.falling(q["y"] - self.level)} if self.ends else {}
+
+
+class Brake(eqx.Module):
+    gain: jk.Scalar
+
+    def __call__(self, t, state):
+        return self.gain * state["vy"]
+
+
+TOP = jnp.array([0.0, 1.0])
+
+
+@pytest.mark.slow
+def test_what_follows_from_a_motion_that_ends_early():
+    """Dependent speeds, a controller's input and projected coordinates, where they were reached; NaN where not."""
+
+    def read(x, adjoint):
+        level, speed, gain = x
+        options = {"project": True, "adjoint": adjoint, "rtol": 1e-10, "atol": 1e-10}
+        ride = jk.simulate(Bead(level), jk.State(TOP, speed[None]), TS, {"push": Brake(gain)}, **options)
+        reached = ride["vy"][3] + 2.0 * ride["push"][4] + 3.0 * ride["y"][4]
+        return jnp.stack([reached, ride.t_end + ride.end.u[0], ride["vy"][-1], ride["push"][-1], ride["y"][-1]])
+
+    x = jnp.array([0.3, 1.0, 0.2])
+    forward, reverse = (slopes(read, mode) for mode in ("forward", "reverse"))
+    numeric = differences(forward, x, 1e-5)
+    assert np.isfinite(numeric[:2]).all()
+    for both in (forward, reverse):
+        found, value = both(x)
+        np.testing.assert_allclose(found[:2], numeric[:2], rtol=1e-5, atol=1e-8)
+        assert np.isnan(value[2:]).all()
+        assert np.isnan(found[2:]).all()
+
+
+@pytest.mark.slow
+def test_speeds_that_become_singular():
+    """The bead's horizontal speed vanishes at a quarter of a turn: the motion ends before."""
+    ride = jk.simulate(Bead(ends=False), jk.State(TOP, jnp.ones(1)), TS)
+    assert ride.status == jk.Status.SINGULAR_SPEEDS
+    assert np.pi / 2 - 0.01 < float(ride.t_end) <= np.pi / 2
+    reached = np.asarray(TS) < np.pi / 2
+    np.testing.assert_allclose(ride["vy"][reached], -np.sin(TS)[reached], atol=1e-5)
+    assert np.isnan(ride["vy"][~reached]).all()
+
+
+@pytest.mark.slow
+def test_other_ends_have_no_derivative():
+    """`max_steps` is no smooth end: its time has a derivative that is NaN, and so has what was not reached."""
+
+    def few(v, adjoint):
+        ride = dropped(100.0, v, Particle(ends="none"), max_steps=3, adjoint=adjoint)
+        return jnp.stack([ride.t_end, ride["h"][-1], ride["h"][0]])
+
+    for mode, adjoint in ((jax.jacfwd, "forward"), (jax.jacrev, "reverse")):
+        found = jax.jit(mode(lambda v: few(v, adjoint)))(0.1)  # noqa: B023
+        assert np.isnan(found[:2]).all()
+        assert found[2] == 0.0
+    assert dropped(100.0, 0.1, Particle(ends="none"), max_steps=3).reason == "max steps"
+
+
+@pytest.mark.parametrize(
+    ("ends", "height", "options"), [("root", 0.21, {"step": 0.07}), ("lost", 0.2, {})], ids=["fixed", "adaptive"]
+)
+def test_an_event_that_is_no_number(ends, height, options):
+    """It is found beside where it is none; if it becomes none before it vanishes, nobody can say what follows."""
+    ride = dropped(1.0, 0.0, Particle(ends=ends), **options)
+    assert ride.reason == {"root": "low", "lost": "step too small"}[ends]
+    np.testing.assert_allclose(ride.t_end, np.sqrt(2 * (1.0 - height) / 9.81), atol=1e-8)
+    reached = np.asarray(TS) <= float(ride.t_end)
+    np.testing.assert_allclose(ride["h"][reached], (1.0 - 4.905 * TS**2)[reached], atol=1e-9)
+    assert np.isnan(ride.q[~reached]).all()
+
+
+def test_a_start_where_an_event_is_no_number():
+    with pytest.raises(ValueError, match="accelerations, rates or events are not finite beside the first state"):
+        dropped(0.1, 0.0, Particle(ends="lost"))
+
+
+@pytest.mark.slow
+def test_the_end_in_single_precision():
+    particle, ts = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (Particle(), TS))
+    start = jk.State(jnp.ones(1, jnp.float32), jnp.zeros(1, jnp.float32))
+    ride = jk.simulate(particle, start, ts)
+    assert ride.reason == "ground"
+    assert ride.t_end.dtype == ride.end.q.dtype == jnp.float32
+    np.testing.assert_allclose(ride.t_end, np.sqrt(2 / 9.81), rtol=1e-5)
+    np.testing.assert_allclose(ride.end.q, 0.0, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_the_end_by_an_implicit_solver():
+    """The bead passes y = 0.3 where cos(t) does; Kvaerno's method solves for the stages of every step."""
+    ride = jk.simulate(Bead(), jk.State(TOP, jnp.ones(1)), TS, solver=diffrax.Kvaerno5())
+    assert ride.reason == "low"
+    np.testing.assert_allclose(ride.t_end, np.arccos(0.3), atol=1e-6)
+
+
+@pytest.mark.slow
+def test_the_end_of_a_stabilized_motion():
+    ride = jk.simulate(Bead(), jk.State(TOP, jnp.ones(1)), TS, stabilize=10.0)
+    assert ride.reason == "low"
+    np.testing.assert_allclose(ride.t_end, np.arccos(0.3), atol=1e-6)
+    np.testing.assert_allclose(ride.end.q, [np.sqrt(0.91), 0.3], atol=1e-6)
+
+
+def test_an_event_that_reads_no_speed_costs_no_accelerations():
+    """A ride without events does as much as ever; one with them looks at coordinates and their rates alone."""
+    from jaxkane._integrate.events import events_of
+
+    start = jk.State(jnp.ones(1), jnp.ones(1))
+    assert not events_of(Particle(), TS[0], start).read_speeds
+    assert events_of(Particle(ends="roof"), TS[0], start).read_speeds
+
+
+def test_the_first_crossing_of_cubics():
+    """Against the roots of random cubics, among them those that start on zero."""
+    rng = np.random.default_rng(0)
+    p, direction = rng.normal(size=(300, 4)), rng.integers(-1, 2, size=300)
+    p[::7, 3] = 0.0
+    ends = (p[:, 3], p[:, 2], p.sum(1), 3 * p[:, 0] + 2 * p[:, 1] + p[:, 2], direction.astype(float))
+    of_one = lambda *x: first_crossing(*(y[None] for y in x))[0]  # noqa: E731
+    found = np.asarray(jax.jit(jax.vmap(of_one))(*map(jnp.asarray, ends)))  # each of them is written out
+    for coefficients, way, x in zip(p, direction, found):
+        roots = np.roots(coefficients)
+        roots = np.sort(roots[np.abs(roots.imag) < 1e-9].real)
+        slopes = np.polyval(np.polyder(coefficients), roots)
+        crossings = [r for r, s in zip(roots, slopes) if 1e-9 < r <= 1 and way * s >= 0]
+        if way and coefficients[3] == 0 and way * coefficients[2] > 0:
+            crossings = [0.0]
+        np.testing.assert_allclose(x, crossings[0] if crossings else np.inf, atol=0.02)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_derivatives_by_times_of_samples(mode):
+    """Two signals, one of whose kinks stand at one time; the times of the ride itself; against central differences."""
+    kinks = jnp.array([0.1, 0.35, 0.8, 1.1, 1.7])
+    others, values = jnp.array([0.05, 0.35, 0.6, 1.2, 1.9]), jnp.array([1.0, -2.0, 3.0, -1.0, 2.0])
+    ts = jnp.linspace(0.02, 2.0, 5)
+
+    def height(x, adjoint):
+        """x: the delay of a signal; of all times of the ride."""
+        one, other = jk.Samples(kinks + x[0], 5 * values), jk.Samples(others, -3 * values)
+        drive = Both(one, other)
+        ride = jk.simulate(
+            Particle(), jk.State(jnp.array([9.0]), jnp.zeros(1)), ts + x[1], {"drive": drive}, rtol=1e-11, atol=1e-11,
+            adjoint=adjoint,
+        )  # fmt: skip
+        return ride["h"][-1] + ride["v"][2]
+
+    both, x = slopes(height, mode), jnp.zeros(2)
+    np.testing.assert_allclose(both(x)[0], differences(both, x, 1e-5), rtol=1e-6)
+
+
+class Both(eqx.Module):
+    """The sum of two signals."""
+
+    one: jk.Samples
+    other: jk.Samples
+
+    def __call__(self, t, state):
+        return self.one(t) + self.other(t)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"step": jnp.nan}, "`step` must be positive"),
+        ({"step": -0.1}, "`step` must be positive"),
+        ({"rtol": 0.0}, "`rtol` must be positive"),
+        ({"atol": float("nan")}, "`atol` must be positive"),
+        ({"stabilize": -1.0}, "`stabilize` must be a rate"),
+        ({"max_steps": 0}, "`max_steps` must be a whole number"),
+        ({"max_steps": 2.5}, "`max_steps` must be a whole number"),
+        ({"step": 0.1, "rtol": 1e-6}, "`step` fixes the steps of integration, `rtol` and `atol` let them"),
+        ({"step": 0.1, "atol": 1e-6}, "`step` fixes the steps of integration, `rtol` and `atol` let them"),
+    ],
+)
+def test_options_that_contradict_themselves(options, message):
+    with pytest.raises(ValueError, match=message):
+        dropped(1.0, **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"solver": diffrax.Tsit5}, r"`solver` is an instance, not a class: solver=diffrax.Tsit5\(\)"),
+        ({"solver": "Tsit5"}, r"`solver` is one of diffrax, as diffrax.Tsit5\(\) is a solver; got 'Tsit5'"),
+        (
+            {"adjoint": diffrax.DirectAdjoint},
+            r"`adjoint` is an instance, not a class: adjoint=diffrax.DirectAdjoint\(\)",
+        ),
+        ({"adjoint": True}, "`adjoint` is one of diffrax"),
+        ({"project": "no"}, "`project` is True or False, got 'no'"),
+        ({"progress": 1}, "`progress` is True or False, got 1"),
+    ],
+)
+def test_options_of_another_type(options, message):
+    with pytest.raises(TypeError, match=message):
+        dropped(1.0, **options)
+
+
+def branching(t, state):
+    return 1.0 if t > 0.5 else 0.0
+
+
+def by_numpy(t, state):
+    return np.polyval([1.0, 0.0], t)
+
+
+@pytest.mark.parametrize(
+    ("inputs", "label"),
+    [
+        ({"drive": branching}, "The input 'drive'"),
+        ({"drive": by_numpy}, "The input 'drive'"),
+        ({"drive": lambda t, s: float(s["h"])}, "The input 'drive'"),
+        (lambda t, s: {"drive": branching(t, s)}, "The function of the inputs"),
+    ],
+)
+def test_inputs_that_ask_for_values_of_what_is_traced(inputs, label):
+    with pytest.raises(
+        TypeError, match=rf"{label} asks for the value .*jnp.polyval .* jnp.where\(a > b, x, y\) for `if`"
+    ):
+        jk.simulate(Particle(), jk.State(jnp.ones(1), jnp.ones(1)), TS, inputs)
+
+
+class Deciding(Particle):
+    def events(self, t, q, u):
+        return {"low": q["h"] if q["h"] > 0.1 else 1.0}
+
+
+def test_an_event_that_asks_for_the_value_of_what_is_traced():
+    with pytest.raises(TypeError, match=r"Deciding.events asks for the value .* jnp.where\(a > b, x, y\) for `if`"):
+        dropped(1.0, system=Deciding())
+
+
+@pytest.mark.parametrize(
+    ("events", "message"),
+    [
+        (lambda q: {"low": q["h"] < 0.5}, "The event 'low' is a truth value"),
+        (lambda q: {"low": jk.falling(q["h"] < 0.5)}, "The event 'low' is a truth value"),
+        (lambda q: [q["h"]], "events returns quantities by name, a dict"),
+    ],
+)
+def test_events_that_are_no_quantities_by_name(events, message):
+    class Watching(Particle):
+        def events(self, t, q, u):
+            return events(q)
+
+    with pytest.raises(TypeError, match=message):
+        dropped(1.0, system=Watching())
+
+
+def test_an_event_is_not_called_as_another_end():
+    class Confusing(Particle):
+        def events(self, t, q, u):
+            return {"max_steps": q[0] - 0.5}
+
+    with pytest.raises(ValueError, match="an event is called 'max_steps'"):
+        dropped(1.0, system=Confusing())
+
+
+def test_samples_that_are_none():
+    times = np.array([0.0, 1.0, 2.0])
+    for ts, values, error in (
+        (times[::-1], times, ValueError),
+        (times, times[:2], ValueError),
+        (times[:1], times[:1], ValueError),
+        (times, np.array([0.0, np.nan, 1.0]), ValueError),
+        (np.array([0.0, np.nan, 1.0]), times, ValueError),
+        (np.ma.masked_array(times, [0, 1, 0]), times, ValueError),
+        (times, times + 1j, TypeError),
+        (times, ["a", "b", "c"], TypeError),
+    ):
+        with pytest.raises(error, match="Samples"):
+            jk.Samples(ts, values)
+    for value, error in ((np.nan, ValueError), ("a", TypeError), (1j, TypeError), (np.ones(11, complex), TypeError)):
+        with pytest.raises(error, match="drive"):
+            jk.simulate(Particle(), jk.State(jnp.ones(1), jnp.ones(1)), TS, {"drive": value})
+
+
+def test_times_that_tracing_hides_are_invalid():
+    start = jk.State(jnp.ones(1), jnp.ones(1))
+    hidden = jax.jit(lambda ts: jk.simulate(Particle(), start, ts))
+    for ts in (TS.at[3].set(jnp.nan), TS[::-1]):
+        ride = hidden(ts)
+        assert ride.reason == "invalid"
+        assert np.isnan(ride.q).all()
+
+
+def _of_a_batch(x, adjoint):
+    """Of four members: when it ended, height and speed there, and the height at the first two times and the last."""
+    rides = jax.vmap(lambda h, v: dropped(h, v, Particle(gravity=x[2, 0]), adjoint=adjoint))(x[0], x[1])
+    heights = rides["h"][:, jnp.array([0, 1, -1])].T
+    return jnp.stack([rides.t_end, rides.end.q[:, 0], rides.end.u[:, 0], *heights, rides.status.astype(float)], axis=1)
+
+
+def _formulas(h, v, g):
+    ends = jnp.stack([*exact(h, v, g), h, h + v * TS[1] - 0.5 * g * TS[1] ** 2])
+    high = jnp.stack([2.0 + 0 * h, h + 2 * v - 2 * g, v - 2 * g, *ends[3:], h + 2 * v - 2 * g])
+    return jnp.where(h > 20.0, high, jnp.append(ends, jnp.nan))
+
+
+_OF_A_BATCH = {mode: slopes(_of_a_batch, mode) for mode in ("forward", "reverse")}
+_BY_FORMULA = jax.jit(jax.vmap(slopes(lambda x, _: _formulas(*x), "forward"), in_axes=1))
+_number = lambda low, high: st.floats(low, high, allow_nan=False)  # noqa: E731
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+@settings(max_examples=8, deadline=None, derandomize=True)
+@given(_number(0.5, 1.5), _number(-1.0, 2.0), _number(5.0, 15.0))
+def test_members_of_a_batch_end_at_their_own_times(mode, h, v, g):
+    """Two end early, one completes, and the start of one is no number. Derivatives by what is theirs and by what all
+    share (g, in the first column) are those of the formula, and NaN where what is missing is read."""
+    rtol = 1e-6
+    x = jnp.array([[h, 50.0, jnp.nan, 1.1 * h], [v, v, 0.0, v + 0.1], [g] * 4])
+    (found, values), (right, right_values) = _OF_A_BATCH[mode](x), _BY_FORMULA(x)  # (4,7,3,4) (4,7); (4,6,3) (4,6)
+    ground, completed, invalid = jk.Status.EVENT, jk.Status.COMPLETED, jk.Status.INVALID
+    assert list(values[:, 6]) == [ground, completed, invalid, ground]
+    for k in (0, 1, 3):
+        np.testing.assert_allclose(values[k, :6], right_values[k], atol=1e-8)
+        n = 6 if k == 1 else 5  # a ride that ended has no height at the last time, and no derivative of it
+        np.testing.assert_allclose(found[k, :n, :2, k], right[k, :n, :2], rtol=rtol, atol=rtol)
+        np.testing.assert_allclose(found[k, :n, 2, 0], right[k, :n, 2], rtol=rtol, atol=rtol)
+        assert not np.any(np.delete(found[k, :n, :2], k, axis=-1)), "of other members' numbers"
+        assert k == 1 or np.isnan(found[k, 5, 0, k])
+        assert k == 1 or np.isnan(found[k, 5, 2, 0])
+    assert np.isnan(values[2, 1:6]).all()
+    assert np.isnan(found[2, 1:6, 0, 2]).all(), "what is missing has no derivative"

@@ -1,0 +1,195 @@
+"""Inputs that are held from sample to sample: exact motions, and their derivatives by the times of the jumps."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane._integrate.inputs import kinks_of
+from jaxkane._integrate.integrate import Now
+
+ts = np.linspace(0.0, 1.0, 6)
+values = np.array([1.0, -2.0, 0.5, 3.0, -1.0, 4.0])
+
+
+class Cart(jk.System):
+    coordinates = ("place",)
+    speeds = ("speed",)
+    inputs = ("push",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q[0] * N.x, u[0] * N.x, frame=N), name="cart")])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force(inputs["push"] * motion.N.x, motion["cart"])
+
+
+def place(t, delay):
+    """Twice the integral of the held values."""
+    jumps = np.concatenate([[values[0]], np.diff(values)])
+    since = [t, *(np.maximum(t - ts[1:] - delay, 0.0))]
+    return sum(jump * s**2 / 2 for jump, s in zip(jumps, since, strict=True))
+
+
+def end(delay, adjoint="auto"):
+    push = jk.Samples(ts + delay, values, hold=True)
+    return jk.simulate(Cart(), jk.State([0.0], [0.0]), [0.0, 0.5, 1.0], {"push": push}, adjoint=adjoint)["place"]
+
+
+@pytest.mark.slow
+def test_the_exact_motion_and_its_derivative_by_a_delay():
+    found, slope = jax.jit(lambda d: jax.jvp(lambda d: end(d, "forward"), (d,), (1.0,)))(0.03)
+    exact = [place(t, 0.03) for t in (0.0, 0.5, 1.0)]
+    np.testing.assert_allclose(found, exact, atol=1e-12)
+    h = 1e-6
+    np.testing.assert_allclose(slope, [(place(t, 0.03 + h) - place(t, 0.03 - h)) / (2 * h) for t in (0, 0.5, 1)], 1e-8)
+    reverse = jax.jit(jax.grad(lambda d: end(d)[-1]))(0.03)
+    assert float(reverse) == pytest.approx(float(slope[-1]), rel=1e-9)
+
+
+def test_steps_of_one_length_that_end_at_the_samples():
+    push = jk.Samples(ts, values, hold=True)
+    ride = jk.simulate(Cart(), jk.State([0.0], [0.0]), ts, {"push": push}, step=0.1, solver=diffrax.Bosh3())
+    np.testing.assert_allclose(ride["place"], [place(t, 0.0) for t in ts], atol=1e-13)
+    np.testing.assert_array_equal(ride["push"], values)
+    with pytest.raises(ValueError, match="Tsit5 reads the end of a step, where the next sample begins"):
+        jk.simulate(Cart(), jk.State([0.0], [0.0]), ts, {"push": push}, step=0.1)
+
+
+def test_what_is_no_hold_is_refused():
+    with pytest.raises(TypeError, match="`hold` is True or False, got 'zero'"):
+        jk.Samples(ts, values, hold="zero")
+
+
+def push_of(form, delay, hold):
+    """An input that acts a delay later, in one of the ways in which a user may write it."""
+    samples, late = jk.Samples(ts, values, hold=hold), jk.Samples(ts + delay, values, hold=hold)
+    return {
+        "direct": {"push": late},
+        "moved": {"push": lambda t, s: 1.0 * late(t)},
+        "made inside": {"push": lambda t, s: jk.Samples(ts + delay, values, hold=hold)(t)},
+        "asked earlier": {"push": lambda t, s: samples(t - delay)},
+        "compiled": {"push": jax.jit(lambda t, s: samples(t - delay))},
+        "module": {"push": Earlier(samples, delay)},
+        "branch": {"push": lambda t, s: jax.lax.cond(s["place"] > -9.0, lambda t: samples(t - delay), lambda t: t, t)},
+        "batch": {"push": lambda t, s: 0.5 * jnp.sum(jax.vmap(samples)(t - delay * jnp.ones(2)))},
+        "controller": lambda t, s: {"push": samples(-delay + t) + 0.0 * s["speed"]},
+    }[form]
+
+
+FORMS = ("direct", "moved", "made inside", "asked earlier", "compiled", "module", "branch", "batch", "controller")
+
+
+class Earlier(eqx.Module):
+    samples: jk.Samples
+    delay: float
+
+    def __call__(self, t, state):
+        return self.samples(t - self.delay)
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_kinks_of_samples_that_a_function_calls(form):
+    state_of = lambda t, y: Now(y[:1], y[1:], None, t, Cart())  # noqa: E731
+    kinks = kinks_of(push_of(form, 0.03, True), {}, jnp.array(0.1), jnp.zeros(2), state_of, False)
+    np.testing.assert_allclose(np.unique(np.round(kinks.times, 12)), ts + 0.03, rtol=1e-14)
+    assert kinks.jumps
+
+
+def by_delay(end):
+    """A motion's end and its derivative by a delay of 0.03 s."""
+    return jax.jit(lambda d: jax.jvp(end, (d,), (1.0,)))(0.03)
+
+
+def end_with(system, push):
+    ride = jk.simulate(system, jk.State([0.0], [0.0]), [0.0, 0.5, 1.0], push, adjoint="forward")
+    return ride["place"][-1]
+
+
+def test_a_delay_inside_a_function_has_its_derivative():
+    rtol, h = 1e-8, 1e-6
+    slope = (place(1.0, 0.03 + h) - place(1.0, 0.03 - h)) / (2 * h)
+    found = by_delay(lambda d: end_with(Cart(), push_of("asked earlier", d, True)))
+    np.testing.assert_allclose(found, (place(1.0, 0.03), slope), rtol=rtol)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("form", ["branch", "controller"])
+def test_samples_that_a_function_calls_are_those_given(form):
+    rtol = 1e-11
+    found, given = (
+        by_delay(lambda d, form=form: end_with(Cart(), push_of(form, d, False))) for form in (form, "direct")
+    )
+    np.testing.assert_allclose(found, given, rtol=rtol)
+
+
+class Blown(Cart):
+    wind: jk.Samples
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force(self.wind(t) * motion.N.x, motion["cart"])
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Blown")
+def test_samples_of_a_description_have_derivatives_by_their_times():
+    rtol, h = 1e-8, 1e-6
+    slope = (place(1.0, 0.03 + h) - place(1.0, 0.03 - h)) / (2 * h)
+    found = by_delay(lambda d: end_with(Blown(jk.Samples(ts + d, values, hold=True)), None))
+    np.testing.assert_allclose(found, (place(1.0, 0.03), slope), rtol=rtol)
+
+
+class Late(Cart):
+    delay: jk.Scalar = jk.parameter(0.0)  # [s]
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force(samples_held(t - self.delay) * motion.N.x, motion["cart"])
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:Late")
+def test_samples_that_a_description_reads_from_outside_are_met():
+    rtol, h = 1e-8, 1e-6
+    slope = (place(1.0, 0.03 + h) - place(1.0, 0.03 - h)) / (2 * h)
+    np.testing.assert_allclose(by_delay(lambda d: end_with(Late(d), None)), (place(1.0, 0.03), slope), rtol=rtol)
+
+
+@pytest.mark.parametrize(
+    ("push", "options", "message"),
+    [
+        (lambda t, s: samples_held(0.5 * t), {}, "'push' calls Samples at something else than t or t - delay"),
+        (lambda t, s: samples_held(s["place"]), {}, "for a table over anything but time use jnp.interp"),
+        (lambda t, s: jk.Samples(ts + s["place"], values)(t), {}, "cannot end at their kinks"),
+        (
+            lambda t, s: samples_held(t),
+            {"step": 0.1, "solver": diffrax.Bosh3()},
+            "give the Samples as the input itself",
+        ),
+    ],
+)
+def test_calls_of_samples_that_steps_cannot_follow_are_refused(push, options, message):
+    with pytest.raises(ValueError, match=message):
+        jk.simulate(Cart(), jk.State([0.0], [0.0]), [0.0, 0.5, 1.0], {"push": push}, **options)
+
+
+samples_held = jk.Samples(ts, values, hold=True)
+
+
+@pytest.mark.parametrize("f", ["linear", "held", pytest.param("motion", marks=pytest.mark.slow)])
+def test_memory_goes_with_the_number_of_samples(f):
+    """A table of samples by times of 3000 would take 72 MB."""
+    n, per_sample = 3000, 1000
+
+    def values_at(t, y):
+        samples = jk.Samples(t, y, hold=f == "held")
+        if f != "motion":
+            return jax.vmap(samples)(t)
+        return jk.simulate(Cart(), jk.State([0.0], [0.0]), t, {"push": samples})
+
+    times = jax.ShapeDtypeStruct((n,), float)
+    memory = jax.jit(values_at).lower(times, times).compile().memory_analysis()
+    assert memory.temp_size_in_bytes < per_sample * n

@@ -1,0 +1,142 @@
+"""The steps of a motion: their length by their error, and the loop that takes them."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane._integrate import diffrax_compat as loops
+from jaxkane._integrate import integrate as ride
+from jaxkane._integrate.settings import settings_for
+from jaxkane._integrate.step_control import ByError
+from jaxkane._scalarjit.function import fused
+
+
+def van_der_pol(controller):
+    return diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, y, mu: jnp.stack([y[1], mu * (1 - y[0] ** 2) * y[1] - y[0]])),
+        diffrax.Tsit5(),
+        0.0,
+        12.0,
+        0.1,
+        jnp.array([2.0, 0.0]),
+        5.0,  # stiff enough for steps of all lengths, of which some are taken back
+        stepsize_controller=controller,
+    )
+
+
+def test_steps_by_error_are_those_of_diffrax():
+    expected = van_der_pol(diffrax.PIDController(rtol=1e-6, atol=1e-8))
+    found = van_der_pol(ByError(jnp.array([1e-6, 1e-8, 1e-12])))
+    assert {k: int(v) for k, v in found.stats.items()} == {k: int(v) for k, v in expected.stats.items()}
+    assert found.stats["num_rejected_steps"] > 10
+    np.testing.assert_allclose(found.ys, expected.ys, rtol=1e-11, atol=1e-11)
+
+
+def test_a_step_shorter_than_the_shortest_ends_the_solution():
+    blows_up = diffrax.ODETerm(lambda t, y, args: y**2)  # y = 1 / (1 - t)
+    found = diffrax.diffeqsolve(
+        blows_up,
+        diffrax.Tsit5(),
+        0.0,
+        2.0,
+        0.1,
+        jnp.array([1.0]),
+        stepsize_controller=ByError(jnp.array([1e-6, 1e-8, 1e-9])),
+        throw=False,
+    )
+    assert found.result == diffrax.RESULTS.dt_min_reached
+
+
+def test_a_solver_without_an_estimate_of_its_error_asks_for_a_step():
+    system, state = pendulum()
+    with pytest.raises(ValueError, match="step=1e-3"):
+        jk.simulate(system, state, jnp.linspace(0.0, 0.5, 3), solver=diffrax.Euler())
+
+
+def pendulum():
+    return jk.catalog.DoublePendulum(mass=1.0, length=0.7), jk.State(jnp.array([1.0, -0.5]), jnp.zeros(2))
+
+
+@pytest.mark.parametrize("adjoint", ["forward", "reverse"])
+def test_the_loop_of_known_times_is_that_of_diffrax(adjoint, monkeypatch):
+    """The way back, for a release of diffrax whose insides are others."""
+    system, state = pendulum()
+    ts = jnp.linspace(0.2, 1.0, 7)
+    settings = settings_for(ts, adjoint=adjoint, rising=True)
+
+    def ends(q):
+        ride_of = eqx.filter_jit(ride.solve.__wrapped__)(system, jk.State(q, state.u), ts, {}, settings)
+        return jnp.sum(ride_of.q[-1] ** 2), ride_of
+
+    def found():
+        (_, motion), slope = (
+            eqx.filter_value_and_grad(ends, has_aux=True)(state.q)
+            if adjoint == "reverse"
+            else (
+                ends(state.q),
+                jax.jvp(lambda q: ends(q)[0], (state.q,), (jnp.ones(2),))[1],
+            )
+        )
+        return motion, slope
+
+    assert loops._AS_EXPECTED
+    motion, slope = found()
+    monkeypatch.setattr(loops, "_AS_EXPECTED", False)
+    other, other_slope = found()
+    for x, y in zip(jax.tree.leaves(motion), jax.tree.leaves(other), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(slope, other_slope, rtol=1e-11)
+    assert motion.status == jk.Status.COMPLETED
+    assert motion.t_end == ts[-1]
+
+
+@fused
+def _of_the_first(x, y):
+    return jnp.sin(x) + 1.0
+
+
+def test_what_a_program_does_not_read_is_not_computed_for_it(native):
+    def f(x):
+        return _of_the_first(x, jnp.exp(x))
+
+    lowered = jax.jit(f).lower(jnp.array(0.5))
+    assert "exponential" not in lowered.compile().as_text()
+    assert float(jax.jit(f)(jnp.array(0.5))) == pytest.approx(np.sin(0.5) + 1.0, rel=1e-15)
+    batch = jax.jit(jax.vmap(lambda x, y: _of_the_first(x, y), in_axes=(None, 0)))(jnp.array(0.5), jnp.arange(3.0))
+    np.testing.assert_allclose(batch, np.sin(0.5) + 1.0, rtol=1e-15)
+    slope = jax.jit(jax.grad(lambda x, y: _of_the_first(x, y), argnums=(0, 1)))(0.5, 2.0)
+    np.testing.assert_allclose(slope, [np.cos(0.5), 0.0], rtol=1e-15)
+
+
+@fused
+def _doubled_if_positive(x):
+    positive = x > 0
+    return jnp.where(positive, 2.0 * x, x), positive
+
+
+def test_a_program_that_also_tells_what_is_true_has_derivatives(kernels):
+    value = lambda x: _doubled_if_positive(x)[0]  # noqa: E731
+    for x, slope in ((0.7, 2.0), (-0.7, 1.0)):
+        assert jax.jit(jax.grad(value))(x) == slope
+        (_, told), (x_dot, _) = jax.jit(lambda x: jax.jvp(_doubled_if_positive, (x,), (1.0,)))(x)
+        assert x_dot == slope
+        assert told == (x > 0)
+    np.testing.assert_array_equal(jax.jit(jax.vmap(jax.grad(value)))(jnp.array([-1.0, 1.0])), [1.0, 2.0])
+
+
+@pytest.mark.parametrize("jacobian", [jax.jacfwd, jax.jacrev])
+def test_the_last_time_and_the_first_have_derivatives(jacobian):
+    system, state = pendulum()
+
+    def end(times):
+        ride_of = jk.simulate(system, state, jnp.stack([times[0], times[1]]))
+        return ride_of.q[-1], (ride_of.u[-1], ride_of.q[0])
+
+    times = jnp.array([0.2, 0.9])
+    slopes, (u_end, _) = jacobian(end, has_aux=True)(times)
+    np.testing.assert_allclose(slopes[:, 1], u_end, rtol=1e-6)  # dq/dt at the end
+    np.testing.assert_allclose(slopes[:, 0], -u_end, rtol=1e-6)  # where nothing depends on the time itself

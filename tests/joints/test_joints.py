@@ -1,0 +1,422 @@
+"""Mechanisms of joints, held to MuJoCo's and SymPy's accelerations, to the catalogue and to closed forms."""
+
+import json
+import pickle
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane.fit._parameters import parameters_of
+from jaxkane.joints import (
+    Actuator,
+    Coupling,
+    Link,
+    Loop,
+    Site,
+    ball,
+    fixed,
+    free,
+    hinge,
+    mechanism,
+    planar,
+    slide,
+    universal,
+)
+
+RTOL = 1e-11
+DATA = Path(__file__).parents[1] / "data"
+FIGURES = json.loads((DATA / "mujoco_tree.json").read_text())
+FOUR_BAR = json.loads((DATA / "sympy_kane_systems.json").read_text())["systems"]["four_bar_linkage"]
+BAR = {"mass": 2.0, "center": (0.0, 0.0, -0.2), "inertia": (0.03, 0.03, 0.002)}
+
+
+def pendulums(n=2, **more):
+    """Bars that hang in a chain, on hinges along y and x in turn."""
+    return [
+        Link(
+            f"link{i}",
+            f"link{i - 1}" if i else None,
+            hinge(f"q{i}", ((0, 1, 0), (1, 0, 0))[i % 2], **more),
+            position=(0, 0, -0.4 if i else 0),
+            **BAR,
+        )
+        for i in range(n)
+    ]
+
+
+def tree_of_all_joints():
+    """The model of tests/data/mujoco_tree.py, by hand."""
+    degree = np.pi / 180
+    inertia = [[0.21, 0.01, -0.02], [0.01, 0.16, 0.015], [-0.02, 0.015, 0.09]]
+    shoulder = hinge(
+        "shoulder",
+        (1, 2, 0.5),
+        anchor=(0.02, -0.01, 0.04),
+        damping=0.3,
+        stiffness=2.0,
+        rest=20 * degree,
+        armature=0.05,
+        reference=10 * degree,
+    )
+    extend = slide("extend", (0, 1, 0.3), damping=0.7, stiffness=30.0, rest=0.1, armature=0.2, reference=0.05)
+    wrist = ball("wrist", anchor=(0.01, 0.02, 0.03), damping=0.2, stiffness=1.5, armature=0.03)
+    hips = [hinge("hip1", (1, 0, 0)), hinge("hip2", (0, 1, 0), anchor=(0, 0, 0.1)), hinge("hip3", (0, 0, -1))]
+    third = ("3-2-1", (np.pi / 2, 0.0, np.pi / 2))  # z to x, x to y, y to z
+    return mechanism(
+        [
+            Link("plate", "hand", fixed(), position=(0.1, 0.1, 0), mass=0.2, inertia=(1e-4, 2e-4, 2.5e-4)),
+            Link("base", None, free("root"), mass=4.8, center=(0.02, 0.01, 0.03), inertia=inertia),
+            Link("arm", "base", [shoulder, extend], (0.2, 0, 0.1), third, 3.6, (0, 0, 0.2), (0.08, 0.07, 0.02)),
+            Link("hand", "arm", wrist, (0, 0.1, 0.4), None, 1.4, (0.1, 0, 0), (0.004, 0.006, 0.005)),
+            Link("leg", "base", hips, (0, 0, -0.3), None, 1.7, (0, 0, -0.1), (0.02, 0.02, 0.002)),
+        ],
+        gravity=(0.3, -0.5, -9.7),
+        actuators=[
+            Actuator("turn", "shoulder", gear=3),
+            Actuator("servo", "extend", gear=2, gain=20, position_gain=20, velocity_gain=1.5),
+            Actuator("hip", "hip1", gear=0.5, gain=2.5, offset=0.3, position_gain=1, velocity_gain=2),
+            Actuator("twist", "wrist", gear=(1, 2, 3)),
+        ],
+        sites=[Site("tip", "arm", (0.1, 0.2, 0.3))],
+    )
+
+
+def test_a_tree_of_every_joint_accelerates_as_in_mujoco():
+    system = tree_of_all_joints()
+    for state in FIGURES["states"]:
+        inputs = dict(zip(system.inputs, state["inputs"], strict=True))
+        u_dot = jk.accelerations(system, 0.0, np.array(state["q"]), np.array(state["u"]), inputs)
+        np.testing.assert_allclose(u_dot, state["u_dot"], rtol=RTOL, atol=RTOL * np.abs(state["u_dot"]).max())
+
+
+def test_two_hinges_are_the_double_pendulum_of_the_catalogue():
+    m, l = 1.3, 0.7
+    bar = {"mass": m, "center": (0, -l / 2, 0), "inertia": (m * l**2 / 12, 0, m * l**2 / 12)}
+    links = [Link("1", None, hinge("a"), **bar), Link("2", "1", hinge("b"), (0, -l, 0), **bar)]
+    motors = [Actuator("shoulder", "a"), Actuator("elbow", "b")]
+    system = mechanism(links, gravity=(0, -9.81, 0), actuators=motors)
+    book = jk.catalog.DoublePendulum(m, l)
+    torques = {"shoulder": 0.3, "elbow": -0.7}
+    angles = jk.accelerations(system, 0.0, [0.7, -1.1], [1.1, -1.9], torques)
+    rates = jk.accelerations(book, 0.0, [0.7, -0.4], [1.1, -0.8], {f"{x}_torque": T for x, T in torques.items()})
+    np.testing.assert_allclose([angles[0], angles[0] + angles[1]], rates, rtol=1e-12)
+
+
+def test_armature_stands_on_the_diagonal_of_the_mass_matrix_and_nowhere_else():
+    chain = [
+        Link("a", None, free("r", armature=0.3), **BAR),
+        Link("b", "a", ball("s", armature=0.2), (0, 0, -0.4), **BAR),
+        Link("c", "b", [slide("x", (1, 1, 0), armature=0.1), hinge("h", (0, 1, 2), armature=0.05)], **BAR),
+    ]
+    bare = [link.__class__(**(vars(link) | {"joints": joint})) for link, joint in zip(chain, (free("r"), ball("s"), 0))]
+    bare[2] = Link("c", "b", [slide("x", (1, 1, 0)), hinge("h", (0, 1, 2))], **BAR)
+    with_rotors, without = mechanism(chain), mechanism(bare)
+    rng = np.random.default_rng(0)
+    e, f = (x / np.linalg.norm(x) for x in rng.normal(size=(2, 4)))
+    at = (0.0, np.array([0.1, 0.2, 0.3, *e, *f, 0.4, 0.5]), rng.normal(size=11))
+    (M, f), (M0, f0) = (jk.equations_of_motion(system, *at) for system in (with_rotors, without))
+    np.testing.assert_allclose(M - M0, np.diag([0.3] * 6 + [0.2] * 3 + [0.1, 0.05]), atol=1e-13)
+    np.testing.assert_allclose(f, f0, atol=1e-12)
+
+
+def test_a_planar_joint_and_a_universal_joint_move_as_their_parts():
+    disk = Link("disk", None, planar("p", ((0, 0, 1), (1, 0, 0)), damping=0.4), mass=2.0, inertia=(0.2, 0.3, 0.2))
+    system = mechanism([disk], gravity=(0, 0, -9.0), actuators=[Actuator("F", "p_x"), Actuator("T", "p_angle")])
+    u_dot = jk.accelerations(system, 0.0, [0.1, 0.2, 0.3], [1.0, 2.0, 3.0], {"F": 5.0, "T": 0.6})
+    # m a = F - c v along z and x; I alpha = T - c omega
+    np.testing.assert_allclose(u_dot, [(5 - 0.4) / 2 - 9.0, -0.8 / 2, (0.6 - 1.2) / 0.3], rtol=1e-13)
+    links = [Link("cross", None, universal("u"), **BAR)]
+    parts = [Link("cross", None, [hinge("u_1", (1, 0, 0)), hinge("u_2", (0, 1, 0))], **BAR)]
+    one, two = (jk.accelerations(mechanism(x), 0.0, [0.3, 0.4], [1.0, -2.0]) for x in (links, parts))
+    np.testing.assert_array_equal(one, two)
+
+
+def test_a_spring_on_a_ball_joint_is_smooth_where_it_rests_and_takes_the_shorter_way():
+    system = mechanism(
+        [Link("a", None, ball("s", stiffness=2.0), mass=1.0, inertia=(0.5, 0.5, 0.5))], gravity=(0, 0, 0)
+    )
+    alpha = lambda angle, sign=1.0: jk.accelerations(  # noqa: E731
+        system, 0.0, sign * jnp.stack([jnp.sin(angle / 2), 0.0 * angle, 0.0 * angle, jnp.cos(angle / 2)]), [0.0] * 3
+    )
+    for angle in (0.0, 1e-5, 1.9e-4, 2.1e-4, 1.0, 3.0):
+        np.testing.assert_allclose(alpha(jnp.float64(angle))[0], -4.0 * angle, rtol=1e-12)
+        np.testing.assert_allclose(alpha(jnp.float64(angle), -1.0)[0], -4.0 * angle, rtol=1e-12)
+    slope = jax.jit(jax.vmap(jax.grad(lambda angle: alpha(angle)[0])))(jnp.array([0.0, 1e-5, 1.0]))
+    np.testing.assert_allclose(slope, -4.0, rtol=1e-9)
+
+
+# Loops
+
+
+def four_bar(across=0.0, **more):
+    p = FOUR_BAR["params"]
+    rod = lambda l: {  # noqa: E731
+        "mass": p["rho"] * l,
+        "center": (l / 2, 0, 0),
+        "inertia": (0, p["rho"] * l**3 / 12, p["rho"] * l**3 / 12),
+    }
+    links = [
+        Link("l2", None, hinge("q1"), (p["l1"], 0, 0), **rod(p["l2"])),
+        Link("l3", "l2", hinge("q2"), (p["l2"], 0, 0), **rod(p["l3"])),
+        Link("l4", "l3", hinge("q3"), (p["l3"], 0, 0), **rod(p["l4"])),
+    ]
+    sites = [Site("ground", None), Site("end", "l4", (p["l4"], 0, across))]
+    return mechanism(links, gravity=(0, 0, 0), sites=sites, loops=[Loop("ground", "end")], **more)
+
+
+def test_a_four_bar_linkage_accelerates_as_in_sympy():
+    system = four_bar(dependent=("q2", "q3"))
+    assert system.dependent_speeds == ("q2_rate", "q3_rate")  # of three residuals two, since it lies in a plane
+    for state in FOUR_BAR["states"]:
+        q = [state["q"][x] for x in system.coordinates]
+        rates = jk.speed_rates(system, 0.0, q, [state["u"]["u1"]], state["inputs"])
+        expected = [state["udot"][x] for x in ("u1", "u2", "u3")]
+        np.testing.assert_allclose([rates[x] for x in ("q1_rate", "q2_rate", "q3_rate")], expected, rtol=RTOL)
+
+
+def test_what_is_dependent_is_found_and_may_be_assembled():
+    system = four_bar()
+    assert len(system.dependent_speeds) == 2
+    state = FOUR_BAR["states"][0]
+    held = next(c for c in system.coordinates if c not in system.dependent_coordinates)
+    guess = np.array([state["q"][c] + (0.0 if c == held else 0.05) for c in system.coordinates])
+    found = jk.assemble(system, guess, [0.3])
+    np.testing.assert_allclose(found.q, [state["q"][c] for c in system.coordinates], rtol=1e-10)
+
+
+def test_a_loop_in_a_plane_that_ends_beside_its_beginning_is_refused():
+    with pytest.raises(ValueError, match=r"Loop\('ground', 'end'\) can never hold: it stays off by 0.1 "):
+        four_bar(across=0.1)
+
+
+@pytest.mark.slow
+def test_a_rigid_loop_is_a_body():
+    slab = {"mass": 1.0, "inertia": (0.1, 0.2, 0.3), "center": (0.1, 0.2, 0.0)}
+    a, b = Link("a", None, free("r"), **slab), Link("b", None, hinge("h", (0, 0, 1)), (0.1, 0.0, 0.0), **slab)
+    turned = (0.0, 0.0, np.sin(0.2), np.cos(0.2))
+    sites = [Site("on a", "a", (0.3, 0.1, 0.2), turned), Site("on b", "b", (0.3, 0.1, 0.2), turned)]
+    welded = mechanism([a, b], sites=sites, loops=[Loop("on a", "on b", rigid=True)], gravity=(0, -9.81, 0))
+    assert len(welded.dependent_speeds) == 6
+    (speed,) = welded.speeds
+    both = mechanism([b, Link("a", "b", **slab)], gravity=(0, -9.81, 0))
+    q0 = {"h": 0.4, "r_x": 0.1, "r_e3": np.sin(0.2), "r_e4": np.cos(0.2)}
+    state = jk.assemble(welded, [q0.get(c, 0.0) for c in welded.coordinates], [0.9])
+    rate = jk.speed_rates(welded, 0.0, state.q, state.u)
+    assert speed in ("h_rate", "r_w3")  # one and the same
+    np.testing.assert_allclose(rate[speed], jk.accelerations(both, 0.0, [0.4], [0.9])[0], rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    "turned", [(1.0, 0.0, 0.0, 0.0), (0.0, 0.6, -0.8, 0.0), (0.5, 0.5, 0.5, 0.5), (0.0, 0.0, 0.0, 1.0)]
+)
+def test_a_turned_weld_holds_in_one_orientation_only(turned):
+    TOLERANCE = 1e-9
+    slab = {"mass": 1.0, "inertia": (0.1, 0.2, 0.25)}
+    sites = [Site("on a", "a", (0.0, 0.0, 0.1)), Site("on b", "b", (0.0, 0.0, -0.1), turned)]
+    welded = mechanism(
+        [Link("a", None, free("a"), **slab), Link("b", None, free("b"), **slab)],
+        sites=sites,
+        loops=[Loop("on a", "on b", rigid=True)],
+    )
+    assert {"a_x", "a_y", "a_z", "a_e1", "a_e2", "a_e3"}.isdisjoint(welded.dependent_coordinates)
+    x, y, z, w = turned
+    for guess in [(0.0, 0.0, 0.0, 1.0), (w, -z, y, -x), (y, -x, w, -z)]:  # the others are half a turn away
+        q = [*(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0), *(0.0, 0.0, 0.2), *guess]
+        state = jk.assemble(welded, q)
+        (A, P), (B, Q) = welded.motion(0.0, state.q, np.zeros(12)).sites.values()
+        np.testing.assert_allclose(A.matrix(B), np.eye(3), rtol=0, atol=TOLERANCE)
+        np.testing.assert_allclose(Q.position_from(P).to(A), 0.0, rtol=0, atol=TOLERANCE)
+
+
+def test_a_rigid_loop_in_a_plane_is_not_closed_half_a_turn_away():
+    links = [Link("a", None, hinge("a"), mass=1.0), Link("b", "a", hinge("b"), (0.5, 0.0, 0.0), mass=1.0)]
+    links.append(Link("c", "b", hinge("c"), (0.5, 0.0, 0.0), mass=1.0))
+    sites = [Site("hand", "c"), Site("goal", None, (0.7, 0.2, 0.0), ("3-1-2", (np.pi, 0.0, 0.0)))]
+    arm = mechanism(links, sites=sites, loops=[Loop("goal", "hand", rigid=True)])
+    for start in (-3.0, 0.0, 3.0):
+        q = jk.assemble(arm, [0.3, 0.4, start]).q
+        np.testing.assert_allclose(np.cos(sum(q)), -1.0, rtol=1e-12)
+
+
+def test_a_coupling_is_a_gear():
+    gears = [Link(n, None, hinge(n), mass=1.0, inertia=(0, 0, I)) for n, I in (("g", 0.2), ("p", 0.03))]
+    geared = mechanism(gears, loops=[Coupling("p", "g", (0.1, -3.0))], actuators=[Actuator("T", "g")])
+    assert geared.dependent_speeds == ("p_rate",)
+    alpha = jk.accelerations(geared, 0.0, [0.2, 0.1 - 0.6], [1.0], {"T": 2.0})
+    np.testing.assert_allclose(alpha, [2.0 / (0.2 + 9 * 0.03)], rtol=1e-13)
+
+
+def test_a_coupling_is_of_two_joints_and_exact_numbers():
+    """Text that reads as a number is none, here and in a gear; `dependent` is refused where nothing is solved."""
+    gears = [Link(n, None, hinge(n), mass=1.0, inertia=(0, 0, I)) for n, I in (("g", 0.2), ("p", 0.03))]
+    for coefficients in ("12", ("0", "2"), (0.0, np.nan), ()):
+        with pytest.raises(ValueError, match="The coefficients of the coupling of 'p'"):
+            mechanism(gears, loops=[Coupling("p", "g", coefficients)])
+    with pytest.raises(ValueError, match="a joint cannot follow itself"):
+        mechanism(gears, loops=[Coupling("p", "p", (0.0, -3.0))])
+    with pytest.raises(ValueError, match="The gear of 'T': finite numbers are asked for, got '2'"):
+        mechanism(gears, actuators=[Actuator("T", "g", gear="2")])
+    with pytest.raises(ValueError, match="names p, and nothing closes a loop"):
+        mechanism(gears, dependent=("p",))
+
+
+# Structure and parameters
+
+
+def test_one_structure_is_one_class_and_survives_a_pickle():
+    one, two = mechanism(pendulums()), mechanism([*reversed(pendulums())])
+    assert type(one) is type(two)
+    assert type(mechanism(pendulums(damping=0.1))) is not type(one)
+    again = pickle.loads(pickle.dumps(one))
+    assert type(again) is type(one)
+    assert eqx.tree_equal(again, one)
+
+
+def test_parameters_have_names_units_and_a_sign():
+    arm = mechanism(pendulums(damping=0.1), actuators=[Actuator("m", "q0")])
+    assert set(arm.mass) == {"link0", "link1"}
+    assert arm.center == {"link0": {"z": -0.2}, "link1": {"z": -0.2}}  # zeros that are written as numbers are structure
+    free_ones = ["mass.link1", "center.link0.z", "damping.q1", "gain.m"]
+    found = parameters_of(arm, free_ones)
+    assert found.names == tuple(free_ones)
+    assert found.units == ("kg", "m", "N m s/rad", "")
+    body = jk.fit.Inertia(
+        moments=("inertia.link1.xx", "inertia.link1.yy", "inertia.link1.zz"),
+        mass="mass.link1",
+        center=(None, None, "center.link1.z"),
+    )
+    assert parameters_of(arm, body).names[:2] == ("mass.link1", "center.link1.z")
+    assert float(arm.replace({"mass.link1": 3.0}).mass["link1"]) == 3.0
+    with pytest.raises(ValueError, match=r"no parameter .mass\.link7."):
+        arm.replace({"mass.link7": 3.0})
+    with pytest.raises(ValueError, match=r"mass.link1 = -1.0 must be positive"):
+        arm.replace({"mass.link1": -1.0})
+    beside = Link("a", None, hinge("q", (0, 1, 0)), mass=1.0, center=(jnp.zeros(()), 0.0, 0.1), inertia=(1, 1, 1))
+    assert set(mechanism([beside]).center["a"]) == {"x", "z"}  # a JAX zero is a parameter
+
+
+@pytest.mark.slow
+def test_a_mechanism_is_swept_by_the_names_of_its_parameters():
+    arm, ts = mechanism(pendulums()), jnp.linspace(0.0, 0.2, 5)
+    start = jk.State({"q0": 0.3}, {})
+    sweep = jk.sweep.sweep(arm, start, ts, table={"mass.link1": [1.0, 2.5]})
+    one = jk.simulate(arm.replace({"mass.link1": 2.5}), start, ts)
+    np.testing.assert_allclose(sweep.trajectory.q[1], one.q, rtol=1e-9)
+
+
+def test_a_mechanism_may_be_made_of_traced_numbers():
+    def alpha(mass):
+        bar = Link("a", None, hinge("q", (0, 1, 0)), mass=mass, center=(0.2, 0, 0), inertia=(0.1, 0.1, 0.1))
+        return jk.accelerations(mechanism([bar], gravity=(0, 0, -10.0)), 0.0, [0.0], [0.0])[0]
+
+    m = 1.5
+    for derivative in (jax.grad, jax.jacfwd):  # alpha = 2 m / (0.1 + 0.04 m)
+        np.testing.assert_allclose(jax.jit(derivative(alpha))(m), 0.2 / (0.1 + 0.04 * m) ** 2, rtol=1e-12)
+    np.testing.assert_allclose(jax.vmap(alpha)(jnp.array([1.0, 2.0])), [2 / 0.14, 4 / 0.18], rtol=1e-12)
+
+
+def test_a_loop_may_be_made_of_traced_numbers():
+    def alpha(across):
+        system = four_bar(across, dependent=("q2", "q3"))
+        return jk.accelerations(system, 0.0, [state["q"][x] for x in system.coordinates], [state["u"]["u1"]])[0]
+
+    state = FOUR_BAR["states"][0]
+    expected = alpha(0.0)
+    np.testing.assert_allclose(jax.jit(alpha)(0.0), expected, rtol=1e-12)
+    np.testing.assert_allclose(jax.vmap(alpha)(jnp.zeros(2)), [expected, expected], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("links", "more", "words"),
+    [
+        ([Link("a.b")], {}, "without a dot.*'a.b'"),
+        ([Link("")], {}, "without a dot"),
+        ([Link("a"), Link("a")], {}, "Two links have the name 'a'"),
+        ([Link("a", "c")], {}, "parent of the link 'a'.*'c'"),
+        ([Link("a", "b"), Link("b", "a")], {}, "circle: a, b"),
+        ([Link("a", None, hinge("h"), **BAR), Link("b", "a", hinge("h"), **BAR)], {}, "Two joints have the name 'h'"),
+        ([Link("a", None, hinge("h.1"), **BAR)], {}, "joint.*'h.1'"),
+        ([Link("a", None, hinge("h"), **BAR)], {"actuators": [Actuator("T", "k")]}, "actuator 'T'.*'k'"),
+        ([Link("a", None, hinge("h"), **BAR)], {"actuators": [Actuator("T", "h", (1, 2))]}, "gear of the actuator 'T'"),
+        ([Link("a", None, hinge("h"), **BAR)], {"sites": [Site("s", "z")]}, "site 's'.*'z'"),
+        ([Link("a", None, hinge("h"), **BAR)], {"sites": [Site("a", "a")]}, "sites or links have the name 'a'"),
+        ([Link("a", None, hinge("h"), **BAR)], {"loops": [Loop("s", "t")]}, "closes a loop.*'s'"),
+        ([Link("a", None, ball("h"), **BAR)], {"loops": [Coupling("h")]}, "coupling is of hinges and sliders; 'h'"),
+        ([Link("a", None, hinge("h"), (1, 2), **BAR)], {}, "position.a has three components"),
+        ([Link("a", None, hinge("h"), orientation=(1, 2), **BAR)], {}, "'a': the orientation is"),
+        ([Link("a", None, hinge("h"), orientation=np.diag([1, 1, -1]), **BAR)], {}, "'a': the orientation is"),
+        ([Link("a", None, hinge("h"), mass=1, inertia=2.0)], {}, "inertia of 'a'"),
+        ([Link("a", None, hinge("h"), **BAR), Link("b", "a", free("f"), **BAR)], {}, "'b' is free of its parent"),
+        ([Link("a", None, hinge("h"), **BAR)], {"actuators": [Actuator("h", "h")]}, "'h' stands in `coordinates` and"),
+        ([Link("a", None, hinge("h"))], {}, "no link.*has a mass"),
+        ([Link("a", mass=1.0)], {}, "no link has a joint"),
+        ([Link("a", None, hinge("h"), mass=1, inertia=((1, 0), (0, 1), (0, 0)))], {}, "inertia of 'a'"),
+        ([Link("a", None, hinge("h"), mass=1, inertia=jnp.eye(3) + jnp.eye(3, k=1))], {}, "not symmetric: 1.0 and 0.0"),
+        ([Link("a", None, hinge("h"), mass=1, inertia=np.eye(3, dtype=int) + np.eye(3, k=1))], {}, "not symmetric"),
+        ([Link("a", None, hinge("h"), **BAR)], {"loops": [Coupling(None, "h")]}, "hinges and sliders; None is none"),
+        (
+            [Link("a", None, hinge("h"), **BAR)],
+            {"sites": [Site("s", "a")], "loops": [Loop("s", "s")]},
+            r"Loop\('s', 's'\).*name two",
+        ),
+        (
+            [Link("a", None, hinge("h"), **BAR)],
+            {"sites": [Site("s", "a"), Site("t", "a", (0, 0, 0.5))], "loops": [Loop("s", "t")]},
+            r"Loop\('s', 't'\) can never hold: it stays off by 0.5",
+        ),
+        (
+            [Link("a", None, hinge("h"), **BAR), Link("b", None, hinge("k"), **BAR)],
+            {"loops": [Coupling("k", "h", (0.0, -3.0)), Coupling("k", "h", (0.2, -3.0))]},
+            r"Coupling\('k', 'h'\) can never hold: it stays off by 0.2",
+        ),
+    ],
+)
+def test_what_is_wrong_is_named(links, more, words):
+    with pytest.raises(ValueError, match=words):
+        mechanism(links, **more)
+
+
+def test_an_inertia_matrix_may_be_off_symmetry_by_rounding_errors():
+    turned = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    inertia = turned @ np.diag([0.1, 0.2, 0.25]) @ turned.T
+    assert (inertia != inertia.T).any()
+    assert mechanism([Link("a", None, hinge("h"), mass=1, inertia=inertia)]).inertia["a"]["xy"] == inertia[0, 1]
+
+
+@pytest.mark.parametrize(
+    ("what", "links", "more"),
+    [
+        ("axis of 'h'", lambda x: [Link("a", None, hinge("h", (0, 1, x)), **BAR)], {}),
+        ("reference of 'h'", lambda x: [Link("a", None, slide("h", reference=x), **BAR)], {}),
+        ("orientation of 'a'", lambda x: [Link("a", None, hinge("h"), orientation=("2", (x,)), **BAR)], {}),
+        (
+            "gear of 'T'",
+            lambda x: [Link("a", None, hinge("h"), **BAR)],
+            {"actuators": lambda x: [Actuator("T", "h", x)]},
+        ),
+    ],
+)
+def test_what_is_structure_is_not_traced(what, links, more):
+    def made(x):
+        return mechanism(links(x), **{name: part(x) for name, part in more.items()})
+
+    made(0.1)
+    with pytest.raises(TypeError, match=rf"The {what} is part of the structure.*cannot be traced"):
+        jax.jit(lambda x: made(x).mass["a"])(0.1)
+
+
+def test_a_universal_joint_has_two_axes():
+    with pytest.raises(ValueError, match="two axes, 'h' 3"):
+        universal("h", np.eye(3))
+
+
+def test_an_axis_has_a_direction():
+    with pytest.raises(ValueError, match="axis of 'h'"):
+        hinge("h", (0, 0, 0))
+    with pytest.raises(TypeError, match="no Link"):
+        mechanism([hinge("h")])

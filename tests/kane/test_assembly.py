@@ -1,0 +1,130 @@
+"""`assemble` holds what is named and finds what is left out; what cannot be found is NaN with its derivatives."""
+
+import re
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane.catalog import RigidBody
+
+PAGE = Path(__file__).parents[2] / "docs" / "describing.md"
+IDENTITY = [0.0, 0.0, 0.0, 1.0]
+
+
+@pytest.fixture(scope="module")
+def balls():
+    """The documentation's own recipe, which names no dependent coordinates."""
+    names = {}
+    for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL):
+        if "class TwoBalls" in block:
+            exec(block, {"jk": jk}, names)
+    return names["TwoBalls"]()
+
+
+class Plane(jk.System):
+    """A particle in a plane, on the parabola y = height + x^2; nothing is named as dependent."""
+
+    height: jk.Scalar = jk.parameter(1.0)
+    coordinates, speeds = ("x", "y", "angle"), ("x_dot", "spin")
+    dependent_speeds = ("y_dot",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(q["x"] * N.x + q["y"] * N.y, u["x_dot"] * N.x + u["y_dot"] * N.y)
+        B = N.rotate(3, q["angle"], u["spin"])
+        return jk.Motion([jk.Body(1.0, (0.1, 0.1, 0.1), P, B)])
+
+    def q_dot(self, t, q, u):
+        return u["x_dot"], u["y_dot"], u["spin"]
+
+    def configuration_constraints(self, t, q):
+        return [q["y"] - self.height - q["x"] ** 2]
+
+
+class OnACircle(jk.System):
+    coordinates, speeds = ("x", "y"), ("x_dot",)
+    dependent_speeds, dependent_coordinates = ("y_dot",), ("y",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q[0] * N.x + q[1] * N.y, u[0] * N.x + u[1] * N.y))])
+
+    def configuration_constraints(self, t, q):
+        return [q["x"] ** 2 + q["y"] ** 2 - 1.0]
+
+
+def test_what_is_named_is_held_and_other_orientations_are_none(balls):
+    for given in ({"a4": 1.0}, {"x": 2.0, "a1": 0.0}):
+        expected = np.array([given.get("x", 0.0), 0.0, 0.0, *IDENTITY, *IDENTITY])
+        np.testing.assert_array_equal(jk.assemble(balls, given).q, expected)
+    q = np.asarray(jk.assemble(balls, {"a1": 0.6, "z": 3.0}).q)
+    np.testing.assert_allclose(q, [0, 0, 3.0, 0.6, 0, 0, 0.8, *IDENTITY], atol=1e-15)
+    traced = jax.jit(lambda a: jk.assemble(balls, {"a1": a, "z": 3.0}).q)(0.6)
+    np.testing.assert_allclose(traced, q, atol=1e-15)
+    body = jk.assemble(RigidBody(), {"x": 1.0, "e2": -0.8}).q  # which names e4 as dependent
+    np.testing.assert_allclose(body, [1.0, 0, 0, 0, -0.8, 0, 0.6], atol=1e-15)
+
+
+def test_what_is_named_and_contradicts_the_constraints_is_refused(balls):
+    with pytest.raises(ValueError, match=r"TwoBalls: .*a4 = 0\.9.*What is named is held"):
+        jk.assemble(balls, {"a4": 0.9})
+    with pytest.raises(ValueError, match=r"b1 = 0\.1.*b4 = 0\.9"):
+        jk.assemble(balls, {"b1": 0.1, "b4": 0.9})
+    with pytest.raises(ValueError, match=r"Plane: x = 1, y = 3, angle = 0 does not satisfy .*is 1\).*nothing is left"):
+        jk.assemble(Plane(), {"x": 1.0, "y": 3.0, "angle": 0.0})
+    with pytest.raises(ValueError, match=r"no a2, a3 satisfies .*a1 = 2"):
+        jk.assemble(balls, {"a1": 2.0, "a4": 0.0}, free=("a2", "a3"))
+    moved = jk.assemble(balls, {"b1": 0.1, "b4": 0.9}, free=("b4",)).q
+    np.testing.assert_allclose(moved[7:], [0.1, 0.0, 0.0, 0.99**0.5], atol=1e-15)
+    everything = jk.assemble(balls, np.array([1.0, 0, 0, 0, 0, 0, 2.0, 0, 0, 0.3, 0.4])).q  # an array names nothing
+    np.testing.assert_allclose(everything, [1.0, 0, 0, *IDENTITY, 0, 0, 0.6, 0.8], atol=1e-12)
+
+
+def test_what_is_left_out_is_found():
+    np.testing.assert_allclose(jk.assemble(Plane(), {"x": 2.0, "angle": 0.5}).q, [2.0, 5.0, 0.5], atol=1e-15)
+    np.testing.assert_allclose(
+        jk.assemble(Plane(), {"y": 5.0}).q, [2.0, 5.0, 0.0], atol=1e-12
+    )  # looked for beside x = 0
+    named = {"x": 2.0, "y": 5.0}  # the angle is left out, and does not enter the constraint
+    np.testing.assert_array_equal(jk.assemble(Plane(), named).q, [2.0, 5.0, 0.0])
+    np.testing.assert_array_equal(jk.assemble(Plane(), named | {"angle": 1.0}).q, [2.0, 5.0, 1.0])
+    with pytest.raises(ValueError, match=r"cannot be met by moving 0 coordinates|does not satisfy"):
+        jk.assemble(OnACircle(), {"x": 0.5}, free=())
+    np.testing.assert_array_equal(jk.assemble(OnACircle(), {"x": 0.6, "y": 0.8}, free=()).q, [0.6, 0.8])
+
+
+@pytest.mark.parametrize("given", [{"x": 2.0}, {"x": 1.0}])  # no such place; a place where y has no derivative
+def test_the_derivatives_of_what_is_not_found_are_nan(given):
+    found = jax.jit(lambda x: jk.assemble(OnACircle(), {"x": x}).q[1])
+    assert np.isnan(found(given["x"]))
+    for derivative in (jax.grad, jax.jacfwd, lambda f: jax.jacfwd(jax.grad(f))):
+        assert np.isnan(jax.jit(derivative(found))(given["x"]))
+
+
+@pytest.mark.slow
+def test_one_that_is_not_found_leaves_the_others_as_they_are():
+    x = jnp.array([0.6, 2.0, 1.0, 0.0, jnp.nan])
+    found = jax.vmap(lambda x: jk.assemble(OnACircle(), {"x": x}).q[1])
+    good = np.array([True, False, False, True, False])
+    y = jax.jit(found)(x)
+    np.testing.assert_allclose(y[good], [0.8, 1.0], atol=1e-15)
+    assert np.isnan(y[~good]).all()
+    slopes = jax.jit(lambda x: jax.vjp(found, x)[1](jnp.ones_like(x))[0])(x)
+    forward = jax.jit(lambda x: jax.jvp(found, (x,), (jnp.ones_like(x),))[1])(x)
+    for derivative in (slopes, forward):  # dy/dx = -x / y
+        np.testing.assert_allclose(derivative[good], [-0.75, 0.0], atol=1e-14)
+        assert np.isnan(derivative[~good]).all()
+    mean = jax.jit(jax.grad(lambda x: jnp.mean(found(x)[jnp.array([0, 3])])))(x)  # reads what was found only
+    np.testing.assert_allclose(mean, [-0.375, 0, 0, 0, 0], atol=1e-14)
+
+
+def test_parameters_move_what_is_found():
+    def y(height):
+        return jk.assemble(Plane(height=height), {"x": 2.0}).q
+
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(y))(1.0), [0.0, 1.0, 0.0], atol=1e-14)
+    np.testing.assert_allclose(jax.jit(jax.jacrev(y))(1.0), [0.0, 1.0, 0.0], atol=1e-14)

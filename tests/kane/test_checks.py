@@ -1,0 +1,494 @@
+"""Wrong descriptions and bad numbers: each is caught with an error that names what is wrong."""
+
+import dataclasses
+import warnings
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_events import Bead
+
+import jaxkane as jk
+from jaxkane._kane.checks import _is_possible
+from jaxkane.catalog import DoublePendulum, WhippleBicycle
+
+
+class Slider(jk.System):
+    """A right description, from which the wrong ones differ in one line."""
+
+    mass: jk.Scalar = jk.parameter(1.0)
+    inertia: jk.Scalar = jk.parameter(0.1)
+    coordinates = ("x", "angle")
+    speeds = ("x_dot", "angle_dot")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(q["x"] * N.x, u["x_dot"] * N.x)
+        B = N.rotate(3, q["angle"], u["angle_dot"], "B")
+        G = P.fixed(0.5 * B.x)
+        return jk.Motion([jk.Body(self.mass, (self.inertia,) * 3, G, B, name="rod")])
+
+
+STATE = ([0.1, 0.2], [0.3, 0.4])
+
+
+def evaluate(system, q=STATE[0], u=STATE[1]):
+    return jk.accelerations(system, 0.0, q, u)
+
+
+def test_the_right_one_passes():
+    assert np.isfinite(evaluate(Slider())).all()
+
+
+def test_no_motion():
+    class Empty(jk.System):
+        coordinates, speeds = ("x",), ("x_dot",)
+
+    with pytest.raises(NotImplementedError, match="Empty must define motion"):
+        evaluate(Empty(), [0.0], [0.0])
+
+
+def test_speeds_that_are_not_the_rates_of_the_coordinates():
+    class TooFewSpeeds(jk.System):
+        coordinates = ("x", "angle")
+        speeds = ("x_dot",)
+
+        def motion(self, t, q, u):
+            N, O = jk.inertial()
+            return jk.Motion([jk.Body(1.0, 0.0, O.moving(q[0] * N.x, u[0] * N.x))])
+
+    with pytest.raises(ValueError, match=r"TooFewSpeeds has 2 coordinates and 1 speeds.*define q_dot"):
+        evaluate(TooFewSpeeds(), u=[0.3])
+
+
+def test_wrong_number_of_dependent_speeds():
+    class TwoResiduals(Slider):
+        dependent_speeds = ("angle_dot",)
+        speeds = ("x_dot",)
+
+        def motion(self, t, q, u):
+            motion = super().motion(t, q, u)
+            return jk.Motion(motion.bodies, [u["x_dot"] - u["angle_dot"], u["angle_dot"] + u["x_dot"]])
+
+    with pytest.raises(
+        ValueError, match=r"1 dependent speeds are named \(angle_dot\), but there are 2 velocity residuals"
+    ):
+        evaluate(TwoResiduals(), u=[0.3])
+
+    class Unnamed(Slider):
+        def motion(self, t, q, u):
+            return jk.Motion(super().motion(t, q, u).bodies, [u["x_dot"] - u["angle_dot"]])
+
+    with pytest.raises(ValueError, match=r"0 dependent speeds are named \(none\)"):
+        evaluate(Unnamed())
+
+
+@pytest.mark.parametrize(
+    ("residual", "message"),
+    [
+        (lambda u: u["x_dot"] - u["angle_dot"] ** 2, "the velocity residual 0 is not affine in angle_dot"),
+        (lambda u: u["angle_dot"] + u["x_dot"] * u["angle_dot"], "products of two speeds"),
+    ],
+)
+def test_residuals_that_are_not_affine(residual, message):
+    class NotAffine(Slider):
+        dependent_speeds = ("angle_dot",)
+        speeds = ("x_dot",)
+
+        def motion(self, t, q, u):
+            return jk.Motion(super().motion(t, q, u).bodies, [residual(u)])
+
+    with pytest.raises(ValueError, match=message):
+        evaluate(NotAffine(), u=[0.3])
+
+
+def test_a_velocity_that_is_not_affine():
+    class Squared(Slider):
+        def motion(self, t, q, u):
+            N, _ = jk.inertial()
+            return jk.Motion([jk.Body(1.0, 0.0, jk.Point.at(u[0] * u[0] * N.x + u[1] * N.y), name="rod")])
+
+    with pytest.raises(ValueError, match="the velocity of 'rod' is not affine in x_dot"):
+        evaluate(Squared())
+
+
+def test_a_rate_that_contradicts_the_coordinates():
+    class WrongRate(Slider):
+        def motion(self, t, q, u):
+            return super().motion(t, q, (u[0], 2.0 * u[1]))
+
+    with pytest.raises(
+        ValueError, match=r"WrongRate: the frame 'B' turns with .* rad/s by the rates of its coordinates"
+    ):
+        evaluate(WrongRate())
+
+    class NotFixed(Slider):
+        def motion(self, t, q, u):
+            N, O = jk.inertial()
+            B = N.rotate(3, q["angle"], u["angle_dot"], "B")
+            return jk.Motion([jk.Body(1.0, (0.1, 0.1, 0.1), O.fixed(q["x"] * B.x), B, name="rod")])
+
+    with pytest.raises(ValueError, match=r"the mass centre of 'rod' moves with .* m/s by the rates of its coordinates"):
+        evaluate(NotFixed())
+
+
+def test_a_body_that_turns_in_its_frame_must_be_symmetric():
+    class Lopsided(Slider):
+        def motion(self, t, q, u):
+            N, O = jk.inertial()
+            P = O.moving(q["x"] * N.x, u["x_dot"] * N.x)
+            return jk.Motion([jk.Body(1.0, (0.1, 0.2, 0.2), P, N, u["angle_dot"] * N.z, name="rotor")])
+
+    with pytest.raises(
+        ValueError, match="'rotor' turns in its frame 'N', but its inertia is not symmetric about that axis"
+    ):
+        evaluate(Lopsided())
+
+    class Rotor(Slider):
+        across: jk.Scalar = jk.parameter(0.1)
+
+        def motion(self, t, q, u):
+            N, O = jk.inertial()
+            P = O.moving(q["x"] * N.x, u["x_dot"] * N.x)
+            return jk.Motion([jk.Body(1.0, (0.1, self.across, 0.1), P, N, u["angle_dot"] * N.z, name="rotor")])
+
+    assert np.isfinite(evaluate(Rotor())).all()
+    with pytest.raises(ValueError, match="'rotor' turns in its frame 'N'"):
+        evaluate(Rotor(across=0.15))  # of one structure with what was right
+
+
+class TwoHingesOnOneAxis(jk.System):
+    """Two links turn about one axis, the first without mass: only the sum of their speeds moves anything.
+
+    With many, there are other bodies beside it, so that LAPACK solves for the accelerations.
+    """
+
+    inertia: jk.Scalar = jk.parameter(0.0)  # [kg m^2] of the first link about the axis
+    scale: jk.Scalar = jk.parameter(1.0)
+    many: bool = eqx.field(static=True, default=False)
+
+    @property
+    def coordinates(self):
+        return ("a", "b", "c", *(f"x{i}" for i in range(12 * self.many)))
+
+    @property
+    def speeds(self):
+        return tuple(f"{name}_rate" for name in self.coordinates)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, q["a"], u["a_rate"])
+        B = A.rotate(A.vector(0.3, 0.5, 0.81), q["b"], u["b_rate"])
+        C = B.rotate(B.vector(0.3, 0.5, 0.81), q["c"], u["c_rate"])
+        upper, lower = O.fixed(A.vector(0.3, 0.1, 0.7)), O.fixed(C.vector(0.1, 0.2, 0.3))
+        moments = [[self.scale * x for x in I] for I in ((0.07, 0.1, 0.13), (0.3, 0.2, 0.17))]
+        bodies = [jk.Body(0.3 * self.scale, moments[0], upper, A), jk.Body(0.2 * self.scale, moments[1], lower, C)]
+        rotor = jk.Body(0.0, (self.inertia, 0.0, 0.0), O, N, u["b_rate"] * N.x, name="rotor")
+        beside = [O.moving(q[i] * N.x, u[i] * N.x) for i in range(3, len(q))]
+        return jk.Motion([*bodies, rotor, *(jk.Body(1.0, 0.0, P) for P in beside)])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Torque(self.scale * (0.1 * motion.N.x + 0.4 * motion.N.z), motion.bodies[1].frame)
+
+
+@pytest.mark.parametrize("many", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_mass_matrix_that_is_singular_but_for_rounding(many):
+    system = TwoHingesOnOneAxis(many=many)
+    rng = np.random.default_rng(0)
+    for q, u in rng.normal(size=(4, 2, len(system.coordinates))):
+        with pytest.raises(ValueError, match="the mass matrix is singular: a combination of b_rate, c_rate moves no"):
+            evaluate(system, q, u)
+    assert np.isnan(jax.jit(lambda u: evaluate(system, q, u))(u)).any()
+    # Small masses are no fault, nor is a link of little inertia.
+    for light in (dict(inertia=1e-9), dict(inertia=1e-21, scale=1e-12)):
+        assert np.isfinite(evaluate(TwoHingesOnOneAxis(many=many, **light), q, u)).all()
+
+
+def test_what_motion_and_loads_return():
+    class NoMotion(Slider):
+        def motion(self, t, q, u):
+            return super().motion(t, q, u).bodies
+
+    with pytest.raises(TypeError, match=r"NoMotion.motion must return a jaxkane.Motion"):
+        evaluate(NoMotion())
+
+    class BadLoad(Slider):
+        def loads(self, t, q, u, motion, inputs):
+            return [3.0]
+
+    with pytest.raises(TypeError, match=r"BadLoad.loads returns Forces and Torques"):
+        evaluate(BadLoad())
+    with pytest.raises(TypeError, match="first argument is a Vector"):
+        jk.Force(3.0, None)
+
+
+# -- numbers
+
+
+@pytest.mark.parametrize(
+    ("value", "error", "message"),
+    [
+        (np.nan, ValueError, "DoublePendulum.mass = nan is not finite"),
+        (np.inf, ValueError, "DoublePendulum.mass = inf is not finite"),
+        (0.0, ValueError, "DoublePendulum.mass = 0.0 must be positive"),
+        (-1, ValueError, "DoublePendulum.mass = -1.0 must be positive"),
+        ("heavy", TypeError, "DoublePendulum.mass must be a real number"),
+        (None, TypeError, "DoublePendulum.mass must be a real number"),
+        (1j, TypeError, "DoublePendulum.mass must be a real number"),
+        (True, TypeError, "DoublePendulum.mass must be a real number"),
+        (np.ones((2, 3)), None, None),  # a batch; `simulate` says what it needs
+    ],
+)
+def test_parameters(value, error, message):
+    if error is None:
+        assert DoublePendulum(mass=value).mass.shape == (2, 3)
+        return
+    with pytest.raises(error, match=message):
+        DoublePendulum(mass=value)
+
+
+def test_integers_become_floats():
+    pendulum = DoublePendulum(mass=2, length=np.int64(1))
+    assert pendulum.mass.dtype == pendulum.length.dtype == jnp.float64
+    assert float(jax.grad(lambda p: jk.accelerations(p, 0, [1, 0], [0, 1]).sum())(pendulum).length) != 0.0
+
+
+def test_a_negative_mass_of_a_parameter_that_was_not_declared_positive():
+    with pytest.raises(ValueError, match=r"Slider, body 'rod': the mass is -1 kg"):
+        evaluate(Slider(mass=-1.0))
+
+
+class Spinner(jk.System):
+    """A body on a hinge, with any inertia."""
+
+    I11: jk.Scalar = jk.parameter()
+    I22: jk.Scalar = jk.parameter()
+    I33: jk.Scalar = jk.parameter()
+    mass: jk.Scalar = jk.parameter(1.0)
+    coordinates, speeds = ("angle",), ("rate",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        B = N.rotate(3, q[0], u[0])
+        return jk.Motion([jk.Body(self.mass, (self.I11, self.I22, self.I33), O.fixed(2.0 * B.x), B, name="disk")])
+
+
+class AnyInertia(Spinner):
+    check_inertia = False
+
+
+RESTING = jk.State(np.array([0.3]), np.array([1.0]))
+TS = np.linspace(0.0, 0.1, 3)
+ASKED = {
+    "accelerations": lambda body: jk.accelerations(body, 0.0, RESTING.q, RESTING.u),
+    "assemble": lambda body: jk.assemble(body, RESTING.q, RESTING.u),
+    "simulate": lambda body: jk.simulate(body, RESTING, TS),
+    "linearize": lambda body: jk.stability.linearize(body, RESTING, steady=False),
+    "grad": lambda body: jax.grad(lambda body: jk.kinetic_energy(body, 0.0, RESTING.q, RESTING.u))(body),
+}
+
+
+@pytest.mark.parametrize("asked", ASKED.values(), ids=ASKED)
+def test_one_rule_for_inertias_that_no_body_can_have(asked):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        asked(Spinner(1.0, 1.0, 2.0))  # a flat plate
+        asked(Spinner(1.0, 1.0, 2.003))  # rounded
+        asked(Spinner(0.0, 0.0, 2.0))  # a rotor: the moment about its axis alone
+        asked(AnyInertia(1.0, 1.0, 3.0))
+    with pytest.warns(UserWarning, match=r"Spinner, body 'disk': .* 1, 1, 2.1 kg m\^2.*triangle inequality"):
+        asked(Spinner(1.0, 2.1, 1.0))
+    with pytest.raises(ValueError, match=r"triangle inequality.*beyond 5 % they are refused.*check_inertia = False"):
+        asked(Spinner(1.0, 1.0, 2.2))
+    with pytest.raises(ValueError, match="none may be negative"):
+        asked(AnyInertia(1.0, -0.1, 1.0))
+
+
+@pytest.mark.slow
+def test_in_a_batch_bodies_that_cannot_be_have_a_status():
+    # possible, rounded, measured, refused, negative
+    I33 = np.array([2.0, 2.003, 2.1, 2.2, -0.1])
+    right = [0, 0, 0, 4, 4]
+    body = Spinner(1.0, 1.0, 1.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        rides = jk.sweep.sweep(body, RESTING, TS, table=jk.sweep.grid(I33=I33))
+        by_vmap = jax.jit(jax.vmap(lambda I: jk.simulate(dataclasses.replace(body, I33=I), RESTING, TS).status))(I33)
+    np.testing.assert_array_equal(rides.status, right)
+    assert np.isnan(rides.q[3:]).all()
+    np.testing.assert_array_equal(by_vmap, right)
+    possible = lambda check, *moments: _is_possible(jnp.array(1.0), jnp.diag(jnp.array(moments)), check)  # noqa: E731
+    assert [bool(possible(True, 1.0, 1.0, x)) for x in I33] == [code == 0 for code in right]
+    assert [bool(possible(False, 1.0, 1.0, x)) for x in I33] == [True, True, True, True, False]
+    assert possible(True, 0.0, 0.0, 2.0)  # a rotor
+    assert possible(True, 0.0, 0.0, 0.0)  # a particle
+    assert possible(True, 0.0, 2.0, 2.0)  # a line
+    lopsided = np.random.default_rng(0).normal(size=(200, 3, 3))
+    turned = np.linalg.qr(lopsided)[0]
+    moments = np.abs(np.random.default_rng(1).normal(size=(200, 3)))
+    largest = np.sort(moments)[:, 2]
+    expected = (2 * largest - moments.sum(1)) / largest <= 0.05
+    I = np.einsum("nij,nj,nkj->nik", turned, moments, turned)
+    found = jax.vmap(lambda I: _is_possible(jnp.array(1.0), I, True))(jnp.array(I))
+    np.testing.assert_array_equal(found, expected)
+    assert 20 < expected.sum() < 180
+
+
+def test_an_inertia_needs_a_frame():
+    N, O = jk.inertial()
+    with pytest.raises(ValueError, match=r"'rod' has an inertia, but no frame to turn with"):
+        jk.Body(1.0, (0.1, 0.1, 0.1), O, name="rod")
+    with pytest.raises(ValueError, match="no frame"):
+        jk.Body(1.0, jnp.eye(3), O)
+    jk.Body(1.0, 0, O), jk.Body(1.0, (0.0, 0, 0.0), O), jk.Body(1.0, np.zeros(3), O)
+    jk.Body(1.0, (0.1, 0.1, 0.1), O, angular_velocity=2.0 * N.z)  # a ball that turns
+    with pytest.raises(TypeError, match="the mass centre of 'rod' is a Point"):
+        jk.Body(1.0, 0.0, N, name="rod")
+    with pytest.raises(TypeError, match="the frame of 'rod' is a Frame"):
+        jk.Body(1.0, 0.0, O, O, name="rod")
+
+
+# -- names
+
+
+def test_one_name_for_two_parts_of_a_motion():
+    N, O = jk.inertial()
+    A, P = N.rotate(3, 0.1, 0.0, "A"), O.fixed(N.x)
+    rod, other, unnamed = (jk.Body(1.0, 0.0, O, name=name) for name in ("A", "A", "body"))
+    for parts, kinds in [
+        (([rod], {"frames": {"A": A}}), "a body and a frame"),
+        (([rod], {"points": {"A": P}}), "a body and a point"),
+        (([rod, other], {}), "a body and a body"),
+        (([unnamed], {"points": {"A": P}, "frames": {"A": A}}), "a point and a frame"),
+    ]:
+        with pytest.raises(ValueError, match=rf"two parts have the name 'A', {kinds}: motion\['A'\] could be either"):
+            jk.Motion(parts[0], **parts[1])
+    several = jk.Motion([unnamed, jk.Body(2.0, 0.0, P)], points={"P": P})
+    assert several["P"] is P
+    with pytest.raises(KeyError, match="Several bodies of this motion have no name"):
+        several["body"]
+    assert jk.Motion(unnamed)["body"] is unnamed
+    for wrong in ({"points": {"P": A}}, {"frames": {"A": P}}, {"points": {1: P}}):
+        with pytest.raises(TypeError, match="Motion: "):
+            jk.Motion([unnamed], **wrong)
+    with pytest.raises(TypeError, match="this is no Body"):
+        jk.Motion([P])
+
+
+@pytest.mark.parametrize(
+    ("names", "error", "message"),
+    [
+        (
+            {"inputs": ("torque")},
+            TypeError,
+            r"inputs is a tuple of names; 'torque' is a string. One name is \('torque',\)",
+        ),
+        ({"coordinates": "x"}, TypeError, "coordinates is a tuple of names; 'x' is a string"),
+        ({"speeds": ("x_dot", 2)}, TypeError, "speeds is a tuple of names"),
+        ({"dependent_speeds": None}, TypeError, "dependent_speeds is a tuple of names"),
+        ({"auxiliary_speeds": ("",)}, TypeError, "auxiliary_speeds is a tuple of names"),
+        ({"coordinates": ("x", "x")}, ValueError, "the name 'x' stands twice in `coordinates`"),
+        ({"speeds": ("x", "angle_dot")}, ValueError, "the name 'x' stands in `coordinates` and in `speeds`"),
+        ({"dependent_speeds": ("x_dot",)}, ValueError, "'x_dot' stands in `speeds` and in `dependent_speeds`"),
+        ({"inputs": ("angle",)}, ValueError, "'angle' stands in `coordinates` and in `inputs`"),
+        ({"dependent_coordinates": ("y",)}, ValueError, "names coordinates, each once: y is none"),
+        ({"dependent_coordinates": ("x", "x")}, ValueError, "names coordinates, each once: x is none, or stands"),
+    ],
+)
+def test_names_of_a_class(names, error, message):
+    with pytest.raises(error, match=message):
+        type("Named", (Slider,), names)()
+    properties = {kind: property(lambda self, given=given: given) for kind, given in names.items()}
+    with pytest.raises(error, match=message):
+        type("Named", (Slider,), properties)()
+
+
+def test_lists_of_names_and_the_name_of_an_auxiliary_speed():
+    listed = type("Listed", (Slider,), {"coordinates": ["x", "angle"]})
+    assert listed.coordinates == ("x", "angle")
+    assert np.isfinite(evaluate(listed())).all()
+
+    class Held(Slider):
+        auxiliary_speeds = ("P",)
+
+        def motion(self, t, q, u):
+            motion = super().motion(t, q, u)
+            return jk.Motion(motion.bodies, points={"P": motion["rod"].center})
+
+    with pytest.raises(ValueError, match="Held: P is the name of an auxiliary speed and of a point or a frame"):
+        evaluate(Held())
+
+
+def test_shapes_and_names():
+    bike = WhippleBicycle.benchmark()
+    q, u = np.zeros(8), np.zeros(3)
+    with pytest.raises(ValueError, match=r"WhippleBicycle: q must have the shape \(8,\).*Got \(7,\)"):
+        jk.accelerations(bike, 0.0, q[:7], u)
+    with pytest.raises(ValueError, match=r"u must have the shape \(3,\): roll_rate, .*Got \(4, 3\).*vmap"):
+        jk.accelerations(bike, 0.0, q, np.zeros((4, 3)))
+    with pytest.raises(ValueError, match=r"no input named brake; it has roll_torque, drive_torque, steer_torque"):
+        jk.accelerations(bike, 0.0, q, u, {"brake": 1.0})
+    with pytest.raises(ValueError, match=r"q has no lean; it has roll"):
+        jk.accelerations(bike, 0.0, {"lean": 0.1}, u)
+
+
+class OnACircle(jk.System):
+    coordinates, speeds = ("x", "y"), ("x_dot",)
+    dependent_speeds, dependent_coordinates = ("y_dot",), ("y",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q[0] * N.x + q[1] * N.y, u[0] * N.x + u[1] * N.y))])
+
+    def configuration_constraints(self, t, q):
+        return [q["x"] ** 2 + q["y"] ** 2 - 1.0]
+
+
+def test_assemble_says_when_it_cannot():
+    bike = WhippleBicycle.benchmark()
+    with pytest.raises(ValueError, match=r"constraints do not determine pitch with roll = 1\.571"):
+        jk.assemble(bike, {"roll": np.pi / 2})
+    with pytest.raises(ValueError, match=r"no y satisfies the configuration constraints with x = 2: .* residual is"):
+        jk.assemble(OnACircle(), {"x": 2.0})
+    with pytest.raises(ValueError, match=r"pitch_rate = 3 contradicts the velocity constraints"):
+        jk.assemble(bike, {"roll": 0.1}, {"rear_wheel_rate": -10.0, "pitch_rate": 3.0})
+    with pytest.raises(ValueError, match="WhippleBicycle: steer, roll_rate is not finite"):
+        jk.assemble(bike, {"steer": np.nan}, {"roll_rate": np.inf})
+    with pytest.raises(ValueError, match="has no coordinate lean"):
+        jk.assemble(bike, {}, free=("lean",))
+    given = jk.assemble(bike, {}, {"rear_wheel_rate": -10.0, "front_wheel_rate": -10.0 * 0.3 / 0.35})
+    np.testing.assert_array_equal(given.u, [0.0, -10.0, 0.0])
+
+
+@pytest.mark.slow
+def test_assemble_is_differentiable_twice_and_maps():
+    bike = WhippleBicycle.benchmark()
+    pitch = lambda x: jk.assemble(bike, jnp.zeros(8).at[jnp.array([0, 2])].set(x)).q[4]  # noqa: E731
+    x, h = jnp.array([0.3, -0.5]), 1e-5
+    forward, reverse = jax.jacfwd(pitch)(x), jax.grad(pitch)(x)
+    e = h * jnp.eye(2)
+    numeric = jnp.stack([(pitch(x + d) - pitch(x - d)) / (2 * h) for d in e])
+    np.testing.assert_allclose(forward, numeric, atol=1e-9)
+    np.testing.assert_allclose(reverse, forward, atol=1e-13)
+    hessian = jax.jacfwd(jax.jacfwd(pitch))(x)
+    slopes = jax.jit(jax.jacfwd(pitch))
+    numeric = jnp.stack([(slopes(x + d) - slopes(x - d)) / (2 * h) for d in e])
+    np.testing.assert_allclose(hessian, numeric, atol=1e-7)
+    many = jax.vmap(pitch)(jnp.stack([x, jnp.array([np.pi / 2, 0.0]), jnp.array([np.nan, 0.0])]))
+    assert np.isfinite(many[0])
+    assert np.isnan(many[1:]).all()  # under a trace there is nobody to raise to
+
+
+def test_assemble_and_simulate_in_one_program():
+    bead = Bead(ends=False)
+
+    @jax.jit
+    def final_height(x):
+        state = jk.assemble(bead, {"x": x, "y": 1.0}, {"vx": 0.4})
+        return jk.simulate(bead, state, TS)["y"][-1]
+
+    # On a circle of 1 m, without weight: the speed is 0.4 m/s over the height at the start.
+    end = np.arcsin(0.6) + 0.4 / 0.8 * float(TS[-1])
+    np.testing.assert_allclose(final_height(0.6), np.cos(end), atol=1e-7)

@@ -1,0 +1,78 @@
+"""Motions that are known in closed form, and the formulas in which the textbook errs."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxkane as jk
+from jaxkane._kane.kane import Instant
+from jaxkane.catalog import CATALOG
+
+
+def test_steady_precession_of_the_top():
+    # About O, with I_O = I + m L^2 and the axis at the angle theta from the vertical (Goldstein, section 5.7):
+    # I_O cos(theta) Omega^2 - I3 omega3 Omega + m g L = 0, here the slow root
+    atol = 1e-9  # [rad/s]
+    m, L, I, I3, g, theta, omega3 = 0.5, 0.1, 0.001, 0.0008, 9.81, 0.6, 300.0
+    top = jk.catalog.SpinningTop(m, L, I, I3, g)
+    Omega = np.roots([(I + m * L**2) * np.cos(theta), -I3 * omega3, m * g * L]).min()
+    q = jnp.array([np.sin(theta / 2), 0.0, 0.0, np.cos(theta / 2)])
+    u = jnp.array([0.0, Omega * np.sin(theta), omega3])
+    ts = jnp.linspace(0.0, 2.0, 3)
+    ride = jk.simulate(top, jk.State(q, u), ts, rtol=1e-12, atol=1e-12, max_steps=100_000)
+    motion = top.motion(ts[-1], ride.q[-1], ride.u[-1])
+    x, y, z = motion["T"].z.to(motion.N)
+    turned = np.unwrap([Omega * 2.0, float(jnp.arctan2(x, -y))])[1]  # at first the axis leans towards -y
+    np.testing.assert_allclose(turned / 2.0, Omega, rtol=0, atol=atol)
+    np.testing.assert_allclose(jnp.arccos(z), theta, rtol=0, atol=1e-8)
+
+
+def test_VC_dot_of_the_bicycle_and_the_books_order_of_products():
+    # Example 7, [VC-dot]: in its second and third lines the products stand in the wrong order, R_B2C and [J] are
+    # missing. Right is the expression of [VD-dot], with C in the place of D.
+    bicycle = CATALOG["WhippleBicycle"].example()
+    q, u = (jnp.array(x) for x in (CATALOG["WhippleBicycle"].q, CATALOG["WhippleBicycle"].u))
+    q_dot = jk.coordinate_rates(bicycle, 0.0, q, u)
+
+    def along(f):
+        return jax.jvp(f, (q,), (q_dot,))
+
+    def R_B2C(q):
+        motion = bicycle.motion(0.0, q, jnp.zeros(6))
+        return motion["C"].matrix(motion["B"])
+
+    def of_point(pick):  # partial velocities (3,3) of a point, in C
+        def columns(q):
+            now = Instant(bicycle, 0.0, q, jnp.zeros(3))
+
+            def velocity(u):
+                motion = now.motion(0.0, now.q, (*u, *(J @ u)))
+                return pick(motion).velocity.to(motion["C"])
+
+            J = jnp.array(now.J).T
+            return jax.jacfwd(velocity)(jnp.zeros(3))
+
+        return columns
+
+    VS, VS_dot = along(of_point(lambda motion: motion["S"]))
+    VC, VC_dot = along(of_point(lambda motion: motion["fork"].center))
+    J, J_dot = along(lambda q: jk.constraint_jacobian(bicycle, 0.0, q))
+    R, R_dot = along(R_B2C)
+
+    def A_and_B(q):  # omega_B = (A + B J) u_I, in B
+        (s1, c1), (s2, c2) = ((jnp.sin(x), jnp.cos(x)) for x in (q[0], q[4]))
+        O = jnp.zeros(())
+        A = jnp.stack([jnp.stack(row) for row in ((c2, O, O), (O, O, O), (s2, O, O))])
+        B = jnp.stack([jnp.stack(row) for row in ((-c1 * s2, O, O), (s1, O + 1.0, O), (c1 * c2, O, O))])
+        return A, B
+
+    (A, B), (A_dot, B_dot) = along(A_and_B)
+    E = jnp.zeros((3, 3)).at[2, 2].set(1.0)
+    motion = bicycle.motion(0.0, q, jnp.zeros(6))
+    x, _, z = motion["fork"].center.position_from(motion["S"]).to(motion["C"])
+    X = jnp.array([[0.0, z, 0.0], [-z, 0.0, x], [0.0, -x, 0.0]])
+    np.testing.assert_allclose(VS + X @ (R @ A + E + R @ B @ J), VC, atol=1e-13)  # [VC] as printed is right
+    right = VS_dot + X @ (R_dot @ A + R @ A_dot + R_dot @ B @ J + R @ B @ J_dot + R @ B_dot @ J)
+    printed = VS_dot + X @ (A @ R_dot + A_dot) + X @ (B @ R_dot + B @ J_dot) + X @ (B_dot @ J_dot)
+    np.testing.assert_allclose(right, VC_dot, atol=1e-12)
+    assert np.abs(printed - VC_dot).max() > 0.01

@@ -1,0 +1,204 @@
+"""Drift of configuration constraints, how it is held, and constraints that cannot be solved."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_other_systems import FourBarLinkage
+
+import jaxkane as jk
+from jaxkane import best_dependent_speeds
+from jaxkane._kane.constraints import dependent_speeds_from, relative_condition
+
+HELD = 1e-9
+
+
+def crank_rocker():
+    """Grashof's condition holds: the crank l2 turns round and round."""
+    system = FourBarLinkage(l1=1.0, l2=0.3, l3=0.9, l4=0.7, rho=1.0)
+    return system, jk.assemble(system, {"q1": 0.5, "q2": 1.0, "q3": 2.0}, {"u1": 4.0})
+
+
+@pytest.mark.slow
+def test_a_minute_of_a_four_bar_linkage():
+    system, state = crank_rocker()
+    ts = jnp.linspace(0.0, 60.0, 601)
+    free = jk.audit(system, jk.simulate(system, state, ts))
+    projected = jk.audit(system, jk.simulate(system, state, ts, project=True))
+    assert free.drift > 10 * HELD
+    assert projected.drift < HELD * 1e-3
+    assert projected.energy_balance < 1e-5
+
+
+def top(**options):
+    entry = jk.catalog.CATALOG["SpinningTop"]
+    system, state = entry.example(), jk.State(jnp.array(entry.q), jnp.array(entry.u))
+    return system, jk.simulate(system, state, jnp.linspace(0.0, 5.0, 26), rtol=1e-5, atol=1e-5, **options)
+
+
+@pytest.mark.slow
+def test_stabilized_and_projected_coordinates_do_not_drift():
+    free, stabilized, projected = (jk.audit(*top(**how)) for how in ({}, {"stabilize": 10.0}, {"project": True}))
+    assert stabilized.drift < 0.3 * free.drift  # what is left is the interpolation between steps
+    assert projected.drift < 1e-14
+
+
+@pytest.mark.slow
+def test_a_projected_motion_has_gradients_also_where_it_ends_early():
+    top = jk.catalog.SpinningTop()
+    entry = jk.catalog.CATALOG["SpinningTop"]
+    state = jk.State(jnp.array(entry.q), jnp.array(entry.u))
+
+    def place(gravity, project, max_steps):
+        system = jk.catalog.SpinningTop(gravity=gravity)
+        options = {"project": project, "adjoint": "forward", "max_steps": max_steps}
+        ride = jk.simulate(system, state, jnp.linspace(0.0, 0.3, 4), **options)
+        return jnp.where(jnp.isfinite(ride.q), ride.q, 0.0)[1]
+
+    free, held = (jax.jacfwd(place)(top.gravity, project, 4096) for project in (False, True))
+    np.testing.assert_allclose(held, free, rtol=0, atol=1e-7)
+    steps = int(jk.simulate(top, state, jnp.linspace(0.0, 0.3, 4)).stats["steps"])
+    np.testing.assert_allclose(jax.jacfwd(place)(top.gravity, True, steps // 2), held, rtol=0, atol=1e-12)
+
+
+def test_the_best_dependent_speeds_of_the_bicycle():
+    bicycle = jk.catalog.WhippleBicycle.benchmark()
+    upright = best_dependent_speeds(bicycle, 0.0, jk.assemble(bicycle, {}).q)
+    assert upright.rank == 3
+    assert "well chosen" in str(upright)
+    # Steered across (91.77 deg for the upright benchmark bicycle), the front wheel has no grip on the yaw.
+    steered = jk.assemble(bicycle, {"steer": np.deg2rad(91.77), "roll": 1e-3})
+    across = best_dependent_speeds(bicycle, 0.0, steered.q)
+    assert across.condition > 100 * across.choices[0][1]
+    assert across.best != bicycle.dependent_speeds
+    assert "would be" in str(across)
+    # in the order of conditioning, and those of one's own among them
+    conditions = [x for _, x in across.choices]
+    assert conditions == sorted(conditions)
+    assert len(conditions) == 10  # the best, and three for each of its three speeds
+
+
+def test_the_best_of_many_choices_is_found():
+    rng = np.random.default_rng(5)
+    for _ in range(3):
+        C = rng.normal(size=(5, 18)) * np.where(np.arange(18) < 12, 1e-4, 1.0)  # 8568 choices; the first are bad
+        speeds = tuple(f"u{i}" for i in range(18))
+        chosen = dependent_speeds_from(C, np.zeros(5), speeds, speeds[:5], "Many")
+        least = min(relative_condition(C, c) for c in itertools.combinations(range(12, 18), 5))
+        assert chosen.choices[0][1] <= 1.2 * least
+        assert chosen.condition == relative_condition(C, range(5))
+
+
+class Twice(jk.System):
+    """A point in a plane whose two residuals say the same; or, with a drift, contradict each other."""
+
+    drift: jk.Scalar = jk.parameter(0.0)  # [m/s]
+    coordinates = ("x", "y")
+    speeds = ()
+    dependent_speeds = ("vx", "vy")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(N.vector(q["x"], q["y"], 0.0), N.vector(u["vx"], u["vy"], 0.0))
+        slope = u["vx"] - 2.0 * u["vy"]
+        return jk.Motion([jk.Body(1.0, 0.0, P)], [slope, 3.0 * slope + self.drift])
+
+
+def test_redundant_and_conflicting_residuals_are_told_apart():
+    redundant = best_dependent_speeds(Twice(), 0.0, jnp.array([0.1, 0.2]))
+    assert (redundant.rank, redundant.redundant, redundant.conflicting) == (1, (1,), ())
+    assert "rank 1" in str(redundant)
+    conflicting = best_dependent_speeds(Twice(drift=0.5), 0.0, jnp.array([0.1, 0.2]))
+    assert conflicting.conflicting == (1,)
+    assert "contradicts" in str(conflicting)
+
+
+def test_redundant_residuals_are_refused_with_their_rank():
+    with pytest.raises(ValueError, match="rank 1"):
+        jk.accelerations(TwiceOver(), 0.0, jnp.array([0.0, 0.0]), jnp.array([1.0]))
+
+
+class TwiceOver(Twice):
+    """A third speed, so that there is something to solve for."""
+
+    speeds = ("vz",)
+
+    def q_dot(self, t, q, u):
+        return u["vx"], u["vy"]
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(N.vector(q["x"], q["y"], 0.0), N.vector(u["vx"], u["vy"], 0.0))
+        slope = u["vx"] - 2.0 * u["vy"] - u["vz"]
+        Q = jk.Point.at(u["vz"] * N.z)
+        return jk.Motion([jk.Body(1.0, 0.0, P), jk.Body(1.0, 0.0, Q)], [slope, 3.0 * slope])
+
+
+def spatial_pendulum(**parameters):
+    entry = jk.catalog.CATALOG["SpatialDoublePendulum"]
+    system = jk.catalog.SpatialDoublePendulum(**parameters)
+    return system, jnp.array(entry.q), jnp.array(entry.u)
+
+
+def test_the_best_dependent_speeds_are_asked_for_at_numbers():
+    """NaN in a residual's rows would pass for a good choice, or for singular values that do not converge."""
+    bicycle = jk.catalog.WhippleBicycle.benchmark()
+    with pytest.raises(ValueError, match="WhippleBicycle: q is not finite: steer"):
+        jk.best_dependent_speeds(bicycle, 0.0, jnp.zeros(8).at[2].set(jnp.nan))
+
+
+@pytest.mark.slow
+def test_a_massless_speed_is_refused_by_name():
+    # Kamman, Unit 5, Example 6, note 2: a line has no moment of inertia about itself
+    system, q, u = spatial_pendulum(I22_1=0.0)
+    with pytest.raises(ValueError, match="no mass moves with the speed omega12"):
+        jk.accelerations(system, 0.0, q, u)
+    with pytest.raises(ValueError, match="omega12"):
+        jk.simulate(system, jk.State(q, u), jnp.linspace(0.0, 1.0, 3))
+    both, _, _ = spatial_pendulum(I22_1=0.0, I22_2=0.0)
+    with pytest.raises(ValueError, match="speeds omega12, omega22"):
+        jk.accelerations(both, 0.0, q, u)
+    # in a batch, the status of its member
+    pendulums = jax.vmap(lambda I: spatial_pendulum(I22_1=I)[0])(jnp.array([0.0, 0.002]))
+    rides = jax.vmap(lambda s: jk.simulate(s, jk.State(q, u), jnp.linspace(0.0, 0.1, 3)))(pendulums)
+    assert rides.reason == ["no solution", "completed"]
+
+
+@pytest.mark.slow
+def test_locked_angles_are_met_by_an_event_or_an_error_with_advice():
+    system, q, u = spatial_pendulum()
+    with pytest.raises(ValueError, match=r"theta11, theta12, theta13 are not finite.*Euler parameters"):
+        jk.simulate(system, jk.State(q.at[1].set(0.0), u), jnp.linspace(0.0, 1.0, 3))
+    # The first link swings through the vertical in its own plane: theta12 passes zero.
+    falling = jk.State(jnp.array([0.0, 0.3, 0.0, 0.0, 0.5, 0.0]), jnp.array([-2.0, 0.0, 0.0, 0.0, 0.0, 0.0]))
+    ride = jk.simulate(system, falling, jnp.linspace(0.0, 1.0, 11))
+    assert ride.reason in ("gimbal lock 1", "gimbal lock 2")
+    assert "Euler parameters" in repr(ride)
+
+
+class Wedge(jk.System):
+    """A particle in a plane whose residual is `small` * vx + vy, solved for vx."""
+
+    small: jk.Scalar = jk.parameter(1e-9)
+    coordinates, speeds, dependent_speeds = ("x", "y"), ("vy",), ("vx",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(N.vector(q["x"], q["y"], 0.0), N.vector(u["vx"], u["vy"], 0.0))
+        return jk.Motion([jk.Body(1.0, 0.0, P)], [self.small * u["vx"] + u["vy"]])
+
+    def q_dot(self, t, q, u):
+        return u["vx"], u["vy"]
+
+
+def test_one_residual_is_weighed_against_the_other_speeds():
+    q = jnp.array([0.1, 0.2])
+    wedge = best_dependent_speeds(Wedge(), 0.0, q)
+    np.testing.assert_allclose([x for _, x in wedge.choices], [1.0, 1e9], rtol=1e-9)  # sqrt(1 + 1e-18) / 1e-9
+    assert wedge.best == ("vy",)
+    assert "for vy it would be 1" in str(wedge)
+    assert "well chosen" in str(best_dependent_speeds(Wedge(small=2.0), 0.0, q))
+    scaled = relative_condition(1e6 * np.array([[[1e-9, 1.0]], [[0.0, 1.0]], [[3.0, 4.0]]]), [0])
+    np.testing.assert_allclose(scaled, [1e9, np.inf, 5 / 3], rtol=1e-9)  # the unit of a residual does not matter

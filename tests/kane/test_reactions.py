@@ -1,0 +1,197 @@
+"""Constraint forces against statics, Newton's second law by hand, and SymPy's auxiliary speeds."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_other_systems import FIGURES, FourBarLinkage, RollingDiscDependent
+
+import jaxkane as jk
+from jaxkane import constraint_forces, constraint_multipliers
+from jaxkane._kane.kane import Instant
+from jaxkane.catalog import CATALOG
+
+RTOL = 1e-12
+
+
+def momentum_rate(system, q, u, inputs=None, bodies=slice(None)):
+    """d/dt of the linear momentum (3,) of some bodies, in N, by differentiation along the motion."""
+
+    def momentum(t, q, u):
+        now = Instant(system, t, q, u)
+        motion = now.motion(now.t, now.q, now.u_all)
+        return sum(jnp.asarray(b.mass, float) * b.center.velocity.to(motion.N) for b in motion.bodies[bodies])
+
+    u_dot = jk.accelerations(system, 0.0, q, u, inputs)
+    rates = (jnp.array(1.0), jk.coordinate_rates(system, 0.0, q, u), u_dot)
+    return jax.jvp(momentum, (jnp.array(0.0), q, u), rates)[1]
+
+
+def moving(name):
+    entry = CATALOG[name]
+    return entry.example(), jnp.array(entry.q), jnp.array(entry.u)
+
+
+def test_wheel_loads_of_the_benchmark_bicycle_at_rest():
+    # Meijaard et al. (2007), Table 1, by the lever rule; N.z points down, and the ground pushes up
+    bicycle = jk.catalog.WhippleBicycle.benchmark()
+    state = jk.assemble(bicycle, {})
+    forces = constraint_forces(bicycle, 0.0, state.q, state.u)
+    np.testing.assert_allclose(forces["P"], [0.0, 0.0, -612.836470588236], rtol=1e-13, atol=1e-10)
+    np.testing.assert_allclose(forces["Q"], [0.0, 0.0, -309.303529411765], rtol=1e-13, atol=1e-10)
+
+
+def test_wheel_forces_of_the_moving_bicycle_balance_its_momentum():
+    bicycle, q, u = moving("WhippleBicycle")
+    inputs = {"roll_torque": 2.0, "drive_torque": -5.0, "steer_torque": 1.5}
+    forces = constraint_forces(bicycle, 0.0, q, u, inputs)
+    weight = 94.0 * 9.81 * np.array([0.0, 0.0, 1.0])
+    np.testing.assert_allclose(
+        forces["P"] + forces["Q"] + weight, momentum_rate(bicycle, q, u, inputs), rtol=0, atol=RTOL * 900
+    )
+    # What turns with Y is everything, and contact points carry no moment.
+    np.testing.assert_allclose(forces["Y"], 0.0, atol=RTOL * 900)
+    # fork and front wheel hang on the frame at S
+    front = momentum_rate(bicycle, q, u, inputs, slice(2, 4))
+    np.testing.assert_allclose(forces["S"] + forces["Q"] + 7 / 94 * weight, front, rtol=0, atol=RTOL * 900)
+
+
+def test_joint_forces_of_a_pendulum_are_newtons():
+    # By hand: link 2 is carried at A, both at O; the acceleration of a mass centre from angles, rates and their rates.
+    system, q, u = moving("DoublePendulum")
+    inputs = {"shoulder_torque": 0.7, "elbow_torque": -1.3}
+    forces = constraint_forces(system, 0.0, q, u, inputs)
+    u_dot = jk.accelerations(system, 0.0, q, u, inputs)
+
+    def swing(r, i):  # of a point at r on a link, from its upper end; at zero it hangs along -y
+        s, c = np.sin(q[i]), np.cos(q[i])
+        return r * (u_dot[i] * np.array([c, s, 0.0]) + u[i] ** 2 * np.array([-s, c, 0.0]))
+
+    m, l, g = 1.0, 1.0, np.array([0.0, -9.81, 0.0])
+    a1, a2 = swing(0.5 * l, 0), swing(l, 0) + swing(0.5 * l, 1)
+    np.testing.assert_allclose(forces["A"], m * (a2 - g), rtol=RTOL, atol=RTOL)
+    np.testing.assert_allclose(forces["O"], m * (a1 + a2 - 2 * g), rtol=RTOL, atol=RTOL)
+
+
+def test_joint_forces_of_the_spatial_pendulum_are_newtons():
+    system, q, u = moving("SpatialDoublePendulum")
+    forces = constraint_forces(system, 0.0, q, u)
+    weights = np.array([[0.0, 9.81 * m, 0.0] for m in (1.2, 0.8)])
+    both, second = momentum_rate(system, q, u), momentum_rate(system, q, u, bodies=slice(1, 2))
+    np.testing.assert_allclose(forces["O"], both + weights.sum(0), rtol=RTOL, atol=1e-12)
+    np.testing.assert_allclose(forces["A"], second + weights[1], rtol=RTOL, atol=1e-12)
+
+
+def test_a_rail_carries_a_slider():
+    # Exercise 5.2: along the rail nothing but the loads, across it the weights and the bar's momentum
+    system, q, u = moving("SliderWithPinnedBar")
+    force = constraint_forces(system, 0.0, q, u, {"force": 3.0})["A"]
+    p_dot = momentum_rate(system, q, u, {"force": 3.0})
+    np.testing.assert_allclose(force, [0.0, p_dot[1] + 3.0 * 9.81, 0.0], rtol=RTOL, atol=1e-12)
+
+
+def test_walls_of_the_piston_and_of_the_slider():
+    # Exercise 5.1, by Newton and Euler on the bar: the wall of A pushes along x, the guide of B along y.
+    system, q, u = moving("BarWithPiston")
+    F = 4.0
+    forces = constraint_forces(system, 0.0, q, u, {"force": F})
+    p_dot = momentum_rate(system, q, u, {"force": F})
+    x, v = 0.5 * np.sin(q[0]), 0.5 * np.cos(q[0]) * u[0]
+    np.testing.assert_allclose(forces["piston_guide"], p_dot[0] + 200.0 * x + 5.0 * v, rtol=RTOL)
+    np.testing.assert_allclose(forces["slider_guide"], p_dot[1] + 3.0 * 9.81 + F, rtol=RTOL)
+
+
+def test_a_declared_auxiliary_speed_agrees_with_sympy():
+    figures = FIGURES["rolling_disc_dependent_q_u_aux"]
+    system = RollingDiscDependent(**figures["params"])
+    for state in figures["states"]:
+        q, u = (
+            np.array([state[x][n] for n in names]) for x, names in (("q", system.coordinates), ("u", system.speeds))
+        )
+        forces = constraint_forces(system, 0.0, q, u)
+        np.testing.assert_allclose(list(forces.values()), list(state["aux_forces"].values()), rtol=1e-11, atol=1e-11)
+        # The multipliers are the same force, along the residual's frame B: A turned by the lean.
+        x, y, z = forces.values()
+        c, s = np.cos(q[1]), np.sin(q[1])
+        multipliers = constraint_multipliers(system, 0.0, q, u)
+        np.testing.assert_allclose(multipliers, [x, c * y + s * z, c * z - s * y], rtol=1e-11, atol=1e-11)
+
+
+def test_a_closed_loop_carries_forces_at_all_its_joints():
+    figures = FIGURES["four_bar_linkage"]
+    system = FourBarLinkage(**figures["params"])
+    state = figures["states"][0]
+    q = jnp.array([state["q"][x] for x in system.coordinates])
+    u = jnp.array([state["u"]["u1"]])
+    forces = constraint_forces(system, 0.0, q, u)
+    # Nothing but the pins at the end of the ground link and of the chain touches the three links.
+    multipliers = constraint_multipliers(system, 0.0, q, u)
+    np.testing.assert_allclose(forces["end"], [*multipliers, 0.0], rtol=RTOL)
+    np.testing.assert_allclose(forces["pin"] + forces["end"], momentum_rate(system, q, u), rtol=1e-11, atol=1e-11)
+
+
+class Bracketed(jk.System):
+    """A beam built into a shaft that is driven about N.z: its root carries a force and a moment."""
+
+    coordinates = ("angle",)
+    speeds = ("rate",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        B = N.rotate(3, q[0], u[0], "B")
+        center = O.fixed(0.5 * B.x)
+        beam = jk.Body(2.0, (0.0, 1 / 6, 1 / 6), center, B, name="beam")
+        return jk.Motion([beam], points={"O": O}, frames={"B": B})
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -10.0 * motion.N.z), jk.Torque(3.0 * motion.N.z, motion["beam"])
+
+
+def test_a_frame_carries_a_moment():
+    forces = constraint_forces(Bracketed(), 0.0, jnp.array([0.0]), jnp.array([3.0]))
+    # a = (-0.5 * 3^2, 0.5 * 3 / (2/3), 0); the weight of 20 N at 0.5 m bends the root, the driving torque is a load
+    np.testing.assert_allclose(forces["O"], [-9.0, 4.5, 20.0], rtol=RTOL)
+    np.testing.assert_allclose(forces["B"], [0.0, -10.0, 0.0], rtol=RTOL, atol=RTOL)
+
+
+class Sleigh(jk.System):
+    """Chaplygin's sleigh: a knife edge at P, from which the body is built; a scalar residual."""
+
+    coordinates = ("x", "y", "angle")
+    speeds = ("vx", "rate")
+    dependent_speeds = ("vy",)
+
+    def q_dot(self, t, q, u):
+        return u["vx"], u["vy"], u["rate"]
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        B = N.rotate(3, q["angle"], u["rate"], "B")
+        P = O.moving(N.vector(q["x"], q["y"], 0.0), N.vector(u["vx"], u["vy"], 0.0))
+        body = jk.Body(2.0, (0.2, 0.2, 0.3), P.fixed(0.4 * B.x), B)
+        return jk.Motion([body], [P.velocity.dot(B.y)])
+
+
+def test_the_multiplier_of_a_scalar_residual_is_a_force_along_it():
+    system, q, u = Sleigh(), jnp.array([0.1, 0.2, 0.5]), jnp.array([1.0, 0.7])
+    (force,) = constraint_multipliers(system, 0.0, q, u)
+    across = np.array([-np.sin(0.5), np.cos(0.5), 0.0])
+    np.testing.assert_allclose(force * across, momentum_rate(system, q, u), rtol=RTOL, atol=RTOL)
+
+
+@pytest.mark.slow
+def test_along_a_trajectory_under_jit_and_in_gradients():
+    system, q, u = moving("DoublePendulum")
+    inputs = {"elbow_torque": 0.4}
+    swing = jk.simulate(system, jk.State(q, u), jnp.linspace(0.0, 0.5, 6), inputs)
+    along = jax.jit(constraint_forces)(system, swing)
+    assert along["A"].shape == (6, 3)
+    one = constraint_forces(system, swing.t[3], swing.q[3], swing.u[3], inputs)
+    np.testing.assert_allclose(along["O"][3], one["O"], rtol=RTOL, atol=RTOL)
+
+    def tension(mass):
+        return constraint_forces(jk.catalog.DoublePendulum(mass=mass), 0.0, q, u)["O"][1]
+
+    np.testing.assert_allclose(jax.grad(tension)(2.0), tension(1.0), rtol=RTOL)  # proportional to the mass
+    with pytest.raises(TypeError, match="holds coordinates"):
+        constraint_forces(system, swing, q, u)

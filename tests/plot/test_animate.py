@@ -1,0 +1,415 @@
+"""Animations: everything is where the description says, and the page shows it, in a browser and without one."""
+
+import base64
+import gc
+import json
+import re
+import shutil
+import subprocess
+import tempfile
+import time
+import weakref
+from pathlib import Path
+
+import browser
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from PIL import Image
+
+import jaxkane as jk
+from jaxkane._animate._figures import record
+from jaxkane._animate._scene import project, which_way_is_up
+
+needs_a_browser = pytest.mark.skipif(browser.PROGRAM is None, reason=browser.WHY_NOT)
+NODE = shutil.which("node")
+SPEED = 5.0  # of the bicycle [m/s]
+
+
+def moved(system, ts, q, u, u_dep=None):
+    """A trajectory of given coordinates and speeds, without solving anything."""
+    n = len(ts)
+    dep = np.zeros((n, len(system.dependent_speeds))) if u_dep is None else u_dep
+    x = np.zeros((n, len(system.states)))
+    inputs = {name: jnp.zeros(n) for name in system.inputs}
+    stats = {name: jnp.asarray(n) for name in ("steps", "accepted", "rejected")}
+    return jk.Trajectory(
+        **{name: jnp.asarray(array) for name, array in dict(t=ts, q=q, u=u, u_dep=dep, x=x).items()},
+        inputs=inputs,
+        outputs={},
+        status=jnp.asarray(0),
+        t_end=jnp.asarray(ts[-1]),
+        stats=stats,
+        names=(system.coordinates, system.speeds, system.dependent_speeds, system.states),
+        events=(),
+        adjoint="none",
+    )
+
+
+@pytest.fixture(scope="module")
+def ride():
+    """A bicycle that weaves gently for ten seconds; (system, trajectory)."""
+    system = jk.catalog.WhippleBicycle.benchmark()
+    t = np.linspace(0.0, 10.0, 1001)
+    q, u, u_dep = np.zeros((1001, 8)), np.zeros((1001, 3)), np.zeros((1001, 3))
+    q[:, 0], q[:, 2], q[:, 6] = 0.1 * np.sin(2 * t), 0.05 * np.sin(2 * t), SPEED * t
+    u[:, 1], u_dep[:, 2] = -SPEED / float(system.rR), -SPEED / float(system.rF)
+    q[:, 1], q[:, 5] = u[:, 1] * t, u_dep[:, 2] * t
+    return system, moved(system, t, q, u, u_dep)
+
+
+@pytest.fixture(scope="module")
+def weaving(ride):
+    return jk.animate(*ride)
+
+
+@pytest.fixture(scope="module")
+def swing():
+    """A double pendulum, animated; (system, trajectory, animation)."""
+    system, t = jk.catalog.DoublePendulum(), np.linspace(0.0, 2.0, 81)
+    q = np.stack([0.6 * np.cos(3 * t), -0.4 * np.cos(5 * t)], axis=1)
+    trajectory = moved(system, t, q, np.zeros((81, 2)))
+    return system, trajectory, jk.animate(system, trajectory)
+
+
+def shapes(animation, kind):
+    return [shape for shape in animation.scene.shapes if shape.kind == kind]
+
+
+def test_bodies_and_points_are_where_the_description_says(swing):
+    """1e-12, at a time of the trajectory. N.y is up, so it is the page's z."""
+    system, trajectory, animation = swing
+    x, _ = animation.scene.at(trajectory.t[40])
+    motion = system.motion(trajectory.t[40], trajectory.q[40], jnp.zeros(2))
+    for shape in [*shapes(animation, "center"), *shapes(animation, "dot")]:
+        part = motion["A"].fixed(0.0 * motion.N.x) if shape.label == "O" else motion[shape.label]
+        place = (
+            np.zeros(3)
+            if shape.label == "O"
+            else (part.center if hasattr(part, "center") else part).position.to(motion.N)
+        )
+        right, up, towards = np.asarray(place)
+        np.testing.assert_allclose(x[0, shape.first], [right, -towards, up], atol=1e-12)
+    assert {shape.label for shape in shapes(animation, "center")} == {"link1", "link2"}
+
+
+def test_a_body_is_the_uniform_solid_of_its_inertia(swing):
+    """1e-12: a slender link of 1 m; a cylinder with I = m r^2 / 2 along its axis; a box from its three moments."""
+    rods = [s for s in shapes(swing[2], "line") if s.color != "grey"]
+    vertex = swing[2].scene.vertex
+    assert [np.linalg.norm(np.ptp(vertex[s.first : s.first + s.count], axis=0)) for s in rods] == pytest.approx(
+        [1.0, 1.0]
+    )
+
+    top, t = jk.catalog.SpinningTop(mass=2.0, axial_inertia=0.01, transverse_inertia=0.02), np.linspace(0.0, 1.0, 41)
+    q = np.stack([0.2 * np.sin(t), np.zeros(41), np.zeros(41), np.sqrt(1.0 - (0.2 * np.sin(t)) ** 2)], axis=1)
+    scene = jk.animate(top, moved(top, t, q, np.zeros((41, 3)))).scene
+    rim = next(s for s in scene.shapes if s.closed)
+    place = scene.vertex[rim.first : rim.first + rim.count]
+    np.testing.assert_allclose(np.hypot(place[:, 0], place[:, 1]), np.sqrt(2 * 0.01 / 2.0), rtol=1e-12)
+    assert abs(place[0, 2]) == pytest.approx(0.5 * np.sqrt(12 * (0.02 - 0.01 / 2) / 2.0))
+
+    sides = np.array([0.4, 0.9, 1.3])
+    I = (np.sum(sides**2) - sides**2) / 12 * 3.0
+    body = jk.catalog.RigidBody(mass=3.0, I11=I[0], I22=I[1], I33=I[2])
+    q = np.stack([t, 0 * t, 0 * t, np.sin(t / 2), 0 * t, 0 * t, np.cos(t / 2)], axis=1)
+    box = jk.animate(body, moved(body, t, q, np.zeros((41, 6)))).scene
+    corners = np.concatenate([box.vertex[s.first : s.first + 4] for s in box.shapes if s.closed])
+    np.testing.assert_allclose(np.sort(np.ptp(corners, axis=0)), sides, rtol=1e-12)
+
+
+def test_points_are_joined_where_nothing_moves_between_them(swing):
+    """From the origin through the first link to the joint, and on to the second link's middle."""
+    scene = swing[2].scene
+    x, _ = scene.at(scene.t)
+    joined = [s for s in scene.shapes if s.kind == "line" and s.color == "grey"]
+    ends = {tuple(np.round(x[0, [s.first, s.first + 1]], 9).ravel()) for s in joined}
+    lengths = [np.linalg.norm(x[:, s.first] - x[:, s.first + 1], axis=1) for s in joined]
+    assert len(ends) == 3
+    np.testing.assert_allclose(lengths, 0.5, rtol=1e-12)
+
+
+def test_wheels_turn_although_their_frames_do_not(ride, weaving):
+    """0.03 rad: the spokes turn by the wheel's angle, which the pose of its frame does not hold."""
+    scene, system = weaving.scene, ride[0]
+    spokes = [s for s in scene.shapes if s.kind == "pairs"]
+    for s, radius in zip(spokes, (system.rR, system.rF), strict=True):
+        k = scene.owner[s.first]
+        axis = np.array([0.0, 1.0, 0.0])
+        x, _ = scene.at([0.0, 0.1])
+        before, after = x[:, s.first + 1] - x[:, s.first]
+        assert np.linalg.norm(before) == pytest.approx(float(radius))
+        assert k < scene.rotation.shape[1]
+        # 0.1 s is too short for the weave to turn the wheel's plane by more than 0.02 rad
+        turned = np.arctan2(np.cross(before, after) @ axis, before @ after) % (2 * np.pi)
+        assert turned == pytest.approx(0.1 * SPEED / float(radius) % (2 * np.pi), abs=0.03)
+
+
+def test_the_bicycle_stands_on_the_ground_and_is_followed(weaving):
+    scene = weaving.scene
+    x, leader = scene.at(np.linspace(0.0, 10.0, 50))
+    tracks = [s.first for s in scene.shapes if s.kind == "trace"]
+    np.testing.assert_allclose(x[:, tracks[0], 2], 0.0, atol=1e-6)
+    assert scene.ground == pytest.approx(0.0, abs=0.01)
+    assert scene.view.follow
+    assert np.ptp(leader[:, 0]) == pytest.approx(50.0, rel=1e-3)
+
+
+def test_up_is_opposite_to_the_weights(swing):
+    forces = np.zeros((5, 2, 3))
+    assert which_way_is_up(forces) == "z"
+    forces[:, 0, 1] = -9.81
+    assert which_way_is_up(forces) == "y"
+    forces[:, 1, 1] = np.linspace(0.0, 1000.0, 5)  # a force that changes is no weight
+    assert which_way_is_up(forces) == "y"
+    assert swing[2].scene.view.elevation == 0.0  # what moves in a plane is seen from the front
+
+
+def test_ten_seconds_of_riding_are_small_and_quick(ride, weaving):
+    """At most 300 kB, and 2 s once the program of the poses is compiled."""
+    assert len(weaving.html().encode()) < 300e3
+    started = time.perf_counter()
+    again = jk.animate(*ride).html()
+    assert time.perf_counter() - started < 2.0
+    assert again == weaving.html()
+
+
+@pytest.mark.slow
+def test_single_precision_far_from_the_origin(ride):
+    """Places that are known to 0.03 mm only, a kilometre away, are still those of rigid bodies: within 3 mm."""
+    system, trajectory = jax.tree.map(lambda x: x.astype(jnp.float32) if x.dtype == float else x, ride)
+    far = trajectory.q.at[:, 6].add(jnp.float32(1000.0))
+    animation = jk.animate(system, eqx.tree_at(lambda r: r.q, trajectory, far))
+    scene, near = animation.scene, jk.animate(*ride).scene
+    assert scene.position.shape[1] <= near.position.shape[1]
+    assert len(animation.html()) < 150e3
+    x, expected = (s.at(3.0)[0] for s in (scene, near))
+    np.testing.assert_allclose(x - [1000.0, 0.0, 0.0], expected, atol=3e-3)
+
+
+def test_a_figure_of_ones_own(swing):
+    """Lines keep their places whatever they are fixed in: a body, the ground, or nothing (1e-9 m)."""
+    system, trajectory, _ = swing
+
+    def figure(system, motion, s):
+        N, A, link = motion.N, motion["A"].position, motion["link2"]
+        s.line("red", motion["O"], motion["A"], link)  # turns with no single body
+        s.line("#123456", A - 0.1 * N.x, A + 0.1 * N.x)  # carried without turning
+        s.circle("blue", link, link.frame.x, link.frame.y, 0.2, fill=0.5)
+        s.line("grey", -1.0 * N.x, 1.0 * N.x)
+        s.axes(link, link.frame, 0.3)
+        s.trace("gold", link)
+
+    scene = jk.animate(system, trajectory, figure, up="z").scene
+    x, _ = scene.at(trajectory.t[30])
+    motion = system.motion(trajectory.t[30], trajectory.q[30], jnp.zeros(2))
+    A, G = (np.asarray(p.position.to(motion.N)) for p in (motion["A"], motion["link2"].center))
+    red, carried, circle, ground = (x[0, s.first : s.first + s.count] for s in scene.shapes[:4])
+    np.testing.assert_allclose(red, [np.zeros(3), A, G], atol=1e-9)
+    np.testing.assert_allclose(carried - A, [[-0.1, 0, 0], [0.1, 0, 0]], atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(circle - G, axis=1), 0.2, atol=1e-9)
+    np.testing.assert_allclose(ground[:, 0], [-1.0, 1.0])
+    assert [s.color for s in scene.shapes[4:7]] == ["red", "green", "blue"]
+
+
+def test_the_page_needs_nothing_from_elsewhere(weaving):
+    page = weaving.html()
+    assert not re.search(r"https?:|\bsrc=|@import|<link", page)
+    scene = json.loads(re.search(r'application/json">(.*?)</script>', page, re.DOTALL).group(1))
+    position = np.frombuffer(base64.b64decode(scene["position"]), "<f4").reshape(-1, scene["parts"], 3)
+    np.testing.assert_allclose(position, weaving.scene.position, atol=1e-5)
+    frame = weaving._repr_html_()
+    assert frame.startswith("<iframe srcdoc=")
+    assert '"' not in frame.split('srcdoc="')[1].split('" title=')[0]
+
+
+def test_a_figure_lives_no_longer_than_its_user_wants(swing):
+    system, trajectory, _ = swing
+    size = np.ones(1000)
+
+    def figure(system, motion, sketch):
+        body = motion.bodies[0]
+        sketch.line("gold", body, body.center.position + float(size[0]) * motion.N.x)
+
+    jk.animate(system, trajectory, figure)
+    alive = weakref.ref(figure)
+    del figure
+    gc.collect()
+    assert alive() is None
+
+
+def test_what_cannot_be_animated_is_refused(ride, swing, tmp_path):
+    system, trajectory, animation = swing
+    two = jax.tree.map(lambda x: jnp.stack([x, x]), trajectory)
+    with pytest.raises(ValueError, match="of a batch of shape"):
+        jk.animate(system, two)
+    with pytest.raises(ValueError, match="the motion of another system"):
+        jk.animate(ride[0], trajectory)
+    with pytest.raises(ValueError, match="`up` is one of"):
+        jk.animate(system, trajectory, up="north")
+    with pytest.raises(ValueError, match="`theme` is one of"):
+        jk.animate(system, trajectory, theme="blue")
+    for wrong in ({"speed": 0.0}, {"speed": np.inf}, {"height": -4}):
+        with pytest.raises(ValueError, match="must be positive"):
+            jk.animate(system, trajectory, **wrong)
+    with pytest.raises(ValueError, match="`azimuth` must be finite, got nan"):
+        jk.animate(system, trajectory, azimuth=np.nan)
+    with pytest.raises(ValueError, match="`elevation` must be a real number, got '18'"):
+        jk.animate(system, trajectory, elevation="18")
+    for name in ("seconds", "fps"):
+        with pytest.raises(ValueError, match=f"`{name}` must be positive, got -1"):
+            animation.save(tmp_path / "swing.gif", **{name: -1.0})
+    with pytest.raises(ValueError, match=r"\.html .* or \.gif"):
+        animation.save(tmp_path / "swing.mp4")
+    with pytest.raises(ValueError, match="reached only 0"):
+        jk.animate(system, jax.tree.map(lambda x: x * jnp.nan if x.dtype == float else x, trajectory))
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+def test_a_gif_shows_every_colour_on_its_paper(swing, tmp_path, theme):
+    path = jk.animate(*swing[:2], theme=theme).save(tmp_path / "swing.gif", size=(200, 160), seconds=1.0, fps=10)
+    with Image.open(path) as image:
+        assert image.n_frames == 10
+        assert image.size == (200, 160)
+        assert image.info["duration"] == 100
+        first = np.asarray(image.convert("RGB")).astype(int)
+        image.seek(5)
+        assert np.any(np.asarray(image.convert("RGB")) != first)
+    paper = first[0, 0].mean()
+    assert (paper > 240) if theme == "light" else (paper < 40)
+    warm = (first[..., 0] - first[..., 2]) > 60  # gold
+    cold = (first[..., 2] - first[..., 0]) > 60  # blue
+    assert warm.sum() > 40
+    assert cold.sum() > 40
+
+
+@pytest.mark.skipif(NODE is None, reason="no node on the PATH")
+def test_the_pages_script_draws_without_a_browser(weaving, tmp_path):
+    """In node, on a canvas that only notes what is asked of it: all finite, and keys do what they say."""
+    (tmp_path / "page.html").write_text(weaving.html())
+    run = subprocess.run(
+        [NODE, Path(__file__).parents[1] / "data" / "viewer_in_node.mjs", tmp_path / "page.html"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert run.returncode == 0, run.stderr
+    told = json.loads(run.stdout)
+    assert told["drawn_unseen"] == 0
+    assert told["strokes"] > 100
+    assert told["wild"] == 0
+    assert sorted(told["names"]) == ["fork", "rear frame"]
+    assert told["time_after_a_second"] == pytest.approx(1.0, abs=0.1)
+    assert told["paused"] == [True, False]
+    assert told["speeds"] == [2, 1]
+    assert told["at_the_end"] == pytest.approx(10.0, abs=1e-5)
+    assert told["followed"] == [True, False]
+
+
+@pytest.fixture(scope="module")
+def page():
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder, browser.Page(folder) as page:
+        yield page
+
+
+LOOKED = "document.getElementById('time').textContent > ''"
+
+
+def pixels(page, tmp_path):
+    with Image.open(page.screenshot(tmp_path / "screen.png")) as image:
+        return np.asarray(image.convert("RGB")).astype(int)
+
+
+@needs_a_browser
+@pytest.mark.parametrize("dark", [False, True])
+def test_a_browser_shows_it_on_light_and_dark_pages(weaving, page, tmp_path, dark):
+    page.show(weaving.save(tmp_path / "ride.html"), dark)
+    page.wait(LOOKED)
+    seen = pixels(page, tmp_path)
+    paper, ink = ((16, 20, 29), (238, 241, 246)) if dark else ((251, 252, 254), (29, 36, 48))
+    assert tuple(seen[60, 450]) == paper
+    for color in (ink, (240, 171, 69) if dark else (179, 107, 0)):  # wheels, frame
+        assert (np.abs(seen - color).max(axis=-1) < 12).sum() > 300
+    assert page.errors == []
+
+
+@needs_a_browser
+def test_a_browser_projects_as_the_library_does(weaving, page, tmp_path):
+    """Within 0.05 pixels: places are kept in 32 bits and orientations in 16."""
+    page.show(weaving.save(tmp_path / "ride.html"))
+    page.wait(LOOKED)
+    page.value("(() => { const v = canvas.viewer; v.state.playing = false; v.state.time = 3.217; v.draw(); })()")
+    width, height = page.value("[canvas.clientWidth, canvas.clientHeight]")
+    scene = weaving.scene
+    x, leader = scene.at(3.217)
+    p = project(x[0], leader[0], scene.view, scene.view.span_following)
+    expected = np.array([width / 2, height / 2]) + min(width, height) * p[:, :2] * [1, -1]
+    seen = np.array(page.value(f"Array.from({{length: {len(p)}}}, (_, v) => canvas.viewer.see(v))"))
+    np.testing.assert_allclose(seen[:, :2], expected, atol=0.05)
+
+
+@needs_a_browser
+def test_a_browsers_mouse_and_keys_move_it(weaving, page, tmp_path):
+    page.show(weaving.save(tmp_path / "ride.html"))
+    page.wait(LOOKED)
+    state = lambda: page.value("canvas.viewer.state")  # noqa: E731
+    before = state()
+    page.mouse("mousePressed", 300, 200, button="left", clickCount=1)
+    page.mouse("mouseMoved", 400, 250, button="left", buttons=1)
+    page.mouse("mouseReleased", 400, 250, button="left", clickCount=1)
+    page.mouse("mouseWheel", 300, 200, deltaX=0, deltaY=-300)
+    page.wait("canvas.viewer.state.zoom > 1")
+    after = state()
+    assert after["azimuth"] == pytest.approx(before["azimuth"] - 0.8)
+    assert after["elevation"] == pytest.approx(before["elevation"] + 0.4)
+    page.key(" ")
+    assert not state()["playing"]
+    page.value("document.getElementById('slider').value = 500")
+    page.value("document.getElementById('slider').oninput()")
+    assert state()["time"] == pytest.approx(5.0, abs=1e-6)
+    page.key("r")
+    assert state()["zoom"] == 1
+    assert page.errors == []
+
+
+@needs_a_browser
+def test_nothing_is_drawn_until_someone_looks(weaving, page, tmp_path):
+    """In a notebook's frame far down a page: drawn only when it is scrolled to."""
+    path = tmp_path / "notebook.html"
+    path.write_text(
+        f'<!doctype html><div style="height: 5000px"></div>{weaving._repr_html_().replace(" loading=", " x=")}'
+    )
+    page.show(path)
+    shown = "document.querySelector('iframe').contentDocument.getElementById('time')?.textContent ?? null"
+    page.wait(f"({shown}) !== null")
+    time.sleep(0.3)
+    assert page.value(shown) == ""
+    page.value("document.querySelector('iframe').scrollIntoView()")
+    page.wait(f"({shown}) > ''")
+    assert page.errors == []
+
+
+class Pushed(jk.System):
+    """A point mass that a motor pushes, late."""
+
+    coordinates, speeds, states = ("x",), ("v",), ("push",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x))])
+
+    def loads(self, t, q, u, motion, inputs):
+        [body] = motion.bodies
+        return [jk.weight(motion, -9.81 * motion.N.y), jk.Force(inputs["push"] * motion.N.x, body)]
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return (10.0 - x["push"],)
+
+
+def test_loads_that_read_states_are_drawn():
+    system, ts = Pushed(), np.linspace(0.0, 1.0, 3)
+    ride = moved(system, ts, ts[:, None], np.ones((3, 1)))
+    np.testing.assert_allclose(record(system, ride, None).forces, [[[0.0, -9.81, 0.0], [0.0, 0.0, 0.0]]] * 3)

@@ -1,0 +1,86 @@
+"""What the library uses of JAX and equinox beyond what they promise: what is gone is named, and results stay right."""
+
+import importlib
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxkane._scalarjit import compat as internals
+from jaxkane._scalarjit.function import fused
+
+USED = {
+    "jax.extend.core": "ClosedJaxpr Jaxpr JaxprEqn Literal Primitive jaxpr_as_fun",
+    "jax.interpreters.ad": "Zero instantiate_zeros is_undefined_primal primitive_jvps primitive_transposes",
+    "jax.interpreters.batching": "primitive_batchers",
+    "jax.interpreters.mlir": "lower_fun register_lowering",
+    "jax.interpreters.partial_eval": "dce_jaxpr",
+    "jax.experimental.xla_metadata": "set_xla_metadata",
+    "jax.experimental.compilation_cache.compilation_cache": "reset_cache",
+    "jax.experimental.multihost_utils": "process_allgather",
+    "jax.ffi": "ffi_lowering pycapsule register_ffi_target",
+    "jax.core": "Tracer eval_context",
+    "equinox._errors": "EQX_ON_ERROR",
+}
+
+
+@pytest.mark.parametrize("module", USED)
+def test_it_is_there(module):
+    found = importlib.import_module(module)
+    missing = [name for name in USED[module].split() if not hasattr(found, name)]
+    assert not missing, f"{module} lacks {', '.join(missing)}: see jaxkane/_scalarjit/compat.py for what is lost"
+
+
+def test_what_they_do(by_xla):
+    assert internals.FUSES is None
+    text = jax.jit(fused(lambda x: jnp.sin(x) * 2.0)).lower(0.5).as_text()
+    assert "xla_cpu_small_call" in text
+    before = internals.settings()
+    with jax.enable_x64(not jax.config.jax_enable_x64):
+        assert internals.settings() != before
+    assert internals.settings() == before
+
+
+def test_without_the_frontend_attribute_only_speed_goes(by_xla, monkeypatch):
+    monkeypatch.delattr("jax.experimental.xla_metadata.set_xla_metadata")
+    f = jax.jit(jax.grad(fused(lambda x: jnp.sin(x) * 1.5)))
+    assert "xla_cpu_small_call" not in f.lower(0.5).as_text()
+    np.testing.assert_allclose(f(0.5), 1.5 * np.cos(0.5), rtol=1e-14)
+
+
+# A rod that hangs from a hinge: its acceleration is -3 g sin(angle) / (2 length).
+WITHOUT = """
+import diffrax, equinox, optimistix, jax, jax.numpy as jnp, numpy as np
+jax.config.update("jax_enable_x64", True)
+import jax.extend.core, jax.experimental.compilation_cache.compilation_cache as cache, equinox._errors as errors
+del jax.extend.core.jaxpr_as_fun, cache.reset_cache, errors.EQX_ON_ERROR
+import warnings
+import jaxkane as jk
+from jaxkane._scalarjit import compat
+assert "jaxpr_as_fun" in compat.FUSES
+class Rod(jk.System):
+    length: jk.Scalar = jk.parameter(0.5)
+    coordinates, speeds = ("angle",), ("rate",)
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        rod = N.rotate(3, q["angle"], u["rate"])
+        I = self.length**2 / 12
+        return jk.Motion([jk.Body(1.0, (I, 0.0, I), O.fixed(-0.5 * self.length * rod.y), rod)])
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+f = lambda angle: jk.accelerations(Rod(), 0.0, jnp.stack([angle]), jnp.zeros(1))[0]
+angles = jnp.array([0.3, 1.1])
+np.testing.assert_allclose(jax.vmap(f)(angles), -29.43 * np.sin(angles), rtol=1e-12)
+np.testing.assert_allclose(jax.jit(jax.grad(f))(0.3), -29.43 * np.cos(0.3), rtol=1e-12)
+compat.look_for_cache_again()
+assert compat.on_failed_checks("nan") is None
+print("right")
+"""
+
+
+def test_without_what_programs_are_made_of_results_stay_right():
+    run = subprocess.run([sys.executable, "-c", WITHOUT], capture_output=True, text=True, timeout=300, check=False)
+    assert run.stdout.strip() == "right", run.stderr[-2000:]

@@ -1,0 +1,290 @@
+"""Scalar programs as one operation: the same numbers as plain JAX, in every transformation, and no aborted process."""
+
+import functools
+import subprocess
+import sys
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxkane._scalarjit import function as fuse
+from jaxkane._scalarjit import jaxpr as pieces
+from jaxkane._scalarjit.function import fused
+from jaxkane._scalarjit.jaxpr import without_repetition
+from jaxkane._scalarjit.linear import determinant, solve
+
+
+def plain(a, b, x):
+    s, c = jnp.sin(x[0]), jnp.cos(x[0])
+    y = s * a + c * x[1] / jnp.sqrt(b * b + 1.0)
+    return jnp.stack([y * s, s * s + c, a + 0.0 * y]), y**3
+
+
+program = fused(plain)
+ARGUMENTS = (jnp.array(0.7), jnp.array(-1.2), jnp.array([0.3, 0.9]))
+
+
+def total(f):
+    return lambda *args: f(*args)[0].sum() + f(*args)[1]
+
+
+TRANSFORMATIONS = {
+    "itself": lambda f: f,
+    "jit": jax.jit,
+    "forward": lambda f: jax.jacfwd(f, argnums=(0, 1, 2)),
+    "reverse": lambda f: jax.jacrev(f, argnums=(0, 1, 2)),
+    "hessian": lambda f: jax.hessian(total(f), argnums=(0, 2)),
+    "reverse of reverse": lambda f: jax.jacrev(jax.grad(total(f), argnums=2), argnums=(0, 2)),
+    "linearize": lambda f: lambda *args: jax.linearize(f, *args)[1](*args),
+    "batch": lambda f: lambda a, b, x: jax.vmap(f, in_axes=(0, None, 0))(jnp.stack([a, b]), b, jnp.stack([x, 2 * x])),
+    "batch of gradients": lambda f: (
+        lambda a, b, x: jax.vmap(jax.grad(total(f), argnums=(0, 2)), (None, 0, None))(a, jnp.stack([a, b]), x)
+    ),
+    "gradient of a batch": lambda f: jax.grad(
+        lambda a, b, x: jax.vmap(total(f), in_axes=(None, None, 0))(a, b, jnp.stack([x, 2 * x, 3 * x])).sum(), (0, 1, 2)
+    ),
+    "checkpoint": lambda f: jax.grad(jax.checkpoint(total(f)), argnums=(0, 2)),
+    "in a loop": lambda f: lambda a, b, x: jax.lax.scan(lambda c, _: (f(c, b, x)[1], c), a, length=5),
+    "gradient of a loop": lambda f: jax.grad(
+        lambda a, b, x: jax.lax.scan(lambda c, _: (f(c, b, x)[1], c), a, length=5)[0], (0, 1, 2)
+    ),
+}
+
+
+@functools.cache
+def by_plain_jax(name):
+    return jax.jit(TRANSFORMATIONS[name](plain))(*ARGUMENTS)
+
+
+@pytest.mark.parametrize("name", TRANSFORMATIONS)
+@pytest.mark.parametrize("compiled", [False, True], ids=["eager", "jit"])
+def test_the_same_as_plain_jax(name, compiled, kernels):
+    ours = TRANSFORMATIONS[name](program)
+    if compiled:
+        ours = jax.jit(ours)
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14), ours(*ARGUMENTS), by_plain_jax(name)
+    )
+
+
+@pytest.mark.parametrize("name", ["jit", "reverse", "batch", "batch of gradients", "gradient of a loop"])
+def test_a_long_program_in_pieces(name, by_xla, monkeypatch):
+    monkeypatch.setattr(pieces, "_WHOLE_UP_TO", 4)
+    monkeypatch.setattr(pieces, "_PIECE", 3)
+
+    def chosen(a, b, x):
+        left = x[0] < a  # what is not a float goes from piece to piece too
+        y, z = plain(a, b, x)
+        return jnp.where(left, y, 2.0 * y), z
+
+    transform = TRANSFORMATIONS[name]
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14),
+        jax.jit(transform(fused(chosen)))(*ARGUMENTS),
+        jax.jit(transform(chosen))(*ARGUMENTS),
+    )
+
+
+def test_repetition_goes():
+    once = without_repetition(jax.make_jaxpr(lambda x: jnp.sin(x) + jnp.sin(x) * jnp.cos(x) + 0.0 * jnp.tan(x))(1.0))
+    names = [e.primitive.name for e in once.jaxpr.eqns]
+    assert names.count("sin") == 1
+
+
+def test_it_is_traced_once():
+    calls = []
+
+    @fused
+    def counted(x):
+        calls.append(1)
+        return jnp.sin(x)
+
+    for _ in range(3):
+        counted(jnp.array(1.0))
+    jax.jit(lambda x: counted(x) + counted(2 * x))(jnp.array(1.0))
+    assert len(calls) <= 2  # one for a strong type, one for what the tracer makes of it
+
+
+# Each of these once ended the process: XLA checks, and aborts, where a parameter is never read.
+CRASHES = """
+import jax, jax.numpy as jnp
+jax.config.update("jax_enable_x64", True)
+from jaxkane._scalarjit.function import fused
+program = fused(lambda a, b, t, x: (jnp.sin(x[0]) * a + t + jnp.cos(x[1]), 0.0 * b))
+x = jnp.ones(3)
+def loop(f, n=5):
+    def body(c):
+        i, x, big = c
+        y = f(x)
+        return i + 1, x.at[0].add(y), big.at[i].add(y)
+    return jax.lax.while_loop(lambda c: c[0] < n, body, (0, x, jnp.zeros(1000)))[2].sum()
+jax.jit(lambda a, b: loop(lambda x: program(a, b, 0.0, x)[0]))(1.0, 2.0)
+jax.jit(lambda a: loop(lambda x: program(a, 3.0, 0.0, x)[0] + program(1.0, 2.0, 0.0, jnp.zeros(3))[0]))(1.0)
+jax.jit(lambda: program(1.0, 2.0, 0.0, jnp.ones(3)))()
+jax.jit(jax.vmap(lambda a: program(a, 2.0, 0.0, x)))(jnp.ones(5000))
+jax.jit(jax.grad(lambda a: loop(lambda x: program(a, 2.0, 0.0, x)[0], 3) if False else program(a, 2.0, 0.0, x)[0]))(1.0)
+jax.jit(jax.grad(lambda b: jax.vmap(lambda a: program(a, b, 0.0, x)[0] * b)(jnp.ones(5000)).sum()))(1.0)
+jax.jit(lambda z: jax.lax.map(lambda a: program(a, 2.0, 0.0, x)[0], z))(jnp.ones(70))
+print("alive")
+"""
+
+
+@pytest.mark.slow
+def test_the_process_stays_alive():
+    run = subprocess.run([sys.executable, "-c", CRASHES], capture_output=True, text=True, timeout=300, check=False)
+    assert run.stdout.strip() == "alive", run.stderr[-2000:]
+
+
+def test_a_batch_without_jit_is_compiled_once(monkeypatch):
+    f = fused(lambda x, a: jnp.sin(a * x))
+    lowered, lower = [], fuse._Program.target
+    monkeypatch.setattr(fuse._Program, "target", lambda self, *batch: lowered.append(batch) or lower(self, *batch))
+    x = jnp.linspace(0.0, 1.0, 5)
+    for a in (1.0, 2.0, 3.0):
+        np.testing.assert_allclose(jax.vmap(f, (0, None))(x, a), np.sin(a * x), rtol=1e-14)
+    assert len(lowered) == 1
+    jax.vmap(f, (0, None))(x[:4], 1.0)
+    jax.vmap(f)(x, x)
+    assert len(lowered) == 3  # another size, and another argument that varies
+
+
+def test_a_value_of_the_trace_under_way_is_not_kept():
+    box = {}
+    f = fused(lambda x: box["k"] * jnp.sin(x))
+
+    def g(k, x):
+        box["k"] = k
+        return f(x)
+
+    x = jnp.array(0.4)
+    for k in (2.0, 3.0):
+        np.testing.assert_allclose(jax.jit(g)(jnp.array(k), x), k * np.sin(0.4), rtol=1e-14)
+        np.testing.assert_allclose(jax.grad(g)(jnp.array(k), x), np.sin(0.4), rtol=1e-14)
+        np.testing.assert_allclose(jax.jvp(g, (k, x), (0.0, 1.0))[1], k * np.cos(0.4), rtol=1e-14)
+        np.testing.assert_allclose(jax.vmap(g)(jnp.full(2, k), jnp.full(2, 0.4)), k * np.sin(0.4), rtol=1e-14)
+
+
+FIRST_CALLS = {
+    "jit": lambda f: jax.jit(f),
+    "grad": lambda f: lambda x: jax.value_and_grad(f)(x)[0],
+    "jvp": lambda f: lambda x: jax.jvp(f, (x,), (1.0,))[0],
+    "vmap": lambda f: lambda x: jax.vmap(f)(jnp.stack([x, x]))[1],
+    "jit of grad of vmap": lambda f: jax.jit(lambda x: jax.grad(lambda y: jax.vmap(f)(y).sum())(jnp.stack([x, x]))[0]),
+}
+
+
+@pytest.mark.parametrize("name", FIRST_CALLS)
+def test_a_first_call_inside_a_trace_leaves_nothing_behind(name):
+    f = fused(lambda x: jnp.sin(x) * jnp.cos(0.5 * x))
+    x = jnp.array(0.4)
+    with jax.checking_leaks():
+        FIRST_CALLS[name](f)(x)
+    np.testing.assert_allclose(f(x), np.sin(0.4) * np.cos(0.2), rtol=1e-14)
+    np.testing.assert_allclose(f(0.4), np.sin(0.4) * np.cos(0.2), rtol=1e-14)  # and of a weak type
+
+
+def test_the_precision_may_be_switched_between_calls():
+    f = fused(lambda x: (2.0 * x, jnp.full(2, 0.5)))
+    x = jnp.float32(0.4)
+    assert [y.dtype for y in f(x)] == [jnp.float32, jnp.float64]
+    with jax.enable_x64(False):
+        assert [y.dtype for y in f(x)] == [jnp.float32, jnp.float32]
+    assert [y.dtype for y in f(x)] == [jnp.float32, jnp.float64]
+
+
+def test_numbers_that_print_alike_are_not_the_same():
+    """Common ones are found by their bits: arrays print eight digits, -0.0 equals 0.0, and no NaN is itself."""
+    near = [np.array(0.1234567891234), np.array(0.1234567895678)]
+    f = lambda x: [x * near[0], x * near[1], jnp.arctan2(x * 0.0, -1.0), jnp.arctan2(x * -0.0, -1.0), x + jnp.nan]  # noqa: E731
+    once = without_repetition(jax.make_jaxpr(lambda x: [*f(x), *f(x)])(1.0))
+    assert [e.primitive.name for e in once.jaxpr.eqns].count("mul") == 4
+    assert [e.primitive.name for e in once.jaxpr.eqns].count("add") == 1
+    np.testing.assert_array_equal(jnp.stack(fused(f)(3.0)), [3 * near[0], 3 * near[1], np.pi, -np.pi, np.nan])
+
+
+class Ball(eqx.Module):
+    """A description's stand-in: its name is told."""
+
+    a: jax.Array
+
+
+SLOW = {
+    "cond": lambda b, x: jax.lax.cond(x > 0.0, lambda: b.a * x, lambda: x),
+    "while": lambda b, x: jax.lax.while_loop(lambda c: c < b.a, lambda c: c + x * x + 1.0, x),
+    "dot_general": lambda b, x: jnp.stack([x, *[b.a] * 64]) @ jnp.stack([*[b.a] * 64, x]),
+    "gather": lambda b, x: jnp.take(jnp.array([1.0, 2.0, 3.0]) * b.a, (x > 0.0).astype(int)),
+    "lu": lambda b, x: jnp.linalg.solve(jnp.full((2, 2), x).at[0, 0].add(b.a), jnp.ones(2))[0],
+}
+
+
+@pytest.mark.parametrize("name", SLOW)
+def test_what_cannot_be_one_function_is_told_once_by_name(name, monkeypatch):
+    monkeypatch.setattr(fuse, "_told", set())
+    f = fused(SLOW[name])
+    ball, x = Ball(jnp.array(1.5)), jnp.array(0.4)
+    with pytest.warns(UserWarning, match=rf"Ball: its description uses .*`{name}`.* cannot be part of one") as told:
+        found = f(ball, x), jax.jit(f)(ball, x), jax.grad(lambda x: f(ball, x) if name != "while" else x)(x)
+    assert len(told) == 1
+    np.testing.assert_allclose(found[:2], np.full(2, SLOW[name](ball, x)), rtol=1e-14)
+
+
+@pytest.mark.filterwarnings("error")
+def test_products_of_small_matrices_are_written_out():
+    A, B = (np.random.default_rng(i).normal(size=s) for i, s in ((0, (2, 3, 4)), (1, (4, 2, 5))))
+    f = lambda b, x: jnp.einsum("bij,jbk->bik", b.a * A, x * jnp.asarray(B))  # noqa: E731
+    ball, x = Ball(jnp.array(1.5)), jnp.array(0.4)
+    exact = np.einsum("bij,jbk->bik", 1.5 * A, 0.4 * B)
+    np.testing.assert_allclose(fused(f)(ball, x), exact, rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(jax.jacfwd(lambda x: fused(f)(ball, x))(x), exact / 0.4, rtol=1e-13, atol=1e-14)
+
+
+@pytest.mark.filterwarnings("error")
+def test_lapack_of_the_method_itself_is_not_told():
+    def solved(x):
+        rows = [[1.0 + x if i == j else 0.1 * x for j in range(4)] for i in range(4)]
+        return solve(rows, [x, 1.0, 2.0, 3.0])[0][0] + determinant(rows)
+
+    f = lambda x: jax.jvp(solved, (x,), (jnp.ones(()),))[1]  # noqa: E731
+    np.testing.assert_allclose(fused(f)(jnp.array(0.4)), f(jnp.array(0.4)), rtol=1e-14)
+    np.testing.assert_allclose(jax.grad(fused(f))(jnp.array(0.4)), jax.grad(f)(jnp.array(0.4)), rtol=1e-14)
+
+
+@pytest.mark.usefixtures("native")
+def test_what_kernels_cannot_do_is_told_once_by_name(monkeypatch):
+    monkeypatch.setattr(fuse, "_told", set())
+    f = fused(lambda ball, x: ball.a * jnp.asarray(x).astype(jnp.int32).astype(float))
+    match = "Ball: its description uses convert_element_type of float64, which native"
+    with pytest.warns(UserWarning, match=match) as told:
+        found = [f(Ball(jnp.array(1.5)), jnp.array(x)) for x in (0.4, 2.7, 2.5)]
+    np.testing.assert_allclose(found, [0.0, 3.0, 3.0])
+    assert len(told) == 1
+
+
+@fused
+def of_two(a, b):
+    return 2.0 * jnp.sin(a), a * b, b**2
+
+
+@fused
+def with_a_constant(b):
+    return jnp.ones(()), 2.0 * b
+
+
+def test_what_members_share_remains_shared():
+    """Only an output without an axis of members may be given out without one."""
+    a, b = jnp.array(0.7), jnp.arange(1.0, 4.0)
+    shared, product, square = jax.jit(jax.vmap(of_two, in_axes=(None, 0), out_axes=(None, 0, 0)))(a, b)
+    np.testing.assert_allclose(shared, 2 * np.sin(0.7), rtol=1e-15)
+    np.testing.assert_allclose(product, 0.7 * b, rtol=1e-15)
+    np.testing.assert_allclose(square, b**2, rtol=1e-15)
+    inner = jax.vmap(of_two, in_axes=(None, 0), out_axes=(None, 0, 0))
+    both = jax.jit(jax.vmap(inner, in_axes=(0, None), out_axes=(0, 0, None)))
+    assert [x.shape for x in both(b, b)] == [(3,), (3, 3), (3,)]
+    np.testing.assert_allclose(both(b, b)[1], np.outer(b, b), rtol=1e-15)
+    slopes = jax.jit(jax.grad(lambda a: sum(jnp.sum(x) for x in inner(a, b))))
+    np.testing.assert_allclose(slopes(a), 2 * np.cos(0.7) + 6.0, rtol=1e-14)
+    batch = jax.jit(jax.vmap(with_a_constant))(b)
+    np.testing.assert_array_equal(batch, [np.ones(3), 2 * b])

@@ -1,0 +1,128 @@
+"""What is missing is NaN with its derivatives of every order; who does not read it never meets it."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxkane._scalarjit.nan import nan_derivative_where, nan_where
+
+P = {"a": jnp.array(0.7), "b": jnp.array([0.2, -0.4]), "n": 3}
+MISSING = jnp.array([False, False, True, True])
+
+
+def rows(a, b, missing=MISSING):
+    """Four rows of two numbers; the last two are missing, and were inf before."""
+    x = jnp.stack([jnp.stack([jnp.sin(a * i), b[0] * b[1] * a**i]) for i in (1.0, 2.0)])
+    x = jnp.concatenate([x, jnp.full((2, 2), jnp.inf)])
+    return nan_where(missing, {"x": x}, (a, b, 3))["x"]
+
+
+def clean(a, b):
+    return jnp.sum(rows(a, b)[:2] ** 2)
+
+
+def expected(a, b):
+    return sum(jnp.sin(a * i) ** 2 + (b[0] * b[1] * a**i) ** 2 for i in (1.0, 2.0))
+
+
+def flat(tree):
+    return np.concatenate([np.ravel(x) for x in jax.tree.leaves(tree)])
+
+
+ORDERS = [modes for n in (1, 2) for modes in itertools.product((jax.jacfwd, jax.jacrev), repeat=n)]
+# Of second derivatives, forward over reverse and reverse over reverse are enough for a plain run.
+ORDERS = [pytest.param(m, marks=pytest.mark.slow) if m[1:] and m[0] is jax.jacfwd else m for m in ORDERS]
+named = lambda modes: "-".join(mode.__name__ for mode in modes)  # noqa: E731
+
+
+def derivative(modes, f):
+    for mode in modes:
+        f = mode(f, argnums=(0, 1))
+    return jax.jit(f)
+
+
+@pytest.mark.parametrize("modes", ORDERS, ids=named)
+def test_who_reads_what_exists_gets_clean_derivatives(modes):
+    a, b = P["a"], P["b"]
+    masked = lambda a, b: jnp.sum(jnp.where(MISSING[:, None], 0.0, rows(a, b)) ** 2)  # noqa: E731
+    read = lambda a, b: jnp.stack([clean(a, b), masked(a, b), expected(a, b)])  # noqa: E731
+    for slopes in jax.tree.leaves(derivative(modes, read)(a, b)):
+        first, second, exact = slopes
+        np.testing.assert_allclose(first, exact, rtol=1e-12)
+        np.testing.assert_allclose(second, exact, rtol=1e-12)
+
+
+@pytest.mark.parametrize("modes", ORDERS, ids=named)
+def test_who_reads_what_is_missing_gets_nan(modes):
+    """Also where the cotangents of two rows, or the tangents of two parameters, would cancel."""
+    a, b = P["a"], P["b"]
+
+    def read(a, b):
+        x = rows(a, b)
+        moved = rows(a - b[0], jnp.stack([b[0] - a, b[1]]))
+        return jnp.stack([x[3, 0], x[0, 0] + 1e-200 * x[2, 1], x[3, 0] - x[2, 0], moved[2, 1]])
+
+    assert np.isnan(read(a, b)).all()
+    assert np.isnan(flat(derivative(modes, read)(a, b))).all()
+
+
+def test_what_does_not_move_has_the_derivative_zero():
+    x, x_dot = jax.jvp(lambda c: rows(P["a"], P["b"]) + 0.0 * c, (1.0,), (1.0,))
+    assert np.isnan(x[2:]).all()
+    np.testing.assert_array_equal(jax.grad(lambda c: c * clean(P["a"], P["b"]))(2.0), clean(P["a"], P["b"]))
+    np.testing.assert_array_equal(x_dot[:2], np.zeros((2, 2)))
+
+
+def test_members_of_a_batch_are_told_apart():
+    """In a shared parameter only the sum over who exists is clean; each member's own are its own."""
+    missing = jnp.stack([MISSING, jnp.zeros(4, bool), jnp.ones(4, bool)])
+    rows_of = jax.vmap(lambda a, b, missing: rows(a, b, missing)[:2], (None, 0, 0))
+    bs = jnp.stack([P["b"], 2.0 * P["b"], P["b"]])
+    first_two = lambda a, bs: jnp.sum(rows_of(a, bs, missing)[:2])  # noqa: E731
+    all_three = lambda a, bs: jnp.sum(rows_of(a, bs, missing))  # noqa: E731
+    for mode in (jax.jacfwd, jax.jacrev):
+        shared, own = jax.jit(mode(first_two, argnums=(0, 1)))(P["a"], bs)
+        assert np.isfinite(shared)
+        assert np.isfinite(own).all()
+        shared, own = jax.jit(mode(all_three, argnums=(0, 1)))(P["a"], bs)
+        assert np.isnan(shared)
+        assert np.isfinite(own[:2]).all()
+        assert np.isnan(own[2]).all()
+
+
+def test_complex_and_single_precision():
+    for missing, dtype in itertools.product((False, True), (jnp.complex64, jnp.float32)):
+        f = lambda a: nan_where(jnp.array(missing), (a * 2).astype(dtype), a)  # noqa: B023, E731
+        value, slope = jax.jvp(f, (jnp.float32(2.0),), (jnp.float32(1.0),))
+        assert value.dtype == slope.dtype == dtype
+        assert bool(np.isnan(value)) == bool(np.isnan(slope)) == missing
+        assert bool(np.isnan(jax.grad(lambda a: f(a).real)(jnp.float32(2.0)))) == missing  # noqa: B023
+
+
+def test_without_an_origin_and_without_a_row():
+    assert np.isnan(nan_where(jnp.array(True), jnp.array(1.0), None))
+    assert nan_where(jnp.zeros(0, bool), jnp.zeros((0, 3)), P).shape == (0, 3)
+
+
+@pytest.mark.parametrize("mask", [nan_where, nan_derivative_where])
+@pytest.mark.parametrize("batched", ["missing", "origin"])
+def test_a_batch_in_a_loop_of_values_that_all_members_share(mask, batched):
+    """The value is one for all, its derivative is each member's."""
+
+    def one(x):
+        missing = x > 1.5 if batched == "missing" else jnp.array(True)
+        return jnp.sum(mask(missing, jnp.ones((2, 3)), x))
+
+    x = jnp.array([[1.0, 2.0]])
+    f = jax.jit(lambda x: jax.lax.map(jax.vmap(one), x))
+    slopes = jax.jvp(f, (x,), (jnp.ones_like(x),))[1]
+    np.testing.assert_array_equal(np.isnan(slopes), [[batched == "origin", True]])
+
+
+def test_values_without_entries_in_a_batch_in_a_loop():
+    f = jax.jit(lambda x: jax.lax.map(jax.vmap(lambda x: nan_where(x > jnp.ones(4), jnp.zeros((4, 0)), x)), x))
+    x = jnp.array([[1.0, 2.0]])
+    assert jax.jvp(f, (x,), (x,))[1].shape == (1, 2, 4, 0)

@@ -1,0 +1,250 @@
+"""Native kernels: machine code through LLVM gives what XLA gives, in every shape of a batch."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane._kane.kane import _motion_rates, motion_rates
+from jaxkane._scalarjit import function as fuse
+from jaxkane._scalarjit.backends import native as native_kernels
+from jaxkane._scalarjit.function import _Program, fused
+
+LARGEST = 19
+
+
+def on_x(*names):
+    return [(name, getattr(jnp, name)) for name in names]
+
+
+OPERATIONS = dict(
+    on_x("sin", "cos", "tan", "arctan", "sinh", "cosh", "tanh", "arcsinh", "exp", "exp2", "expm1", "cbrt", "sign")
+    + on_x("abs", "floor", "square", "negative", "isfinite")
+) | {
+    "arcsin": lambda x: jnp.arcsin(x / 4),
+    "arccos": lambda x: jnp.arccos(x / 4),
+    "arctanh": lambda x: jnp.arctanh(x / 4),
+    "arccosh": lambda x: jnp.arccosh(4 + x),
+    "log": lambda x: jnp.log(4 + x),
+    "log1p": lambda x: jnp.log1p(4 + x),
+    "sqrt": lambda x: jnp.sqrt(4 + x),
+    "rsqrt": lambda x: jax.lax.rsqrt(4 + x),
+    "erf": jax.scipy.special.erf,
+    "logistic": jax.nn.sigmoid,
+    "pow": lambda x: (4 + x) ** 1.7,
+    "atan2": lambda x: jnp.arctan2(x, x[::-1]),
+    "rem": lambda x: jax.lax.rem(x, jnp.asarray(0.7, x.dtype)),
+    "mod": lambda x: [jnp.mod(x, 0.7), jnp.mod(x, -0.7), x // 0.7],
+    "whole numbers": lambda x: [jnp.ceil(x), jnp.trunc(3 * x), jnp.round(3 * x), jax.lax.round(3 * x), jnp.round(x, 1)],
+    "halves": lambda x: [f(jnp.round(5 * x) + 0.5) for f in (jnp.round, jax.lax.round)],
+    "largest": lambda x: [jnp.max(x), jnp.min(x), jnp.prod(x), jnp.max(jnp.outer(x, x), axis=1)],
+    "any and all": lambda x: [jnp.any(x > 0.5), jnp.all(x > -0.5), (x > 0.0) == (x < 0.5), (x > 0.0) != (x < 0.5)],
+    "integer powers": lambda x: [jax.lax.integer_pow(x, n) for n in (-3, -1, 0, 2, 7)],
+    "max and min": lambda x: [jnp.maximum(x, x[::-1]), jnp.minimum(x, 0.1), jnp.clip(x, -0.5, 0.5)],
+    "comparisons": lambda x: [x < x[::-1], x <= 0.0, x > 0.0, x >= x, x == x[::-1], x != x],
+    "logic": lambda x: [(x > 0.0) & (x < 1.0), (x > 0.0) | (x < -1.0), ~(x > 0.0), (x > 0.0) ^ (x < 1.0)],
+    "where": lambda x: jnp.where(x > 0.0, x, 2 * x),
+    "bool to float": lambda x: (x > 0.0).astype(x.dtype) * x,
+    "other precision": lambda x: x.astype(jnp.float32) * jnp.float32(3),
+    "sums": lambda x: [x.sum(), x[None, :].sum(0), x.reshape(3, 1).sum(1)],
+    "moving": lambda x: [jnp.concatenate([x[1:], x[:1]]), jnp.outer(x, x).T[::-1, ::2], jnp.pad(x, (1, 2))],
+    "holes": lambda x: jax.lax.pad(x, 0 * x[0], [(-1, 3, 1)]),
+    "constants": lambda x: [jnp.zeros_like(x) + 0 * x, 1 * x, x - 0, 0 - x, x / 1, -1 * x, jnp.array([1.0, jnp.inf])],
+}  # fmt: skip
+
+
+SINGLE = pytest.param(jnp.float32, marks=pytest.mark.slow)
+
+
+@pytest.fixture(scope="module", params=[jnp.float64, SINGLE], ids=["float64", "float32"])
+def plainly(request):
+    """Rows, and every operation of each by plain JAX."""
+    x = jnp.asarray(np.random.default_rng(0).normal(size=(LARGEST, 3)), request.param)
+    return x, jax.jit(jax.vmap(every_operation))(x)
+
+
+def every_operation(x):
+    return {name: operation(x) for name, operation in OPERATIONS.items()}
+
+
+# Whoever is told that something cannot be part of one function, or of a kernel, compares XLA with itself.
+@pytest.mark.filterwarnings("error:.*its description uses")
+@pytest.mark.parametrize("kernels", ["native", pytest.param("XLA", marks=pytest.mark.slow)], indirect=True)
+def test_every_operation(plainly, kernels):
+    x, expected = plainly
+    program = fused(every_operation)
+    assert native_kernels.Scalars(jax.make_jaxpr(every_operation)(x[0])).graph.nodes, "cannot be written as scalars"
+    tolerance = 1e-14 if x.dtype == jnp.float64 else 1e-6
+    check = lambda a, b: np.testing.assert_allclose(a, b, rtol=20 * tolerance, atol=tolerance)  # noqa: E731
+    for n in (1, LARGEST):
+        found = jax.jit(jax.vmap(program))(x[:n])
+        for name in OPERATIONS:
+            jax.tree.map(check, found[name], jax.tree.map(lambda a, n=n: a[:n], expected[name]))
+
+
+# What is folded and what is not shows where a number is not finite, or a zero has a sign.
+ODD = {
+    "x + 0": lambda x: x + 0.0,
+    "-0 + x": lambda x: -0.0 + x,
+    "x - 0": lambda x: x - 0.0,
+    "0 - x": lambda x: 0.0 - x,
+    "-0 - x": lambda x: -0.0 - x,
+    "0 x": lambda x: 0.0 * x,
+    "-0 x": lambda x: -0.0 * x,
+    "x (-1)": lambda x: x * -1.0,
+    "x / -1": lambda x: x / -1.0,
+    "0 / x": lambda x: 0.0 / x,
+    "x - x": lambda x: x - x,
+    "x / x": lambda x: x / x,
+    "powers": lambda x: jnp.stack([jax.lax.integer_pow(x, n) for n in (-2, -1, 0, 1, 2)]),
+    "both zeros": lambda x: jnp.stack([jnp.arctan2(0.0 * x, -1.0), jnp.arctan2(-0.0 * x, -1.0)]),
+    "arctan2": lambda x: jnp.arctan2(0.0 - x, -1.0),
+    "max and min": lambda x: jnp.stack([jnp.maximum(x, 0.0), jnp.maximum(-0.0, x), jnp.minimum(x, -0.0)]),
+    "sign": jnp.sign,
+    "abs": jnp.abs,
+    "comparisons": lambda x: jnp.stack([x < 0.0, x >= -0.0, x == x, x != x, jnp.isfinite(x)]),
+    "where": lambda x: jnp.where(x > 0.0, 0.0 * x, -x),
+    "sums": lambda x: jnp.stack([x, 0.0 * x]).sum(),
+    "tangent": lambda x: jax.jvp(lambda y: jnp.sqrt(y) * 0.0 + y * jnp.sin(y), (x,), (0.0 * x,))[1],
+    "gradient": lambda x: jax.grad(lambda y: jnp.where(y > 0.0, jnp.log(y), 0.0 - y))(x),
+    "nan": lambda x: x + jnp.nan,
+    "inf": lambda x: 0.0 * (x + jnp.inf),
+}
+
+
+@pytest.mark.filterwarnings("error:.*its description uses")
+@pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32], ids=["float64", "float32"])
+def test_no_number_and_signed_zeros_as_by_xla(dtype, kernels):
+    """Bit for bit, but for the sign of NaN."""
+    x = jnp.array([0.0, -0.0, 1.0, -1.0, jnp.inf, -jnp.inf, jnp.nan], dtype)
+    f = lambda x: {name: odd(x) for name, odd in ODD.items()}  # noqa: E731
+    expected, found = jax.jit(jax.vmap(f))(x), jax.jit(jax.vmap(fused(f)))(x)
+    one = jax.jit(fused(f))(x[1])
+    for name in ODD:
+        want, got = np.asarray(expected[name]), np.asarray(found[name])
+        np.testing.assert_array_equal(got, want, err_msg=name)
+        np.testing.assert_array_equal(one[name], want[1], err_msg=name)
+        if want.dtype != bool:
+            for a, b in ((got, want), (np.asarray(one[name]), want[1])):
+                np.testing.assert_array_equal(np.signbit(a[~np.isnan(a)]), np.signbit(b[~np.isnan(b)]), err_msg=name)
+
+
+@pytest.mark.usefixtures("native")
+def test_a_member_does_not_depend_on_its_place():
+    f = fused(lambda x, a: jnp.sin(a * x) / (1.0 + x * x))
+    x = jnp.linspace(-1.0, 1.0, LARGEST)
+    together = jax.jit(jax.vmap(f, (0, None)))(x, 0.3)
+    for n in (9, 16):
+        np.testing.assert_array_equal(jax.jit(jax.vmap(f, (0, None)))(x[:n], 0.3), together[:n])
+
+
+@pytest.mark.usefixtures("native")
+def test_batches_of_batches():
+    def plain(a, b, x):
+        return jnp.stack([jnp.sin(a) * x[0], b * x[1] + a, a / b])
+
+    f = fused(plain)
+    a, b = jnp.arange(1.0, 4.0), jnp.arange(1.0, 6.0)
+    x = jnp.asarray(np.random.default_rng(1).normal(size=(3, 5, 2)))
+    for axes in (((0, None, 0), (None, 0, 0)), ((None, 0, 1), (0, None, 0))):  # outer, inner
+        of = lambda g, axes=axes: jax.vmap(jax.vmap(g, axes[1]), axes[0])  # noqa: E731
+        np.testing.assert_allclose(jax.jit(of(f))(a, b, x), of(plain)(a, b, x), rtol=1e-14)
+    only_outer = lambda g: jax.vmap(jax.vmap(g, (None, 0, None)), (0, None, 0))  # noqa: E731
+    np.testing.assert_allclose(jax.jit(only_outer(f))(a, b, x[:, 0]), only_outer(plain)(a, b, x[:, 0]), rtol=1e-14)
+    assert jax.jit(jax.vmap(f, (0, None, None)))(jnp.zeros(0), 1.0, x[0, 0]).shape == (0, 3)
+
+
+@pytest.mark.usefixtures("native")
+@fused
+def spring(parameters, x):
+    m, k, rest, signs = parameters
+    return -k / m * (x - rest) * signs
+
+
+def test_numbers_that_stay_are_one_argument_of_a_kernel():
+    """m, k and rest are one array, where all lanes share them; values and derivatives are those of plain JAX."""
+    parameters, x = (2.0, 5.0, 0.1, jnp.array([1.0, -1.0])), jnp.array([0.3, -0.2])
+    plain = spring.__wrapped__
+    shared = lambda f: jax.vmap(f, in_axes=(None, 0))  # noqa: E731
+    own = lambda f: jax.vmap(f, in_axes=((0, None, None, None), 0))  # noqa: E731
+    xs, masses = jnp.stack([x, 2 * x, 3 * x]), (jnp.arange(1.0, 4.0), *parameters[1:])
+    for as_batch, at, count in (
+        (lambda f: f, (parameters, x), 3),
+        (shared, (parameters, xs), 3),
+        (own, (masses, xs), 4),
+    ):
+        lowered = jax.jit(as_batch(spring)).lower(*at).as_text()
+        call = next(line for line in lowered.splitlines() if "custom_call @jaxkane" in line)
+        assert call.split("@jaxkane")[1].split("(")[1].split(")")[0].count("%") == count
+        for mode in (jax.jacfwd, jax.jacrev):
+            found, expected = (jax.jit(mode(as_batch(f), argnums=(0, 1)))(*at) for f in (spring, plain))
+            jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-14), found, expected)
+
+
+def test_what_cannot_be_written_is_left_to_xla():
+    whole = lambda x: x.astype(jnp.int32).astype(x.dtype)  # noqa: E731
+    f = fused(lambda x: whole(x) + jnp.sin(x))
+    fuse._told.clear()
+    with pytest.raises(native_kernels.NotScalarError, match="convert_element_type of float64"):
+        native_kernels.Scalars(jax.make_jaxpr(whole)(jnp.array(1.0)))
+    match = "uses convert_element_type of float64, which native kernels do not know"
+    with pytest.warns(UserWarning, match=match) as told:
+        found = jax.jit(f)(jnp.array(1.7)), *jax.jit(jax.vmap(f))(jnp.array([1.7, 2.2]))
+    np.testing.assert_allclose(found, np.floor([1.7, 1.7, 2.2]) + np.sin([1.7, 1.7, 2.2]))
+    assert len(told) == 1
+
+
+@pytest.fixture(scope="module")
+def bicycle():
+    system = jk.catalog.WhippleBicycle.benchmark()
+    state = jk.assemble(system, {"roll": 0.1, "steer": 0.2}, {"roll_rate": 0.3, "rear_wheel_rate": -12.0})
+    return system, jnp.array(0.0), state.q, state.u, {}
+
+
+def both(f, *args):
+    found = []
+    for native in (True, False):
+        native_kernels.use(native)
+        found.append(jax.jit(f)(*args))
+    return found
+
+
+def close(a, b):
+    np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-11)
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("native")
+def test_the_bicycle_and_its_derivatives_as_by_xla(bicycle):
+    def many(system, t, q, u, inputs):
+        return jax.vmap(lambda push: motion_rates(system, t, q, u.at[0].set(push), inputs))(jnp.linspace(0.0, 0.5, 11))
+
+    moved = jax.tree.map(lambda x: 0.01 * jnp.ones_like(x), bicycle)
+    jax.tree.map(close, *both(many, *bicycle))
+    jax.tree.map(close, *both(lambda *args: jax.jvp(motion_rates, args, moved), *bicycle))
+
+
+def test_a_derivative_costs_a_few_values(bicycle):
+    """Operations of the graphs; all directions of a derivative are lanes of one kernel, which share what they can."""
+    leaves, treedef = jax.tree.flatten(bicycle)
+    plain = _motion_rates.__wrapped__
+    program = _Program(jax.make_jaxpr(lambda *x: plain(*jax.tree.unflatten(treedef, x)))(*leaves))
+    work = lambda scalars: sum(n.operation not in ("input", "constant") for n in scalars.graph.nodes)  # noqa: E731
+    value = work(program.scalars())
+    tangent = program.tangent((True,) * len(leaves)).scalars()
+    assert value < 1950
+    assert work(tangent) < 5 * value
+
+
+@pytest.mark.usefixtures("native")
+def test_kernels_are_kept_beside_the_cache_of_jax(tmp_path):
+    was = jax.config.jax_compilation_cache_dir
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    try:
+        f = fused(lambda x: jnp.sin(x) * 1.2345678)
+        np.testing.assert_allclose(jax.jit(f)(0.5), np.sin(0.5) * 1.2345678)
+        kept = list((tmp_path / "jaxkane").glob("jaxkane_*.o"))
+        assert len(kept) == 2  # the kernel, and the function that XLA calls
+    finally:
+        jax.config.update("jax_compilation_cache_dir", was)

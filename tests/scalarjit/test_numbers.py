@@ -1,0 +1,119 @@
+"""Fused functions evaluated with numbers, by NumPy: the same values and derivatives as compiled programs."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane._kane.assembly import newton, newton_in_numbers
+from jaxkane._scalarjit.backends.numpy import derivative_in_numbers, in_numbers, is_in_numbers
+from jaxkane._scalarjit.function import fused
+
+ARGUMENTS = ({"a": jnp.array(0.7)}, np.array(-1.2), np.array([0.3, 0.9, -0.4]))
+
+
+@fused
+def functions(given, b, x):
+    a, (y, z, w) = given["a"], x
+    waves = jnp.sin(a) + jnp.cos(b) * jnp.tan(y) - jnp.arctan2(z, b) + jnp.arcsin(y) * jnp.arccos(y) / jnp.arctan(b)
+    growing = jnp.sinh(y) + jnp.cosh(z) * jnp.tanh(w) - jnp.arctanh(y)
+    powers = jnp.exp(y) + jnp.exp2(w) + jnp.expm1(w) + jnp.log(z) * jnp.log1p(y) + a**z + b**3 + jnp.cbrt(z) + a**-2
+    others = jnp.sqrt(a) + abs(w) + jnp.maximum(y, w) * jnp.minimum(z, b) + jnp.sign(w)
+    steps = jnp.where((y > w) & ~(z <= b), a, b) + jax.lax.rem(b, a) + jnp.clip(w, -0.1, 0.1)
+    return {
+        "numbers": jnp.stack([waves, growing, powers]),
+        "rest": (others, steps),
+        "both": x * jnp.sum(x),
+    }
+
+
+@fused
+def error_function(x):
+    return jax.scipy.special.erf(x)
+
+
+@fused
+def by_a_library(b, x):
+    return jnp.linalg.det(jnp.diag(x)) * b
+
+
+def the_same(found, right, **tolerance):
+    assert jax.tree.structure(found) == jax.tree.structure(right)
+    for x, y in zip(jax.tree.leaves(found), jax.tree.leaves(right), strict=True):
+        assert isinstance(x, np.ndarray)
+        assert x.dtype == y.dtype
+        np.testing.assert_allclose(x, y, **tolerance)
+
+
+def test_values_are_those_of_jax():
+    assert is_in_numbers(functions, *ARGUMENTS)
+    the_same(
+        in_numbers(functions, *ARGUMENTS), functions.__wrapped__(*jax.tree.map(jnp.asarray, ARGUMENTS)), rtol=1e-14
+    )
+
+    the_same(in_numbers(error_function, np.array(0.3)), np.array(0.3286267594591274), rtol=1e-15)  # math.erf
+
+
+def test_what_is_no_number_is_so_in_numpy_too_and_nothing_is_said(recwarn):
+    arguments = ({"a": np.array(-1.0)}, np.array(0.0), np.array([2.0, -1.0, np.nan]))
+    right = jax.jit(functions.__wrapped__)(*arguments)
+    the_same(in_numbers(functions, *arguments), right, rtol=1e-14, equal_nan=True)
+    assert not recwarn
+
+
+def test_derivatives_along_several_directions_are_those_of_jax():
+    directions = np.array([[1.0, 0.0], [0.5, 2.0], [0.0, -1.0]])  # (x,d)
+    along_b = np.array([0.3, 0.0])
+    found = derivative_in_numbers(functions, ARGUMENTS, (None, along_b, directions))
+    f = lambda b, x: functions.__wrapped__(ARGUMENTS[0], b, x)  # noqa: E731
+    slope = lambda b, x: jax.jvp(f, tuple(map(jnp.asarray, ARGUMENTS[1:])), (b, x))[1]  # noqa: E731
+    the_same(found, jax.jit(jax.vmap(slope, in_axes=-1, out_axes=-1))(along_b, directions), rtol=1e-13, atol=1e-15)
+    assert derivative_in_numbers(functions, ARGUMENTS, (None, None, np.zeros((3, 0))))["both"].shape == (3, 0)
+
+
+def test_what_is_no_program_of_scalars_is_left_to_jax():
+    b, x = np.array(2.0), np.array([0.5, 3.0])
+    with pytest.warns(UserWarning, match="its description uses"):
+        assert not is_in_numbers(by_a_library, b, x)
+    assert in_numbers(by_a_library, b, x) == pytest.approx(3.0, rel=1e-15)
+    np.testing.assert_allclose(derivative_in_numbers(by_a_library, (b, x), (None, np.eye(2))), [6.0, 1.0], rtol=1e-15)
+
+
+def test_single_precision_stays_single():
+    arguments = jax.tree.map(lambda x: np.asarray(x, np.float32), ARGUMENTS)
+    found = in_numbers(functions, *arguments)
+    the_same(found, jax.jit(functions.__wrapped__)(*arguments), rtol=1e-5)
+    assert found["both"].dtype == np.float32
+
+
+class Rods(jk.System):
+    """Two rods of one length that close a triangle with the ground, and their angles."""
+
+    length: jk.Scalar = jk.parameter(1.0)
+    base: jk.Scalar = jk.parameter(1.5)
+    coordinates, dependent_coordinates = ("a", "b", "c"), ("a", "b")
+    speeds = ("a_rate", "b_rate", "c_rate")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A, B, C = (N.rotate(3, q[i], u[i]) for i in range(3))
+        return jk.Motion([jk.Body(1.0, (0.0, 0.0, 1.0), O, frame) for frame in (A, B, C)])
+
+    def configuration_constraints(self, t, q):
+        x = self.length * (jnp.cos(q["a"]) + jnp.cos(q["b"])) - self.base
+        return [x, self.length * (jnp.sin(q["a"]) + jnp.sin(q["b"]))]
+
+
+@pytest.mark.parametrize("base", [1.5, 2.0, 3.0, np.nan])
+@pytest.mark.parametrize("start", [(0.5, -0.3), (0.0, 0.0), (np.pi, np.pi)])
+def test_newtons_method_finds_in_numbers_what_it_finds_compiled(base, start):
+    """Where there is one place, two rods in line, none, and no number; from beside, and from where all slopes agree."""
+    system = eqx.tree_at(lambda s: s.base, Rods(), jnp.array(base))
+    q = jnp.array([*start, 0.2])
+    found, right = (f(system, q, jnp.array(0.0), (0, 1), False) for f in (newton_in_numbers, newton))
+    assert bool(found.good) == bool(right.good)
+    assert float(found.remainder) == pytest.approx(float(right.remainder), abs=1e-12) or not right.good
+    if right.good:
+        np.testing.assert_allclose(found.q, right.q, atol=1e-14 if base < 2.0 else 1e-11)  # of a double root

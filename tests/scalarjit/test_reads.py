@@ -1,0 +1,707 @@
+"""Programs follow what their code reads: a global, an attribute, a closure, a function that changed between calls."""
+
+import array
+import collections
+import dataclasses
+import functools
+import gc
+import importlib
+import re
+import sys
+import threading
+import types
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane._common.lru_cache import MOST_REMEMBERED, LRUCache
+from jaxkane._scalarjit.cache_key import version_of
+from jaxkane._scalarjit.function import fused
+from jaxkane.fit._linearize import cost
+
+RTOL = 1e-12
+TS = np.linspace(0.0, 0.2, 3)
+GRAVITY = 9.81  # [m/s^2]
+HELD = {"gravity": 9.81}
+TABLE = np.array([9.81, 0.0])
+PUSH = 0.0  # [m/s^2]
+
+
+class Settings:
+    def __init__(self):
+        self.gravity = 9.81
+
+
+SETTINGS = Settings()
+
+
+@dataclasses.dataclass(slots=True)
+class Slots:
+    gravity: float = 9.81
+
+
+SLOTS = Slots()
+NAMES = types.SimpleNamespace(gravity=9.81)
+
+
+def helper():
+    return GRAVITY
+
+
+def in_a_nested_lambda():
+    return (lambda: (lambda: GRAVITY)())()
+
+
+DEFAULT = [9.81]
+
+
+def with_default(gravity=DEFAULT):
+    return gravity[0]
+
+
+def closure():
+    gravity = 9.81
+
+    def read():
+        return gravity
+
+    def change(value):
+        nonlocal gravity
+        gravity = value
+
+    return read, change
+
+
+READ, CHANGE = closure()
+
+
+class Drop(jk.System):
+    """A particle that falls: x_dot_dot = gravity + push, whatever its mass."""
+
+    mass: jk.Scalar = jk.parameter(2.0)
+    coordinates, speeds, inputs = ("x",), ("v",), ("push",)
+    attribute = 9.81
+    mutable = {"gravity": [9.81]}
+
+    def gravity(self):
+        return GRAVITY
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(self.mass, 0.0, O.moving(q[0] * N.x, u[0] * N.x))])
+
+    def loads(self, t, q, u, motion, inputs):
+        return [jk.Force(self.mass * (self.gravity() + inputs["push"]) * motion.N.x, motion.bodies[0])]
+
+
+def accelerate(system):
+    return float(jk.accelerations(system, 0.0, [0.0], [0.0])[0])
+
+
+def with_gravity(read):
+    """A system whose gravity is what `read` says."""
+    return type("Drop", (Drop,), {"gravity": lambda self: read(self), "__module__": __name__})()
+
+
+def put(monkeypatch, values):
+    """Change the first entry, in place."""
+    monkeypatch.setattr(sys.modules[__name__], "restore", lambda: values.__setitem__(0, 9.81))
+    values[0] = 1.62
+
+
+def restore():
+    pass
+
+
+def in_module(name, value):
+    return lambda monkeypatch: monkeypatch.setattr(sys.modules[__name__], name, value)
+
+
+CHANGES = {
+    "global": (lambda self: GRAVITY, in_module("GRAVITY", 1.62)),
+    "global of a helper": (lambda self: helper(), in_module("GRAVITY", 1.62)),
+    "global of a nested lambda": (lambda self: in_a_nested_lambda(), in_module("GRAVITY", 1.62)),
+    "another helper": (lambda self: helper(), in_module("helper", lambda: 1.62)),
+    "code of a helper": (  # as an autoreload puts it in
+        lambda self: helper(),
+        lambda monkeypatch: monkeypatch.setattr(helper, "__code__", (lambda: 1.62).__code__),
+    ),
+    "entry of a dict": (lambda self: HELD["gravity"], lambda m: m.setitem(HELD, "gravity", 1.62)),
+    "entry of an array": (lambda self: TABLE[0], lambda m: put(m, TABLE)),
+    "attribute of an object": (lambda self: SETTINGS.gravity, lambda m: m.setattr(SETTINGS, "gravity", 1.62)),
+    "attribute of a namespace": (lambda self: NAMES.gravity, lambda m: m.setattr(NAMES, "gravity", 1.62)),
+    "slot of an object": (lambda self: SLOTS.gravity, lambda m: m.setattr(SLOTS, "gravity", 1.62)),
+    "default": (lambda self: with_default(), lambda m: put(m, DEFAULT)),
+    "replaced default": (lambda self: with_default(), lambda m: m.setattr(with_default, "__defaults__", ([1.62],))),
+    "closure": (lambda self: READ(), lambda m: CHANGE(1.62)),
+    "class attribute": (lambda self: self.attribute, lambda m: m.setattr(Drop, "attribute", 1.62)),
+    "mutable class attribute": (
+        lambda self: self.mutable["gravity"][0],
+        lambda m: put(m, Drop.mutable["gravity"]),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_change_is_noticed(name, monkeypatch):
+    read, change = CHANGES[name]
+    system = with_gravity(read)
+    assert accelerate(system) == pytest.approx(9.81, rel=RTOL)
+    change(monkeypatch)
+    assert accelerate(system) == pytest.approx(1.62, rel=RTOL)
+    restore()
+    CHANGE(9.81)
+
+
+def test_a_method_that_is_replaced_is_noticed(monkeypatch):
+    system = Drop()
+    assert accelerate(system) == pytest.approx(9.81, rel=RTOL)
+    monkeypatch.setattr(Drop, "gravity", lambda self: 1.62)
+    assert accelerate(system) == pytest.approx(1.62, rel=RTOL)
+
+
+@pytest.mark.parametrize("where", ["import moon", "from moon import gravity", "import planets.moon"])
+def test_modules_that_are_imported_inside(where, monkeypatch):
+    moon, planets = types.ModuleType("moon"), types.ModuleType("planets")
+    vars(moon)["gravity"], vars(planets)["moon"] = 9.81, moon
+    for name, module in {"moon": moon, "planets": planets, "planets.moon": moon}.items():
+        monkeypatch.setitem(sys.modules, name, module)
+    found = "gravity" if "from" in where else where.split()[1] + ".gravity"
+    inside, outside = {"Drop": Drop}, {"Drop": Drop, "__name__": "notebook"}
+    exec(f"class Inside(Drop):\n    def gravity(self):\n        {where}\n        return {found}", inside)
+    exec(f"{where}\nclass Outside(Drop):\n    def gravity(self):\n        return {found}", outside)
+    systems = [inside["Inside"](), *([] if "from" in where else [outside["Outside"]()])]
+    assert [accelerate(s) for s in systems] == pytest.approx([9.81] * len(systems), rel=RTOL)
+    vars(moon)["gravity"] = 1.62
+    assert [accelerate(s) for s in systems] == pytest.approx([1.62] * len(systems), rel=RTOL)
+
+
+@pytest.mark.parametrize(
+    "line", ["from .numbers_of_it import gravity", "from . import numbers_of_it as it", "from .. import moon as it"]
+)
+def test_relative_imports_inside_a_method(line, monkeypatch, tmp_path):
+    """The module is imported by the first call itself, when what the method reads has been looked at already."""
+    inner = tmp_path / "outer" / "inner"
+    inner.mkdir(parents=True)
+    for path in (tmp_path / "outer" / "__init__.py", inner / "__init__.py"):
+        path.touch()
+    for path in (tmp_path / "outer" / "moon.py", inner / "numbers_of_it.py"):
+        path.write_text("gravity = 9.81\n")
+    read = "gravity" if line.endswith("gravity") else "it.gravity"
+    (inner / "drop.py").write_text(f"def fall(self):\n    {line}\n    return {read}\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    fall = importlib.import_module("outer.inner.drop").fall
+    system = type("Drop", (Drop,), {"gravity": fall, "__module__": "outer.inner.drop"})()
+    assert accelerate(system) == pytest.approx(9.81, rel=RTOL)
+    vars(sys.modules["outer.moon" if "moon" in line else "outer.inner.numbers_of_it"])["gravity"] = 1.62
+    assert accelerate(system) == pytest.approx(1.62, rel=RTOL)
+    for name in ("", ".moon", ".inner", ".inner.drop", ".inner.numbers_of_it"):
+        sys.modules.pop(f"outer{name}", None)
+
+
+class DictOfAUser(dict):
+    pass
+
+
+class ListOfAUser(list):
+    pass
+
+
+def places():
+    """By name: what reads a number, and what changes it."""
+    module, made, objects = types.ModuleType("moon"), DictOfAUser(), np.array([9.81], dtype=object)
+    listed, chain = ListOfAUser(), collections.ChainMap({}, {"gravity": 9.81})
+    module.gravity = made.gravity = listed.gravity = 9.81
+    user = collections.UserDict(gravity=9.81)
+    holder = type("Holder", (), {"module": module, "__module__": __name__})
+    by_attribute = lambda m: m.gravity  # noqa: E731
+    own = lambda: own.gravity  # noqa: E731
+    own.gravity = 9.81
+    yield "module given to a function", lambda: by_attribute(module), lambda: setattr(module, "gravity", 1.62)
+    yield "module of a class", lambda: by_attribute(holder.module), lambda: setattr(module, "gravity", 1.62)
+    yield "module in a list", lambda: [m.gravity for m in [module]], lambda: setattr(module, "gravity", 1.62)
+    yield "attribute of a function", own, lambda: setattr(own, "gravity", 1.62)
+    yield "attribute of a dict's class", lambda: made.gravity, lambda: setattr(made, "gravity", 1.62)
+    yield "attribute of a list's class", lambda: listed.gravity, lambda: setattr(listed, "gravity", 1.62)
+    yield "method of a dict's class", lambda: made, lambda: setattr(DictOfAUser, "__missing__", lambda d, k: 1.62)
+    yield "ChainMap", lambda: chain["gravity"], lambda: chain.maps[1].update(gravity=1.62)
+    yield "UserDict", lambda: user["gravity"], lambda: user.update(gravity=1.62)
+    yield "array of objects", lambda: objects[0], lambda: objects.__setitem__(0, 1.62)
+
+
+@pytest.mark.parametrize("name", [name for name, *_ in places()])
+def test_places_that_are_looked_into(name):
+    read, change = {name: both for name, *both in places()}[name]
+    before = version_of(read)
+    assert version_of(read) == before
+    change()
+    assert version_of(read) != before
+
+
+class Bead(jk.System):
+    """A particle on a line, whose place, mass, force, sensor and state follow GRAVITY."""
+
+    mass: jk.Scalar = jk.parameter(2.0)
+    coordinates, speeds, inputs, states = ("x",), ("v",), ("push",), ("lag",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        arm = N.rotate(1, GRAVITY * q[0], GRAVITY * u[0])
+        P = O.moving(GRAVITY * q[0] * N.x, GRAVITY * u[0] * N.x)
+        body = jk.Body(self.mass * GRAVITY, 0.0, P, name="bead")
+        return jk.Motion([body], points={"P": P, "O": O.fixed(0.0 * N.x)}, frames={"arm": arm})
+
+    def loads(self, t, q, u, motion, inputs):
+        return [jk.Force((inputs["push"] - q[0]) * motion.N.x, motion.bodies[0])]
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return [now["push"] - GRAVITY * x[0]]
+
+    def outputs(self, t, q, u, motion, now):
+        return {"reading": GRAVITY * q[0]}
+
+    def events(self, t, q, u):
+        return {"there": q[0] - 2.0 + 1e-3 * GRAVITY}
+
+
+class Ring(jk.System):
+    """A bead on a ring, the square of whose radius is GRAVITY."""
+
+    coordinates, speeds, dependent_coordinates = ("x", "y"), ("v",), ("y",)
+
+    def q_dot(self, t, q, u):
+        return -q[1] * u[0], q[0] * u[0]
+
+    def configuration_constraints(self, t, q):
+        return [q[0] ** 2 + q[1] ** 2 - GRAVITY]
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q[0] * N.x + q[1] * N.y, -q[1] * u[0] * N.x + q[0] * u[0] * N.y))])
+
+
+class Still(jk.System):
+    """A particle on a spring, which reads nothing."""
+
+    mass: jk.Scalar = jk.parameter(2.0)
+    coordinates, speeds, inputs = ("x",), ("v",), ("push",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(self.mass, 0.0, O.moving(q[0] * N.x, u[0] * N.x))])
+
+    def loads(self, t, q, u, motion, inputs):
+        return [jk.Force((inputs["push"] - q[0]) * motion.N.x, motion.bodies[0])]
+
+
+class Pressed(Still):
+    def loads(self, t, q, u, motion, inputs):
+        return [jk.Force((GRAVITY - q[0]) * motion.N.x, motion.bodies[0])]
+
+
+PLACE = jk.State(np.array([0.5]), np.array([0.3]), np.array([0.2]))
+CENTER = jk.State(np.zeros(1), np.zeros(1), np.zeros(1))
+HALF = jk.State(np.array([0.5]), np.zeros(1))
+TWO = {"mass": np.array([1.0, 2.0])}
+
+
+def at_an_instant(name):
+    more = {"speed_rates": ({"lag": 0.2},), "state_rates": ({"lag": 0.2},), "outputs": ({"lag": 0.2},)}
+    return lambda: getattr(jk, name)(Bead(), 0.0, [0.5], [0.3], *more.get(name, ()))
+
+
+def fixed_ride():
+    """A motion as it was found with the first number, to ask of it what depends on the second."""
+    if "ride" not in vars(fixed_ride):
+        fixed_ride.ride = jk.simulate(Bead(), PLACE, TS, **SHORT)
+    return fixed_ride.ride
+
+
+def cost_of_a_fit():
+    trial = jk.fit.Trial(TS, {"x": TS}, sigma=1.0)
+    problem = jk.fit.Problem.of(Pressed(), trial, ["mass"], simulation=jk.fit.Simulation(**SHORT))
+    return cost(problem, problem.start)
+
+
+QUESTIONS: dict[str, Callable[[], Any]] = {
+    "generalized_inertia_forces": lambda: jk.generalized_inertia_forces(Bead(), 0.0, [0.5], [0.3], u_dot=[1.0]),
+    **{
+        name: at_an_instant(name)
+        for name in "accelerations equations_of_motion mass_matrix forcing generalized_active_forces kinetic_energy "
+        "speed_rates state_rates positions velocities orientations partial_velocities "
+        "outputs".split()
+    },
+    "assemble": lambda: jk.assemble(Ring(), {"x": 1.0}, {}).q,
+    "constraint_forces": lambda: jk.constraint_forces(Hung(), 0.0, [0.0], [0.0])["P"],
+    "regressor": lambda: jk.fit.regressor(Hung(), 0.0, [0.5], [0.3], u_dot=[0.0]).matrix,
+    "numpy": lambda: jk.export.numpy(Bead()),
+    "symbolic.equations": lambda: repr(vars(jk.symbolic.equations(Bead()))),
+    "symbolic.linearize": lambda: repr(jk.symbolic.linearize(Hung()).A),
+}
+QUESTIONS_THAT_COMPILE: dict[str, Callable[[], Any]] = {
+    "simulate": lambda: jk.simulate(Bead(), PLACE, TS, **SHORT).q,
+    "simulate with inputs": lambda: jk.simulate(Still(), HALF, TS, {"push": lambda t, s: GRAVITY}, **SHORT).q,
+    "speed_rates of a ride": lambda: jk.speed_rates(Bead(), fixed_ride()),
+    "positions of a ride": lambda: jk.positions(Bead(), fixed_ride()),
+    "outputs of a ride": lambda: jk.outputs(Bead(), fixed_ride()),
+    "linearize": lambda: tuple(jk.stability.linearize(Bead(), CENTER, outputs=["reading"])),
+    "equilibrium": lambda: jk.stability.equilibrium(Pressed()).q,
+    "sweep": lambda: jk.sweep.sweep(Bead(), PLACE, TS, table=TWO, **SHORT).q,
+    "sweep(reduce)": lambda: jk.sweep.sweep(Still(), HALF, TS, table=TWO, reduce=REDUCE, **SHORT).values,
+    "sweep from functions": lambda: jk.sweep.sweep(Still(), START, TS, table=TWO, **SHORT).q,
+    "sweep of functions": lambda: jk.sweep.sweep(SYSTEM, HALF, TS, table={"m": TWO["mass"]}, **SHORT).q,
+    "audit": lambda: repr(jk.audit(Bead(), fixed_ride())),
+    "Problem": cost_of_a_fit,
+}
+CENTER_OF_STILL = jk.State(np.zeros(1), np.zeros(1))
+OUTPUTS = {"f": lambda t, q, u: GRAVITY * q["x"]}
+REDUCE = lambda ride: GRAVITY * ride["x"][-1]  # noqa: E731
+START = lambda system, row: jk.State(jnp.full(1, GRAVITY), jnp.zeros(1))  # noqa: E731
+SYSTEM = lambda row: Still(GRAVITY * row["m"])  # noqa: E731
+
+
+def bytes_of(answer):
+    return answer if isinstance(answer, str) else [np.asarray(x).tobytes() for x in jax.tree.leaves(answer)]
+
+
+@pytest.mark.parametrize(
+    "name", [*QUESTIONS, *(pytest.param(name, marks=pytest.mark.slow) for name in QUESTIONS_THAT_COMPILE)]
+)
+def test_every_public_function_sees_the_change(name, monkeypatch):
+    ask = (QUESTIONS | QUESTIONS_THAT_COMPILE)[name]
+    fixed_ride()
+    before = bytes_of(ask())
+    monkeypatch.setattr(sys.modules[__name__], "GRAVITY", 1.62)
+    after = bytes_of(ask())
+    jk.forget()
+    assert before != after == bytes_of(ask())
+
+
+def test_output_functions_of_a_linear_model_are_looked_into(monkeypatch):
+    model = lambda: jk.stability.linearize(Still(), CENTER_OF_STILL, outputs=OUTPUTS)  # noqa: E731
+    assert float(model().C[0, 0]) == pytest.approx(9.81, rel=RTOL)
+    monkeypatch.setattr(sys.modules[__name__], "GRAVITY", 1.62)
+    assert float(model().C[0, 0]) == pytest.approx(1.62, rel=RTOL)
+
+
+class Controller:
+    def __init__(self):
+        self.push = 0.0
+
+    def __call__(self, t, state):
+        return {"push": self.push}
+
+    def method(self, t, state):
+        return self.push
+
+
+def fall(acceleration):
+    return 0.5 * acceleration * TS[-1] ** 2
+
+
+def push(t, state, scale=None):
+    return PUSH
+
+
+REST = jk.State(np.zeros(1), np.zeros(1))
+SHORT = {"step": 0.1, "solver": diffrax.Midpoint()}  # exact here, and compiled quickly
+
+
+def test_simulate_follows_descriptions_and_controllers(monkeypatch):
+    controller = Controller()
+    last = lambda: float(jk.simulate(Drop(), REST, TS, controller, **SHORT)["x"][-1])  # noqa: E731
+    assert last() == pytest.approx(fall(9.81), rel=1e-9)
+    controller.push = 1.0
+    assert last() == pytest.approx(fall(10.81), rel=1e-9)
+    monkeypatch.setattr(sys.modules[__name__], "GRAVITY", 1.62)
+    assert last() == pytest.approx(fall(2.62), rel=1e-9)
+
+
+def test_input_functions_of_every_kind_are_looked_into(monkeypatch):
+    controller = Controller()
+    ways = [controller, {"push": controller.method}, {"push": push}, {"push": functools.partial(push, scale=HELD)}]
+    ways += [jax.tree_util.Partial(push), jax.jit(push), eqx.filter_jit(push), Holder(push, 1.0)]
+    before = [version_of(way) for way in ways]
+    assert [version_of(way) for way in ways] == before
+    controller.push = 1.0
+    monkeypatch.setattr(sys.modules[__name__], "PUSH", 1.0)
+    assert not set(before) & {version_of(way) for way in ways}
+    assert version_of(Holder(push, 1.0)) == version_of(Holder(push, 2.0))  # a number that is an argument of the program
+
+
+class Walled(Still):
+    """Beside a wall that it meets before the last sample."""
+
+    def events(self, t, q, u):
+        return {"wall": q[0] - 0.52}
+
+
+@pytest.mark.parametrize("derivative", [pytest.param(jax.jacrev, marks=pytest.mark.slow), jax.jacfwd])
+def test_a_closure_of_an_input_function_has_the_derivatives_of_an_input(derivative):
+    start = jk.State(np.array([0.5]), np.array([0.3]))
+    given = lambda k: jk.simulate(Walled(), start, TS, {"push": k}, **SHORT)["x"]  # noqa: E731
+    captured = lambda k: jk.simulate(Walled(), start, TS, {"push": lambda t, state: 1.0 * k}, **SHORT)["x"]  # noqa: E731
+    slopes = derivative(captured)(jnp.array(1.0))
+    np.testing.assert_allclose(slopes, derivative(given)(jnp.array(1.0)), rtol=RTOL)
+    assert np.isnan(slopes[-1])  # the wall is met before
+
+
+def test_a_sweep_is_differentiated_forward_by_what_its_functions_read():
+    start = jk.State(np.array([0.5]), np.array([0.3]))
+
+    def last(k):
+        inputs = {"push": lambda t, state: 1.0 * k}
+        return jk.sweep.sweep(Walled(), start, TS, inputs, table={"mass": [2.0]}, **SHORT)["x"][0]
+
+    _, slopes = jax.jvp(last, (jnp.array(1.0),), (jnp.array(1.0),))
+    assert slopes[0] == 0.0
+    assert np.isnan(slopes[-1])
+
+
+@pytest.mark.parametrize("method", ["events", "loads"])
+def test_a_traced_number_in_the_closure_of_a_description_is_refused(method):
+    def ends_at(k):
+        read = {"events": lambda self, t, q, u: {"wall": q[0] - k}, "loads": lambda self, *_: [k]}[method]
+        system = type("Walled", (Still,), {method: read, "__module__": __name__})()
+        return jk.simulate(system, HALF, TS, **SHORT).t_end
+
+    with pytest.raises(TypeError, match=r"Walled: its description reads, .* Make it a parameter"):
+        jax.grad(ends_at)(0.52)
+
+
+def test_traced_numbers_that_a_description_has_kept_are_no_closure():
+    """What an earlier trace left behind is nobody's."""
+    kept = []
+
+    class Keeping(Still):
+        def loads(self, t, q, u, motion, inputs):
+            kept.append(q[0])
+            return super().loads(t, q, u, motion, inputs)
+
+    for _ in range(2):
+        assert jk.simulate(Keeping(), HALF, TS, **SHORT).ok
+
+
+class Holder(eqx.Module):
+    f: Callable
+    gain: jax.Array = eqx.field(converter=jnp.asarray)
+
+    def __call__(self, t, state):
+        return self.gain * self.f(t, state)
+
+
+@pytest.mark.slow
+def test_sweeps_fits_models_and_forces_follow(monkeypatch):
+    table = {"mass": np.array([1.0, 2.0])}
+    trial = jk.fit.Trial(TS, {"x": fall(1.62) * (TS / TS[-1]) ** 2}, sigma=1.0)
+    problem = jk.fit.Problem.of(Drop(), trial, ["mass"], simulation=jk.fit.Simulation(**SHORT))
+
+    def now():
+        rides = jk.sweep.sweep(Drop(), REST, TS, table=table, reduce=lambda ride: ride["x"][-1], **SHORT)
+        model = jk.stability.linearize(Sprung(), REST)
+        force = jk.constraint_forces(Hung(), 0.0, [0.0], [0.0])["P"][2]
+        return *rides.values, cost(problem, problem.start), float(model.A[1, 0]), float(force)
+
+    distance = fall(9.81 - 1.62) * (TS / TS[-1]) ** 2
+    np.testing.assert_allclose(now(), [fall(9.81), fall(9.81), np.sum(distance**2), -9.81, 2 * 9.81], rtol=1e-6)
+    monkeypatch.setattr(sys.modules[__name__], "GRAVITY", 1.62)
+    np.testing.assert_allclose(now(), [fall(1.62), fall(1.62), 0.0, -1.62, 2 * 1.62], rtol=1e-6, atol=1e-12)
+
+
+class Sprung(Drop):
+    """x_dot_dot = -GRAVITY x."""
+
+    def loads(self, t, q, u, motion, inputs):
+        return [jk.Force(-self.mass * GRAVITY * q[0] * motion.N.x, motion.bodies[0])]
+
+
+class Hung(jk.System):
+    """A pendulum whose pivot P carries its weight, mass 2 kg, along z."""
+
+    mass: jk.Scalar = jk.parameter(2.0)
+    coordinates, speeds = ("angle",), ("rate",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.fixed(0.0 * N.x)
+        arm = N.rotate(1, q[0], u[0])
+        return jk.Motion([jk.Body(self.mass, 0.0, P.fixed(-1.0 * arm.z))], points={"P": P})
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -GRAVITY * motion.N.z)
+
+
+def test_what_came_back_is_not_traced_again(monkeypatch):
+    calls = []
+
+    class Counted(Drop):
+        def loads(self, t, q, u, motion, inputs):
+            calls.append(1)  # what tracing itself changes is no change
+            return super().loads(t, q, u, motion, inputs)
+
+    system = Counted()
+    accelerate(system)
+    n = len(calls)
+    assert n > 0
+    accelerate(system)
+    assert len(calls) == n
+    monkeypatch.setattr(sys.modules[__name__], "GRAVITY", 1.62)
+    assert accelerate(system) == pytest.approx(1.62, rel=RTOL)
+    assert len(calls) > n
+
+
+def test_values_that_come_back_find_their_program_again():
+    seen = []
+
+    @fused
+    def program(x, f):
+        seen.append(f())
+        return x * f()
+
+    space = {"g": 2.0}
+    exec("def f():\n    return g", space)
+    f, x = jax.tree_util.Partial(space["f"]), jnp.array(3.0)
+    for g, expected in [(2.0, 6.0), (5.0, 15.0), (2.0, 6.0), (2, 6.0)]:
+        space["g"] = g
+        assert float(program(x, f)) == expected
+    assert seen == [2.0, 5.0, 2]
+
+
+def test_nan_zeros_and_arrays_of_other_types_are_told_apart():
+    space: dict[str, Any] = {}
+    exec("def f():\n    return x", space)
+    versions = []
+    values = [
+        np.nan,
+        0.0,
+        -0.0,
+        0,
+        False,
+        None,
+        "0",
+        (0.0,),
+        [0.0],
+        np.zeros(1),
+        np.zeros(1, np.float32),
+        np.zeros((1, 1)),
+    ]
+    for space["x"] in [*values, np.zeros(1, np.int64), {0.0}, {"a": 0.0}, {"b": 0.0}, jnp, len]:
+        versions.append(version_of(space["f"]))
+        assert version_of(space["f"]) == versions[-1]
+    assert len(set(versions)) == len(versions)
+    space["x"] = np.zeros(1)
+    assert version_of(space["f"]) == versions[9]  # not the same array, but the same numbers
+
+
+def test_objects_that_name_each_other_and_long_chains_come_to_an_end():
+    chain = []
+    for _ in range(5000):
+        chain = [chain]
+    ring = {}
+    ring["ring"] = ring
+    space = {"chain": chain, "ring": ring}
+    exec("def f():\n    return chain, ring, g()\ndef g():\n    return f()", space)
+    assert version_of(space["f"]) == version_of(space["f"])
+    before = version_of(space["f"])
+    ring["x"] = 1.0
+    assert version_of(space["f"]) != before
+
+
+def test_forget_reads_what_cannot_be_seen():
+    hidden = array.array("d", [9.81])  # of a C extension
+    system = with_gravity(lambda self: hidden[0])
+    outer = jax.jit(lambda v: jk.accelerations(system, 0.0, jnp.zeros(1), v)[0])
+    assert accelerate(system) == float(outer(jnp.zeros(1))) == pytest.approx(9.81, rel=RTOL)
+    hidden[0] = 1.62
+    jk.forget()
+    assert accelerate(system) == float(outer(jnp.zeros(1))) == pytest.approx(1.62, rel=RTOL)
+
+
+def test_what_is_gone_is_not_kept():
+    """JAX's registry keeps every class of a pytree for ever; nothing else does, and no controller is kept."""
+
+    def once(n):
+        controller = Controller()
+        version_of(controller, lambda: n)
+        return weakref.ref(controller)
+
+    gone = [once(n) for n in range(300)]
+    gc.collect()
+    assert sum(ref() is not None for ref in gone) <= 256
+    jk.forget()
+    gc.collect()
+    assert not any(ref() for ref in gone)
+
+
+def test_systems_and_their_arrays_are_not_kept():
+    """A program takes the numbers of a system; it keeps neither them nor the system."""
+    system = Bead(jnp.array(3.0))
+    gone = [weakref.ref(system), weakref.ref(system.mass)]
+    jk.kinetic_energy(system, 0.0, [0.5], [0.3])
+    jk.equations_of_motion(system, 0.0, [0.5], [0.3], {"lag": 0.2})
+    jk.positions(system, 0.0, [0.5], [0.3])
+    jk.export.numpy(system)
+    jk.symbolic.equations(system)
+    del system
+    gc.collect()
+    assert [ref() for ref in gone] == [None, None]
+
+
+def test_threads_agree():
+    found, n = [], 8
+
+    def look():
+        for _ in range(200):
+            found.append(version_of(Drop()))
+
+    threads = [threading.Thread(target=look) for _ in range(n)]
+    [t.start() for t in threads]
+    [t.join() for t in threads]
+    assert len(found) == 200 * n
+    assert len(set(found)) == 1
+
+
+def test_threads_share_a_memory_that_is_full():
+    memory, failed = LRUCache(), []
+
+    def fill(start):
+        try:
+            for i in range(3000):
+                memory[start + i] = i
+                memory.get(start)
+        except RuntimeError as error:  # a dict that another thread is changing
+            failed.append(error)
+
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    threads = [threading.Thread(target=fill, args=(10_000 * n,)) for n in range(8)]
+    [t.start() for t in threads]
+    [t.join() for t in threads]
+    sys.setswitchinterval(before)
+    assert not failed
+    assert len(memory) == MOST_REMEMBERED
+
+
+def test_a_look_walks_through_nothing(monkeypatch):
+    system = Drop()
+    version = version_of(system)
+    monkeypatch.setattr("jaxkane._scalarjit.captured_values._Walk", None)  # it would be called to look anew
+    assert version_of(system) == version
+
+
+def test_every_compiled_function_of_the_library_follows():
+    """One at module level that is compiled by itself would keep what was read when it was traced."""
+    source = Path(jk.__file__).parent
+    wrong = r"^@(eqx\.filter_jit|jax\.jit)\s+def (\w+)"
+    found = {m[2] for path in source.rglob("*.py") for m in re.finditer(wrong, path.read_text(), re.MULTILINE)}
+    of_numbers = {"_eliminate", "_solved_by_lapack", "_det_by_lapack"}
+    assert found <= of_numbers, f"compile {found} with `_reads.compiled`, or show that they read no description"

@@ -1,0 +1,420 @@
+"""Eigenvalues along a parameter, critical speeds and their derivatives: against the literature and differences."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import jaxkane as jk
+from jaxkane import Scalar, parameter
+from jaxkane.bicycles import sharp_motorcycle
+from jaxkane.stability import critical_speeds, eigenvalues, linearize, straight_ahead
+from jaxkane.stability._eigenvalues import _tracked, pairs, track
+
+BIKE = jk.catalog.WhippleBicycle.benchmark()
+PUBLISHED = json.loads((Path(__file__).parents[1] / "data" / "meijaard2007.json").read_text())
+WEAVE, CAPSIZE = 4.29238253634111, 6.02426201538837  # [m/s] Meijaard et al. (2007), section 5
+DOUBLE_ROOT = 0.68428307889246  # [m/s] as above
+NAMES = [f.name for f in dataclasses.fields(BIKE)]
+LATERAL = ("roll", "steer", "roll_rate", "steer_rate")
+
+
+def differences(f, h):
+    """df/dparameters of a function of the bicycle, by central differences of the fourth order with relative steps h."""
+    found = {}
+    for name in NAMES:
+        x = float(getattr(BIKE, name))
+        step = h * max(abs(x), 0.1)
+        at = lambda k: f(dataclasses.replace(BIKE, **{name: x + k * step}))  # noqa: B023, E731
+        found[name] = (8 * (at(1) - at(-1)) - (at(2) - at(-2))) / (12 * step)
+    return found
+
+
+def agree(derivative, by_differences, rtol):
+    """To `rtol`, or to the rounding of the differences where a derivative is next to nothing."""
+    for name in NAMES:
+        x, y = np.asarray(getattr(derivative, name)), np.asarray(by_differences[name])
+        size = max(abs(float(getattr(BIKE, name))), 0.1)
+        np.testing.assert_allclose(x, y, rtol=rtol, atol=1e-10 / size, err_msg=name)
+
+
+# -- along the speed
+
+
+@pytest.fixture(scope="module")
+def found():
+    return eigenvalues(BIKE, jnp.linspace(0.0, 10.0, 101))
+
+
+def test_eigenvalues_of_the_benchmark_at_eleven_speeds(found):
+    """Meijaard et al. (2007), Table 2."""
+    atol = 1e-11
+    for row in PUBLISHED["table2"]:
+        here = np.asarray(found.eigenvalues[int(10 * row["v"])])
+        for real, imaginary in row["eig_published"]:
+            assert np.abs(here - complex(real, imaginary)).min() < atol
+
+
+def test_modes_are_followed_and_named(found):
+    """Capsize and castering decay, castering ever faster; the weave swings from 0.68 m/s on."""
+    assert found.modes == ("weave", "weave", "capsize", "castering")
+    v = np.asarray(found.values)
+    castering, weave = np.asarray(found["castering"])[:, 0], np.asarray(found["weave"])
+    assert np.all(np.diff(castering.real) < 0)
+    np.testing.assert_array_equal(np.abs(weave.imag).min(axis=1) > 0, v > DOUBLE_ROOT)
+    assert np.abs(np.diff(np.asarray(found.eigenvalues)[v > 0.75], axis=0)).max() < 0.4
+    assert np.abs(np.asarray(found["capsize"]).imag).max() == 0
+    np.testing.assert_array_equal(found.stable, (v > WEAVE) & (v < CAPSIZE))
+    A = linearize(BIKE, straight_ahead(BIKE, 5.0), states=LATERAL).A
+    X, lam = found.vectors[50], found.eigenvalues[50]
+    np.testing.assert_allclose(A.astype(complex) @ X, X * lam[None, :], atol=1e-12)
+    with pytest.raises(KeyError, match="no 'wobble' in these modes; there are weave, capsize, castering"):
+        found["wobble"]
+
+
+def test_crossing_modes_keep_their_columns():
+    """Three straight lines and a pair, shuffled: all cross; the vectors tell them apart."""
+    rng = np.random.default_rng(0)
+    p = np.linspace(0.0, 1.0, 41)
+    lam = np.stack([-1 + 2 * p, 0.5 - p, 0.1 + 0 * p, -0.3 + 3j * p, -0.3 - 3j * p], axis=1).astype(complex)
+    X = np.eye(5) + 0.1 * rng.standard_normal((5, 5))
+    X = X / np.linalg.norm(X, axis=0)
+    shuffles = np.stack([rng.permutation(5) for _ in p])
+    shuffled = np.take_along_axis(lam, shuffles, axis=1)
+    order, _ = track(p, shuffled, np.stack([X[:, s] for s in shuffles]))
+    tracked = np.take_along_axis(shuffled, order, axis=1)
+    columns = [int(np.abs(lam - tracked[:, [j]]).sum(axis=0).argmin()) for j in range(5)]
+    assert sorted(columns) == [0, 1, 2, 3, 4]
+    np.testing.assert_array_equal(tracked, lam[:, columns])
+
+
+@pytest.mark.slow
+def test_derivatives_of_eigenvalues_with_respect_to_all_parameters():
+    rtol = 1e-7
+
+    @jax.jit
+    def parts(bicycle):
+        x = eigenvalues(bicycle, jnp.array([5.0])).eigenvalues[0]
+        return jnp.stack([x[0].real, jnp.abs(x[0].imag), x[2].real, x[3].real])
+
+    agree(jax.jit(jax.jacrev(parts))(BIKE), differences(parts, 4e-4), rtol)
+
+
+@pytest.mark.slow
+def test_where_modes_coalesce_there_is_no_derivative():
+    """Not a silent zero: NaN for the two that meet, numbers for the others, and words."""
+
+    def at(v):
+        return eigenvalues(BIKE, v[None])
+
+    @jax.jit
+    def value_and_slopes(v):
+        def real(v):
+            found = at(v)
+            return found.eigenvalues[0].real, found
+
+        slope, found = jax.jacrev(real, has_aux=True)(v)
+        return found, slope
+
+    found, slope = value_and_slopes(jnp.array(DOUBLE_ROOT))
+    np.testing.assert_allclose(found["weave"].real, 3.7829040512932, atol=1e-6)
+    np.testing.assert_array_equal(found.coalescing, [[True, True, False, False]])
+    np.testing.assert_array_equal(np.isnan(slope), [True, True, False, False])
+    assert "modes coalesce at 0.684283: no derivative there" in repr(found)
+    found, slope = value_and_slopes(jnp.array(0.7))
+    assert np.isfinite(slope).all()
+    assert not np.asarray(found.coalescing).any()
+
+
+# -- critical speeds
+
+
+def test_weave_and_capsize_speeds():
+    atol = 1e-11
+    found = critical_speeds(BIKE)
+    np.testing.assert_allclose(found.values, [WEAVE, CAPSIZE], atol=atol)
+    np.testing.assert_allclose(found.frequency, [3.43503384866144, 0.0], atol=1e-10)
+    np.testing.assert_array_equal(found.direction, [-1, 1])
+    assert (found["weave"], found["capsize"]) == tuple(found.values)
+    assert np.isnan(found["castering"])
+    assert repr(found).startswith("CriticalSpeeds(weave stable from 4.292382536 (3.435 rad/s), capsize unstable")
+
+
+def test_riding_backwards_is_riding_forwards_with_time_reversed():
+    """Each mode keeps its name: it was castering that capsized."""
+    speeds = jnp.linspace(1.0, 10.0, 19)
+    forwards, backwards = eigenvalues(BIKE, speeds), eigenvalues(BIKE, -speeds)
+    assert forwards.modes == backwards.modes
+    np.testing.assert_allclose(backwards.eigenvalues.real, -forwards.eigenvalues.real, rtol=1e-9)
+    found = critical_speeds(BIKE, -speeds)
+    assert [found.modes[i] for i in found.mode] == ["capsize", "weave"]
+    np.testing.assert_allclose(found.values, [-CAPSIZE, -WEAVE], rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_derivatives_of_critical_speeds_with_respect_to_all_parameters():
+    rtol = 1e-7
+
+    @jax.jit
+    def both(bicycle):
+        found = critical_speeds(bicycle, jnp.linspace(2.0, 9.0, 36))
+        return jnp.stack([found["weave"], found["capsize"]])
+
+    np.testing.assert_allclose(both(BIKE), [WEAVE, CAPSIZE], atol=1e-11)
+    agree(jax.jit(jax.jacrev(both))(BIKE), differences(both, 4e-4), rtol)
+
+
+class Pencil(jk.System):
+    """States that follow x_dot = A x, beside a point that comes to rest."""
+
+    A: jax.Array = parameter(shape=(4, 4))
+
+    coordinates = ("place",)
+    speeds = ("speed",)
+    states = ("x1", "x2", "x3", "x4")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(q["place"] * N.x, u["speed"] * N.x)
+        return jk.Motion([jk.Body(1.0, 0.0, P, name="point")])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force(-(q["place"] + u["speed"]) * motion.N.x, motion["point"])
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return [sum(self.A[i, j] * x[k] for j, k in enumerate(self.states)) for i in range(4)]
+
+
+REST = jk.State(jnp.zeros(1), jnp.zeros(1), jnp.zeros(4))
+STEPS = np.linspace(-1.0, 1.0, 5)
+
+
+@jax.jit
+def crossings_of(A, dA):
+    """Where x_dot = (A + p dA) x becomes stable or unstable for p from -1 to 1, and the slopes along A."""
+
+    def critical(s):
+        at = lambda system, p: (Pencil(A=(1 + s) * A + p * dA), REST)  # noqa: E731
+        found = critical_speeds(Pencil(A=A), STEPS, at, states=Pencil.states, most=24)
+        return found.values, found
+
+    slopes, found = jax.jacfwd(critical, has_aux=True)(0.0)
+    return found, slopes
+
+
+def pencil(seed):
+    """A and dA of a random pencil: dense, of an oscillator, of parts that do not notice each other, of one that hardly
+    decays, or of one of its own beside them that is a thousand times as fast."""
+    rng = np.random.default_rng(seed)
+    A, dA = rng.standard_normal((2, 4, 4))
+    match seed % 5:
+        case 1:
+            A[:2], dA[:2] = np.eye(4)[2:], 0.0
+        case 2:
+            for x in (A, dA):
+                x[:2, 2:] = x[2:, :2] = 0.0
+        case 3:
+            A, dA = A - A.T + 0.05 * dA, dA - dA.T + 0.05 * A
+        case 4:
+            for x, own in ((A, rng.standard_normal()), (dA, 1e3)):
+                x[3], x[:, 3] = 0.0, 0.0
+                x[3, 3] = own
+    return A, dA
+
+
+def every_crossing_is_found(seed):
+    """The number of growing modes at 2001 values follows from the crossings, at which a real part is zero; and slopes
+    are those of first-order perturbation: Re(y A x) + Re(y dA x) dp = 0."""
+    atol, (A, dA) = 1e-9, pencil(seed)
+    found, slopes = crossings_of(A, dA)
+    some = np.isfinite(found.values)
+    p, frequency, direction, slopes = (
+        np.asarray(x)[some] for x in (found.values, found.frequency, found.direction, slopes)
+    )
+    fine = np.linspace(-1.0, 1.0, 2001)
+    growing = (np.linalg.eigvals(A + fine[:, None, None] * dA).real > 0).sum(axis=1)
+    changes = direction * np.where(frequency > 0, 2, 1)
+    told = growing[0] + (changes[None, :] * (p[None, :] < fine[:, None])).sum(axis=1)
+    beside = (np.abs(p[None, :] - fine[:, None]) < 1e-6).any(axis=1)
+    np.testing.assert_array_equal(told[~beside], growing[~beside])
+    for value, w, slope in zip(p, frequency, slopes, strict=True):
+        x, Y, X = scipy.linalg.eig(A + value * dA, left=True)
+        i = np.argmin(np.abs(x - 1j * w))
+        assert abs(x[i] - 1j * w) < atol * max(1.0, np.abs(x).max())
+        y = Y[:, i].conj() / (Y[:, i].conj() @ X[:, i])
+        by_hand = -(y @ A @ X[:, i]).real / (y @ dA @ X[:, i]).real
+        assert abs(slope - by_hand) <= 1e-6 * abs(by_hand) or np.linalg.norm(y) > 1e6
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.integers(0, 2**20))
+def test_every_crossing_of_a_random_pencil_is_found(seed):
+    """In four steps, against two thousand."""
+    every_crossing_is_found(seed)
+
+
+@pytest.mark.slow
+@settings(max_examples=2000, deadline=None)
+@given(st.integers(0, 2**32))
+def test_every_crossing_of_many_random_pencils_is_found(seed):
+    every_crossing_is_found(seed)
+
+
+@settings(max_examples=40, deadline=None, derandomize=True)
+@given(st.integers(0, 2**20), st.integers(2, 12))
+def test_a_pair_is_not_torn_while_it_is_one(seed, n):
+    """Along a pencil in steps that are small enough, what is a pair in two rows stays in its two columns."""
+    A, dA = pencil(seed)
+    p = np.linspace(0.0, 0.01, n)
+    values, vectors = np.linalg.eig(A + p[:, None, None] * dA)
+    order, _ = track(p, values, vectors)
+    together = pairs(np.take_along_axis(values, order, axis=1))
+    kept = (together.sum(axis=(1, 2))[1:] == 2) & (together.sum(axis=(1, 2))[:-1] == 2)
+    np.testing.assert_array_equal(together[1:][kept], together[:-1][kept])
+
+
+def test_a_pair_that_becomes_real_and_unstable_within_a_step():
+    """x'' = (p - 0.1) x - 0.4 x' has a pair up to p = 0.06 and grows from 0.1 on; beside it one decays up to 0.07, and
+    one exactly up to a value that is given."""
+    A, dA = np.zeros((2, 4, 4))
+    A[0, 1], A[1, :2], dA[1, 0] = 1.0, (-0.1, -0.4), 1.0
+    A[2, 2], dA[2, 2], A[3, 3], dA[3, 3] = -0.7, 10.0, -0.5, 1.0
+    found, slopes = crossings_of(A, dA)
+    np.testing.assert_allclose(found.values[:3], [0.07, 0.1, 0.5], rtol=1e-12)
+    np.testing.assert_allclose(slopes[:3], [0.07, 0.1, 0.5], rtol=1e-9)
+    np.testing.assert_array_equal(found.direction[:3], 1)
+    np.testing.assert_array_equal(found.frequency[:3], 0.0)
+    assert np.isnan([*found.values[3:], *slopes[3:]]).all()
+
+
+def canonical(v):
+    """Matrices (m, 4, 4) of the benchmark bicycle: Meijaard et al. (2007), eq. (5.3)."""
+    M, C1, K0, K2 = (np.array(PUBLISHED["canonical"][name]) for name in ("M", "C1", "K0", "K2"))
+    right = [np.hstack([-9.81 * K0 - x**2 * K2, -x * C1]) for x in v]
+    return np.array([np.vstack([np.eye(4)[2:], np.linalg.solve(M, below)]) for below in right])
+
+
+def in_order(v):
+    """Eigenvalues of the benchmark by modes, and whether these are clear."""
+    A = canonical(v)
+    values, vectors = np.linalg.eig(A)
+    left = np.linalg.inv(vectors).conj().swapaxes(1, 2)
+    order, clear = _tracked((v, values, left, vectors), LATERAL, {})
+    return np.take_along_axis(values, order, axis=1), clear
+
+
+FINE = np.arange(1001) / 100  # [m/s]
+
+
+@pytest.fixture(scope="module")
+def reference():
+    values, clear = in_order(FINE)
+    assert clear.all()
+    return values
+
+
+@given(first=st.integers(0, 900), n=st.integers(1, 12), step=st.integers(1, 1000))
+@settings(max_examples=200, deadline=None, derandomize=True)
+def test_names_are_right_or_not_given(reference, first, n, step):
+    """From any speed on, in few or coarse steps, against steps of 0.01 m/s; and they are clear where steps are small,
+    or where a pair swings at a single speed."""
+    rows = np.arange(first, 1001, step)[:n]
+    values, clear = in_order(FINE[rows])
+    for name in (slice(0, 2), slice(2, 3), slice(3, 4)):
+        if clear[name].all():
+            as_set = (np.sort_complex(x[:, name]) for x in (values, reference[rows]))
+            np.testing.assert_allclose(*as_set, atol=1e-9)
+    if step <= 5 or (len(rows) == 1 and first > 70):
+        assert clear.all()
+
+
+def test_a_doubtful_name_is_not_given_and_a_warning_says_so():
+    """From 0.22 to 12 m/s in one step two real modes become the weave; which of four cannot be told."""
+    speeds = jnp.repeat(jnp.array([0.22, 12.0]), jnp.array([50, 51]), total_repeat_length=101)
+    with pytest.warns(UserWarning, match="which modes are weave, .*capsize.* is not clear: numbered instead"):
+        found = eigenvalues(BIKE, speeds)
+    assert found.modes[0] == "mode 1"
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:which modes are")
+def test_names_of_a_motorcycle_at_one_speed_and_in_coarse_steps():
+    """What is named weave, wobble or capsize is it, and no pair has two names."""
+    motorcycle = sharp_motorcycle()
+    for v in (20.0, 30.0, 40.0):
+        found = eigenvalues(motorcycle, jnp.array([v]))
+        values, names = np.asarray(found.eigenvalues[0]), np.array(found.modes)
+        for i, j in np.argwhere(pairs(values)):
+            assert names[i] == names[j] or {*names[[i, j]]} <= {f"mode {k}" for k in range(1, 9)}
+    for first in (1.0, 3.0, 5.0):
+        found = critical_speeds(motorcycle, jnp.arange(first, 50.1, 5.0))
+        np.testing.assert_allclose(found.values, [5.934966209, 10.98552992], rtol=1e-9)
+        for i, name in zip(found.mode, ("weave", "capsize"), strict=True):
+            assert found.modes[i] in (name, f"mode {i + 1}")
+    fine = critical_speeds(motorcycle, jnp.linspace(1.0, 50.0, 99))
+    assert [fine.modes[i] for i in fine.mode] == ["weave", "capsize"]
+
+
+class Inverted(jk.System):
+    """An inverted pendulum with a spring and a damper at its pin."""
+
+    mass: Scalar = parameter(positive=True)  # [kg]
+    length: Scalar = parameter(positive=True)  # [m]
+    spring: Scalar = parameter()  # [N m/rad]
+    damper: Scalar = parameter()  # [N m s/rad]
+
+    coordinates = ("angle",)
+    speeds = ("rate",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        rod = N.rotate(3, q["angle"], u["rate"])
+        return jk.Motion([jk.Body(self.mass, 0.0, O.fixed(self.length * rod.y), rod, name="ball")], frames={"rod": rod})
+
+    def loads(self, t, q, u, motion, inputs):
+        torque = -self.spring * q["angle"] - self.damper * u["rate"]
+        return jk.weight(motion, -9.81 * motion.N.y), jk.Torque(torque * motion.N.z, motion["rod"])
+
+
+@pytest.mark.slow
+def test_any_parameter_of_any_system():
+    """It stands from a spring of m g l on; d/dlength is m g."""
+    rtol = 1e-12
+
+    def softest(system):
+        upright = jk.State(jnp.zeros(1), jnp.zeros(1))
+        at = lambda system, k: (dataclasses.replace(system, spring=k), upright)  # noqa: E731
+        return critical_speeds(system, jnp.linspace(0.0, 40.0, 17), at)
+
+    system = Inverted(mass=2.0, length=0.6, spring=0.0, damper=1.0)
+
+    def value_and_found(length):
+        found = softest(dataclasses.replace(system, length=length))
+        return found.values[0], found
+
+    slope, found = jax.grad(value_and_found, has_aux=True)(0.6)
+    np.testing.assert_allclose(found.values, [2 * 9.81 * 0.6], rtol=rtol)
+    assert list(found.direction) == [-1]
+    np.testing.assert_allclose(slope, 2 * 9.81, rtol=rtol)
+    # Without a damper it never decays: nothing to find, and rounding errors are no crossings.
+    assert softest(dataclasses.replace(system, damper=0.0)).values.size == 0
+
+
+def test_what_is_missing_is_asked_for():
+    system = Inverted(mass=2.0, length=0.6, spring=20.0, damper=1.0)
+    with pytest.raises(ValueError, match=r"Inverted has no family of steady motions by default: give `motion`"):
+        eigenvalues(system, jnp.linspace(0.0, 1.0, 3))
+    with pytest.raises(ValueError, match="Give the values of the parameter"):
+        eigenvalues(BIKE)
+    found = eigenvalues(system, motion=jk.State(jnp.zeros(1), jnp.zeros(1)), modes=("fall", "recoil"))
+    np.testing.assert_allclose(found.eigenvalues.sum(), -1 / 0.72, rtol=1e-12)
+    assert found.modes == ("fall", "recoil")
+    with pytest.raises(ValueError, match="2 modes, but 1 names: fall"):
+        eigenvalues(system, motion=jk.State(jnp.zeros(1), jnp.zeros(1)), modes=("fall",))

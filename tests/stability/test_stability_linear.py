@@ -1,0 +1,296 @@
+"""Linear models about steady motions: against the literature, closed forms, and the motion itself."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+
+import jaxkane as jk
+from jaxkane import Scalar, parameter, stability
+from jaxkane.joints import Link, ball, mechanism
+from jaxkane.stability import linearize, straight_ahead
+
+BIKE = jk.catalog.WhippleBicycle.benchmark()
+PUBLISHED = json.loads((Path(__file__).parents[1] / "data" / "meijaard2007.json").read_text())["canonical"]
+LATERAL = ("roll", "steer", "roll_rate", "steer_rate")
+
+
+class RodOnPin(jk.System):
+    """A point on a rod in x and y, N.x down: x follows from y. SymPy's test_linearize_pendulum_kane_nonminimal."""
+
+    length: Scalar = parameter(positive=True)  # [m]
+    damping: Scalar = parameter(0.0)  # [N s/m]
+
+    coordinates = ("y", "x")
+    speeds = ("v",)
+    dependent_speeds = ("x_dot",)
+    dependent_coordinates = ("x",)
+    inputs = ("push",)
+
+    def configuration_constraints(self, t, q):
+        return (q["x"] ** 2 + q["y"] ** 2 - self.length**2,)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(N.vector(q["x"], q["y"], 0.0), N.vector(u["x_dot"], u["v"], 0.0))
+        return jk.Motion([jk.Body(2.0, 0.0, P, N, name="point")])
+
+    def loads(self, t, q, u, motion, inputs):
+        N = motion.N
+        return jk.weight(motion, 9.8 * N.x), jk.Force((inputs["push"] - self.damping * u["v"]) * N.y, motion["point"])
+
+
+@pytest.fixture(scope="module")
+def models():
+    """Linear models riding straight at 0 ... 10 m/s."""
+    return jax.jit(jax.vmap(lambda v: linearize(BIKE, straight_ahead(BIKE, v), states=LATERAL)))(jnp.arange(11.0))
+
+
+def test_the_bicycle_at_eleven_speeds_is_meijaards(models):
+    atol = 1e-11
+    M, C1, K0, K2 = (np.array(PUBLISHED[name]) for name in ("M", "C1", "K0", "K2"))
+    for v, A, B in zip(range(11), models.A, models.B, strict=True):
+        below = -np.linalg.solve(M, np.hstack([9.81 * K0 + v**2 * K2, v * C1]))
+        np.testing.assert_allclose(A, np.vstack([np.eye(4)[2:], below]), atol=atol)
+        np.testing.assert_allclose(B[2:, [0, 2]], np.linalg.inv(M), atol=atol)
+        np.testing.assert_allclose(B[:, 1], 0.0, atol=atol)
+
+
+def test_canonical_matrices():
+    atol = 1e-12
+    found = jax.jit(stability.canonical)(BIKE)
+    for name in ("M", "C1", "K0", "K2"):
+        np.testing.assert_allclose(getattr(found, name), PUBLISHED[name], atol=atol)
+    np.testing.assert_allclose(found.C0, 0.0, atol=atol)
+    damped = jax.jit(stability.canonical)(dataclasses.replace(BIKE, steer_damping=3))
+    np.testing.assert_allclose(damped.C0, [[0.0, 0.0], [0.0, 3.0]], atol=atol)
+
+
+def test_default_states_and_outputs_of_dependent_speeds():
+    """Without cyclic coordinates; yaw rate = (v steer + c steer_rate) cos(lam) / w to first order."""
+    atol = 1e-12
+    model = linearize(BIKE, straight_ahead(BIKE, 5.0), outputs=("yaw_rate", "steer"))
+    assert model.states == ("roll", "steer", "roll_rate", "rear_wheel_rate", "steer_rate")
+    assert model.inputs == BIKE.inputs
+    steer, rate = np.cos(float(BIKE.lam)) / float(BIKE.w) * np.array([5.0, float(BIKE.c)])
+    np.testing.assert_allclose(model.C, [[0, steer, 0, 0, rate], [0, 1, 0, 0, 0]], atol=atol)
+    np.testing.assert_allclose(model.D, 0.0, atol=atol)
+    assert repr(model).startswith("LinearModel(states: roll, steer, roll_rate")
+
+
+def test_dependent_coordinates_follow_the_constraint():
+    """Hanging: y_ddot = -(g / l) y - (d / m) y_dot + push / m; and a position that is curved, by a function."""
+    atol = 1e-14
+    rod = RodOnPin(length=0.7, damping=0.4)
+    at = stability.equilibrium(rod, {"x": 0.6})
+    A, B, _, _ = linearize(rod, at)
+    np.testing.assert_allclose(A, [[0, 1], [-9.8 / 0.7, -0.2]], atol=atol)
+    np.testing.assert_allclose(B, [[0], [0.5]], atol=atol)
+    model = linearize(rod, at, outputs={"angle": lambda t, q, u: jnp.arctan2(q["y"], q["x"])})
+    np.testing.assert_allclose(model.C, [[1 / 0.7, 0]], atol=atol)
+
+
+def test_about_a_displaced_equilibrium_against_differences():
+    """Pushed aside by 5 N; differences of the rates along the circle."""
+    atol = 1e-8
+    rod = RodOnPin(length=0.7)
+    at = stability.equilibrium(rod, {"y": 0.1, "x": 0.69}, {"push": 5.0})
+    angle = np.arctan2(5.0, 2.0 * 9.8)
+    np.testing.assert_allclose(at.q, [0.7 * np.sin(angle), 0.7 * np.cos(angle)], atol=1e-14)
+    A = linearize(rod, at).A
+
+    def rate(y):
+        q = jnp.array([y, np.sqrt(0.7**2 - y**2)])
+        return float(jk.accelerations(rod, 0.0, q, jnp.zeros(1), {"push": 5.0})[0])
+
+    y, h = float(at["y"]), 1e-5
+    np.testing.assert_allclose(A, [[0, 1], [(rate(y + h) - rate(y - h)) / (2 * h), 0]], atol=atol)
+    other = linearize(rod, at, dependent=("y",), states=("x", "v"))  # the same motion in another coordinate
+    np.testing.assert_allclose(np.linalg.eigvals(other.A), np.linalg.eigvals(A), rtol=1e-12)
+
+
+def test_linear_models_are_differentiable():
+    rtol = 1e-12
+    frequency_squared = lambda length: -linearize(rod := RodOnPin(length=length), _hanging(rod)).A[1, 0]  # noqa: E731
+    value, slope = jax.jit(jax.value_and_grad(frequency_squared))(0.7)
+    np.testing.assert_allclose([value, slope], [9.8 / 0.7, -9.8 / 0.49], rtol=rtol)
+
+
+def _hanging(rod):
+    return jk.State(jnp.stack([jnp.zeros_like(rod.length), rod.length]), jnp.zeros(1))
+
+
+def test_faults_are_named():
+    moving = jk.State(jnp.zeros(8).at[0].set(0.1), jnp.array([0.0, -10.0, 0.0]))
+    with pytest.raises(ValueError, match=r"this motion is not steady: roll_rate is accelerated by .*equilibrium or"):
+        linearize(BIKE, jk.assemble(BIKE, moving.q, moving.u))
+    assert np.isfinite(linearize(BIKE, moving, steady=False).A).all()
+    at = straight_ahead(BIKE, 5.0)
+    with pytest.raises(ValueError, match="pitch, speed cannot be a state"):
+        linearize(BIKE, at, states=("roll", "pitch", "speed"))
+    with pytest.raises(ValueError, match="no output lean; it has roll"):
+        linearize(BIKE, at, outputs=("lean",))
+    with pytest.raises(ValueError, match=r"1 configuration constraints .* but 0 are named"):
+        linearize(BIKE, at, dependent=())
+    with pytest.raises(ValueError, match="violate the configuration constraints"):
+        linearize(BIKE, jk.State(at.q.at[4].set(0.1), at.u))
+
+
+# -- control
+
+
+@pytest.fixture(scope="module")
+def at_four(models):
+    return jax.tree.map(lambda x: x[4], models)
+
+
+@pytest.mark.parametrize("y", [0.0, 1e-14])
+def test_where_constraints_do_not_determine_a_coordinate_there_is_no_linear_model(y):
+    """A ring at the height of its centre, and a wrong choice of `dependent` below it: an error, NaN under a trace."""
+    ring = RodOnPin(length=0.6)
+    model = lambda q, dependent: linearize(ring, jk.State(q, jnp.zeros(1)), dependent=dependent, steady=False)  # noqa: E731
+    for q, dependent in (([0.6, y], "x"), ([y, 0.6], "y")):
+        with pytest.raises(ValueError, match=f"do not determine {dependent} to|cannot be solved for {dependent}_dot"):
+            model(jnp.array(q), (dependent,))
+        assert np.isnan(jax.jit(lambda q: model(q, (dependent,)).A)(jnp.array(q))).all()  # noqa: B023
+
+
+def test_singular_equations_and_derivatives_are_errors():
+    """A ball joint at half a turn, where its norm does not give the last Euler parameter; a speed that is not
+    determined; an output without a slope."""
+    link = Link("a", None, ball("s", stiffness=2.0), mass=1.0, inertia=(0.5, 0.5, 0.5))
+    body = mechanism([link], gravity=(0, 0, 0))
+    half_a_turn = jk.State(jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.zeros(3))
+    with pytest.raises(ValueError, match=r"do not determine s_e4 to first order at .*others of s_e1, s_e2, s_e3, s_e4"):
+        linearize(body, half_a_turn, steady=False)
+    assert np.isfinite(linearize(body, half_a_turn, steady=False, dependent=("s_e1",), states=body.speeds).A).all()
+    ring, aside = RodOnPin(length=0.6), jk.State(jnp.array([0.6, 0.0]), jnp.zeros(1))
+    with pytest.raises(ValueError, match="RodOnPin: the constraints cannot be solved for x_dot"):
+        linearize(ring, aside, dependent=("y",), steady=False)
+    below = jk.State(jnp.array([0.0, 0.6]), jnp.zeros(1))
+    with pytest.raises(ValueError, match="the derivatives of its equations or outputs are not finite"):
+        linearize(ring, below, outputs={"distance": lambda t, q, u: jnp.sqrt(q["y"])})
+
+
+def test_names_of_a_linear_model_are_known_and_stand_once():
+    ring, below = RodOnPin(length=0.6), jk.State(jnp.array([0.0, 0.6]), jnp.zeros(1))
+    with pytest.raises(ValueError, match="`dependent` names coordinates; it has no z; it has y, x"):
+        linearize(ring, below, dependent=("z",))
+    speed = ring.speeds[0]
+    with pytest.raises(ValueError, match=f"{speed} stands twice in `states`"):
+        linearize(ring, below, states=(speed, speed))
+
+
+def test_transfer_function_and_bode_agree(at_four):
+    rtol = 1e-9
+    w = np.logspace(-1, 2, 40)
+    magnitude, phase = stability.bode(at_four, "steer_torque", "roll", w)
+    G = stability.transfer_function(at_four, "steer_torque", "roll")
+    _, response = G.freqresp(w)
+    np.testing.assert_allclose(10 ** (magnitude / 20) * np.exp(1j * np.deg2rad(phase)), response, rtol=rtol)
+    np.testing.assert_allclose(np.sort_complex(G.poles), np.sort_complex(np.linalg.eigvals(at_four.A)), rtol=1e-9)
+    with pytest.raises(ValueError, match="no input 'steer'; it has roll_torque"):
+        stability.bode(at_four, "steer", "roll", w)
+
+
+def test_lqr_balances_the_bicycle_by_steering(at_four):
+    atol = 1e-8
+    K, P, poles = stability.lqr(at_four, [1.0, 1.0, 0.1, 0.1], 0.01, inputs=("steer_torque",))
+    assert np.linalg.eigvals(at_four.A).real.max() > 0 > poles.real.max()
+    A, B = np.asarray(at_four.A), np.asarray(at_four.B)[:, [2]]
+    riccati = A.T @ P + P @ A - P @ B @ B.T @ P / 0.01 + np.diag([1.0, 1.0, 0.1, 0.1])
+    np.testing.assert_allclose(riccati / np.abs(P).max(), 0.0, atol=atol)
+    np.testing.assert_allclose(K, B.T @ P / 0.01)
+    with pytest.raises(ValueError, match=r"no regulator of roll, .* by drive_torque"):
+        stability.lqr(at_four, np.ones(4), 1.0, inputs=("drive_torque",))
+    with pytest.raises(ValueError, match=r"Q is \(4, 4\)"):
+        stability.lqr(at_four, np.ones(3), 1.0)
+    for Q, R in ((np.ones(4), 0.0), (-np.ones(4), 1.0), (np.full(4, np.nan), 1.0)):
+        with pytest.raises(ValueError, match=r"no negative eigenvalue|Q is not finite"):
+            stability.lqr(at_four, Q, R, inputs=("steer_torque",))
+
+
+def test_python_control_gets_the_names_or_is_asked_for(at_four, monkeypatch):
+    with monkeypatch.context() as without:
+        without.setitem(__import__("sys").modules, "control", None)
+        with pytest.raises(ImportError, match=r"jaxkane\[control\]"):
+            stability.to_control(at_four)
+    pytest.importorskip("control")
+    space = stability.to_control(at_four)
+    assert space.state_labels == list(LATERAL)
+    np.testing.assert_allclose(space.A, at_four.A)
+
+
+# -- a turn
+
+
+@pytest.mark.slow
+def test_linear_model_of_a_steady_turn_is_the_return_map():
+    """Deviations after 0.5 s on a hands-free turn: expm(A t) against central differences of simulated rides."""
+    atol = 1e-6
+    turn = stability.steady_turn(BIKE, {"steer": 0.3}, {"rear_wheel_rate": -12.0}, hold={"roll": 0.4})
+    model = linearize(BIKE, turn)
+    assert abs(float(turn["yaw_rate"])) > 1.0
+    ts = jnp.array([0.0, 0.5])
+    kept = [BIKE.coordinates.index("roll"), BIKE.coordinates.index("steer")]
+
+    @jax.jit
+    def after(x):
+        state = jk.assemble(BIKE, turn.q.at[np.array(kept)].add(x[:2]), turn.u + x[2:])
+        ride = jk.simulate(BIKE, state, ts, rtol=1e-12, atol=1e-12)
+        return jnp.concatenate([ride.q[-1][np.array(kept)], ride.u[-1]])
+
+    h = 1e-4
+    columns = [(after(h * e) - after(-h * e)) / (2 * h) for e in np.eye(5)]
+    exact = scipy.linalg.expm(np.asarray(model.A) * 0.5)
+    np.testing.assert_allclose(np.stack(columns, axis=1), exact, atol=atol * np.abs(exact).max())
+
+
+CASES = {
+    "a class for a system": (lambda: linearize(type(BIKE), AHEAD), TypeError, "instance of a System"),
+    "text for a motion": (lambda: linearize(BIKE, "ahead"), TypeError, "a motion is a State"),
+    "another system's steady motion": (lambda: linearize(BIKE, AT_REST), ValueError, "motion of another system"),
+    "a state named twice": (lambda: linearize(BIKE, AHEAD, states=("roll", "roll")), ValueError, "roll stands twice"),
+    "an output that is two numbers": (
+        lambda: linearize(BIKE, AHEAD, outputs={"both": lambda t, q, u: jnp.stack([q["roll"], q["steer"]])}),
+        TypeError,
+        "output 'both' must be one number",
+    ),
+    "text for a speed": (lambda: straight_ahead(BIKE, "4"), TypeError, "speed is one number"),
+    "texts for values": (
+        lambda: stability.eigenvalues(BIKE, ["4", "5"]),
+        TypeError,
+        "values of the parameter must be real",
+    ),
+    "values in two axes": (lambda: stability.eigenvalues(BIKE, np.ones((2, 2))), ValueError, "are a row"),
+    "none are kept": (lambda: stability.critical_speeds(BIKE, most=0), ValueError, "at least one; got 0"),
+    "a state for a steady motion": (lambda: stability.family(BIKE, AHEAD, towards={}), TypeError, "is a SteadyMotion"),
+    "a family of another system": (
+        lambda: stability.family(BIKE, AT_REST, towards={"roll": 1.0}),
+        ValueError,
+        "motion of another system",
+    ),
+    "text for a system": (lambda: stability.equilibrium("bicycle"), TypeError, "instance of a System"),
+    "text to be held": (
+        lambda: stability.equilibrium(BIKE, hold={"roll": "0"}),
+        TypeError,
+        "roll is to be held at a value that is no number: '0'",
+    ),
+    "no system": (lambda: stability.cyclic_coordinates(None), TypeError, "instance of a System"),
+}
+AHEAD = straight_ahead(BIKE, 4.0)
+AT_REST = stability.SteadyMotion(
+    *(jnp.zeros(n) for n in (2, 2, 0, 0)), {}, 0.0, 0.0, (("theta1", "theta2"), ("theta1_dot", "theta2_dot"), (), ())
+)
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_what_is_no_argument_is_refused_in_words(case):
+    call, error, words = CASES[case]
+    with pytest.raises(error, match=words):
+        call()

@@ -1,0 +1,88 @@
+"""A cluster's workers compute what was asked for, or say that they would not."""
+
+import logging
+import sys
+import types
+
+import cloudpickle
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane._common.files import digest
+from jaxkane._kane.checks import check_system
+from jaxkane._kane.consistency import configuration_residual
+
+distributed = pytest.importorskip("distributed")
+
+TS = np.linspace(0.0, 1.0, 3)
+STEPS = {"step": 0.5, "solver": diffrax.Midpoint()}  # exact for what falls freely
+
+WEIGHT = """
+import jaxkane as jk
+
+gravity = 9.81
+
+class Drop(jk.System):
+    mass: jk.Scalar = jk.parameter(1.0)
+    coordinates, speeds = ("x",), ("v",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(self.mass, 0.0, O.moving(q[0] * N.x, u[0] * N.x))])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, gravity * motion.N.x)
+"""
+
+
+@pytest.fixture
+def module(monkeypatch):
+    made = types.ModuleType("falling_weights")
+    monkeypatch.setitem(sys.modules, made.__name__, made)
+    exec(WEIGHT, vars(made))
+    return made
+
+
+@pytest.fixture(scope="module")
+def client():
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    options = {"processes": False, "n_workers": 1, "threads_per_worker": 1, "dashboard_address": None}
+    with distributed.LocalCluster(**options) as cluster, distributed.Client(cluster) as client:
+        yield client
+
+
+def fallen(module, client):
+    start, table = jk.State(q=[0.0], u=[0.0]), {"mass": np.linspace(1.0, 2.0, 3)}
+    return jk.sweep.sweep(module.Drop(), start, TS, table=table, client=client, **STEPS)["x"][:, -1]
+
+
+def test_a_worker_with_another_global_is_refused(module, client, monkeypatch):
+    assert cloudpickle.loads(cloudpickle.dumps(module.Drop)) is module.Drop  # travels by its name
+    np.testing.assert_allclose(fallen(module, client), 9.81 / 2, rtol=1e-7)
+    submit = client.submit
+
+    def by_another(*args, **kwargs):  # the worker reads the module only now
+        module.gravity = 1.62
+        return submit(*args, **kwargs)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(client, "submit", by_another)
+        with pytest.raises(RuntimeError, match=r"another program .* changed after the import"):
+            fallen(module, client)
+    np.testing.assert_allclose(fallen(module, client), 1.62 / 2, rtol=1e-7)  # now both have it
+
+
+def test_a_program_is_the_same_wherever_it_was_traced_first(module):
+    t = jnp.zeros(())
+
+    def program():
+        return digest(jax.make_jaxpr(lambda q: configuration_residual(module.Drop(), t, q))(np.zeros(1)))
+
+    check_system(module.Drop(), t, jnp.zeros(1))
+    in_a_check = program()
+    module.Drop.note = "what a program knows of a class is read again"
+    assert program() == in_a_check

@@ -1,0 +1,366 @@
+"""Folders of sweeps: known again by what was computed, and sound after whatever has happened to their files."""
+
+import contextlib
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+import threading
+import warnings
+from pathlib import Path
+from typing import Any
+
+import diffrax
+import jax
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane._common.files import digest, write_whole
+from jaxkane.sweep._chunks import digest_of
+from jaxkane.sweep._files import Folder
+
+TS = np.linspace(0.0, 0.2, 3)
+REST = jk.State(np.zeros(1), np.zeros(1))
+TABLE = {"mass": np.linspace(1.0, 2.0, 70)}  # three chunks
+OPTIONS = {"table": TABLE, "chunk": 32, "step": 0.1, "solver": diffrax.Midpoint()}
+GRAVITY = 9.81
+
+
+class Drop(jk.System):
+    """A particle whose acceleration is read in several ways."""
+
+    mass: jk.Scalar = jk.parameter(2.0)
+    coordinates, speeds, inputs = ("x",), ("v",), ("push",)
+    numbers = {"one": [1.0]}
+    array = np.ones(2)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(self.mass, 0.0, O.moving(q[0] * N.x, u[0] * N.x))])
+
+    def loads(self, t, q, u, motion, inputs):
+        gravity = (lambda: (lambda: GRAVITY)())() * self.numbers["one"][0] * self.array[0]
+        return [jk.Force(self.mass * (gravity + inputs["push"]) * motion.N.x, motion.bodies[0])]
+
+
+def run(folder=None, **options):
+    return jk.sweep.sweep(Drop(), REST, TS, folder=folder, **{**OPTIONS, **options})
+
+
+@pytest.fixture(scope="module")
+def rides():
+    return run()
+
+
+@pytest.fixture(scope="module")
+def finished(rides, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("finished") / "sweep"
+    np.testing.assert_array_equal(run(folder).q, rides.q)
+    return folder
+
+
+@pytest.fixture
+def copy(finished, tmp_path):
+    for path in finished.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    return tmp_path
+
+
+def contents(folder):
+    return {path.name: path.read_bytes() for path in sorted(Path(folder).iterdir())}
+
+
+CHANGES = {
+    "a global in a nested lambda": lambda m: m.setattr(sys.modules[__name__], "GRAVITY", 1.62),
+    "a dict on a class": lambda m: m.setitem(Drop.numbers, "one", [2.0]),
+    "an array on a class": lambda m: m.setattr(Drop, "array", np.array([2.0, 1.0])),
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_numbers_that_the_description_reads_belong_to_the_sweep(name, copy, monkeypatch, rides):
+    CHANGES[name](monkeypatch)
+    with pytest.raises(ValueError, match=r"holds another sweep. It differs in program \("):
+        run(copy)
+    monkeypatch.undo()
+    np.testing.assert_array_equal(run(copy).q, rides.q)
+
+
+def test_numbers_that_inputs_and_reduce_read_belong_to_the_sweep(tmp_path):
+    held = {"push": np.array([1.0]), "scale": [1.0]}
+    inputs = {"push": lambda t, state: held["push"][0]}
+    reduce = lambda ride: held["scale"][0] * ride["x"][-1]  # noqa: E731
+    first = run(tmp_path, inputs=inputs, reduce=reduce).values
+    for name, change in (("push", np.array([2.0])), ("scale", [3.0])):
+        was, held[name] = held[name], change
+        with pytest.raises(ValueError, match="It differs in program"):
+            run(tmp_path, inputs=inputs, reduce=reduce)
+        held[name] = was
+    held["other"] = 1.0  # that nobody reads
+    np.testing.assert_array_equal(run(tmp_path, inputs=inputs, reduce=reduce).values, first)
+
+
+def test_numbers_in_the_closure_of_a_callback_belong_to_the_sweep(tmp_path):
+    """A function that the program calls back is part of it, with all that it reads."""
+
+    def inputs(push):
+        called = lambda t: np.asarray(push + 0.0 * t)  # noqa: E731
+        like = jax.ShapeDtypeStruct((), float)
+        return {"push": lambda t, state: jax.pure_callback(called, like, t, vmap_method="expand_dims")}
+
+    few = {"table": {"mass": [1.0, 2.0]}}
+    first = run(tmp_path, inputs=inputs(1.0), **few)
+    np.testing.assert_array_equal(run(tmp_path, inputs=inputs(1.0), **few).q, first.q)
+    with pytest.raises(ValueError, match="It differs in program"):
+        run(tmp_path, inputs=inputs(2.0), **few)
+
+
+@pytest.mark.slow
+def test_a_digest_outlives_the_process_and_tells_programs_apart():
+    code = """
+import jax, jax.numpy as jnp, numpy as np, dataclasses, jaxkane as jk
+from jaxkane._common.digest import digest
+jax.config.update("jax_enable_x64", True)
+
+class Bead(jk.System):  # on a ring, pushed
+    mass: jk.Scalar = jk.parameter(1.0)
+    coordinates, speeds, inputs = ("x", "y"), ("rate",), ("push",)
+    dependent_coordinates = ("y",)
+    def q_dot(self, t, q, u):
+        return -q[1] * u[0], q[0] * u[0]
+    def configuration_constraints(self, t, q):
+        return [q[0] * q[0] + q[1] * q[1] - 1.0]
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(q[0] * N.x + q[1] * N.y, -q[1] * u[0] * N.x + q[0] * u[0] * N.y)
+        return jk.Motion([jk.Body(self.mass, 0.0, P)])
+    def loads(self, t, q, u, motion, inputs):
+        return [jk.Force(inputs["push"] * motion.N.x, motion.bodies[0])]
+    def events(self, t, q, u):
+        return {b: q[0] - 2.0 for b in {"left", "right"}}
+
+from jaxkane.sweep._fingerprint import traced
+from jaxkane.sweep._members import members_of
+from jaxkane.sweep._solve import Job
+from jaxkane.sweep._table import as_table
+from jaxkane._integrate.settings import settings_for, checked_times
+ts = checked_times(np.linspace(0.0, 1.0, 3), float)
+def found(k):
+    start, push = jk.State(np.array([0.0, 1.0]), np.ones(1)), {"push": lambda t, s: k * s["x"]}
+    members, shared, n = members_of(Bead(), start, push, as_table({"x": np.array([0.1, 0.2])}), ts)
+    own = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), members)
+    return traced(Job(shared, ts, settings_for(ts, step=0.1), None, None), own)[0]
+first = found(1.0), digest({"a": np.ones(2), "b": {"c", "d", "e"}})
+"""
+    here: dict[str, Any] = {}
+    exec(code, here)
+    assert here["first"][0] == here["found"](1.0) != here["found"](2.0)
+    env = {**os.environ, "PYTHONHASHSEED": "1"}
+    script = [sys.executable, "-c", code + "print(first)"]
+    run = subprocess.run(script, env=env, capture_output=True, text=True, timeout=300, check=True)
+    assert run.stdout.strip() == str(here["first"])
+
+
+def callback_of(k):
+    called = lambda x: x * k if k in {"one", "two", 1.0, 2.0} else x  # noqa: E731
+    return lambda x: jax.pure_callback(called, jax.ShapeDtypeStruct((), float), x)
+
+
+def root_of(k):
+    return lambda x: jax.lax.custom_root(lambda y: y - k * x, x, lambda f, x: x * k, lambda f, y: y)
+
+
+@pytest.mark.parametrize("made", [callback_of, root_of])
+def test_digests_of_programs_that_stand_within_an_operation(made):
+    program = lambda k: digest_of(jax.make_jaxpr(made(k))(1.0))  # noqa: E731
+    assert program(1.0) == program(1.0) != program(2.0)
+
+
+def test_digests_of_programs():
+    a = jax.make_jaxpr(lambda x, y: x * y + 1.0)(1.0, 2.0)
+    same = jax.make_jaxpr(lambda other, name: other * name + 1.0)(3.0, 4.0)
+    others = [lambda x, y: x * y + 2.0, lambda x, y: y * x + 1.0, lambda x, y: x + y + 1.0, lambda x, y: (x * y, 1.0)]
+    programs = [a, *(jax.make_jaxpr(f)(1.0, 2.0) for f in others), jax.make_jaxpr(lambda x, y: x * y + 1.0)(1.0, 2)]
+    assert digest(a) == digest(same)
+    assert len({digest(p) for p in programs}) == len(programs)
+    inner = jax.jit(lambda x: x * np.arange(3.0))
+    constants = [jax.make_jaxpr(lambda x, k=k: inner(x) + np.full(3, k))(1.0) for k in (1.0, 2.0)]
+    assert digest(constants[0]) != digest(constants[1])
+
+
+@pytest.mark.parametrize("name", ["sweep.json.4711.tmp", "chunk-00000000.npz.4711-ab.tmp"])
+def test_what_a_killed_writer_left_behind_blocks_nothing(name, tmp_path, rides):
+    (tmp_path / name).write_bytes(b"{")
+    np.testing.assert_array_equal(run(tmp_path).q, rides.q)
+    assert not list(tmp_path.glob("*.tmp"))
+
+
+@pytest.mark.parametrize(
+    ("bytes_", "message"),
+    [
+        (b"", r"sweep\.json cannot be read \(.*damaged.*Choose another folder, or delete"),
+        (bytes(100), r"sweep\.json cannot be read"),
+        (b"\xff\xfe\x00", r"sweep\.json cannot be read"),
+        (b'{"system": {"cl', r"sweep\.json cannot be read"),
+        (b"[1, 2]", r"sweep\.json is no manifest of a sweep"),
+        (b'{"name": "vacuum"}', r"sweep\.json is no manifest of a sweep"),
+        (b'{"system": {}, "times": "", "layout": {}}', r"an earlier version of jaxkane"),
+    ],
+)
+def test_manifests_that_cannot_be_read_are_named(bytes_, message, copy):
+    (copy / "sweep.json").write_bytes(bytes_)
+    before = contents(copy)
+    with pytest.raises(ValueError, match=message):
+        run(copy)
+    assert contents(copy) == before
+
+
+def damaged(data, how):
+    if how == "swapped bytes":
+        middle = len(data) // 2
+        return data[:middle] + bytes(x ^ 255 for x in data[middle : middle + 64]) + data[middle + 64 :]
+    return {"empty": b"", "zeros": bytes(len(data)), "cut": data[:-30], "text": b"thesis"}[how]
+
+
+def test_a_folder_is_known_again_whatever_the_order_of_the_columns(tmp_path):
+    columns = {"mass": [1.0, 2.0], "x": [0.1, 0.2]}
+    first = run(tmp_path / "sweep", table=columns)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        again = run(tmp_path / "sweep", table=dict(reversed(columns.items())))
+    np.testing.assert_array_equal(again.q, first.q)
+
+
+def test_damaged_chunks_are_computed_again_with_one_warning(copy, finished, rides):
+    files = sorted(copy.glob("chunk-*.npz"))
+    for hows in (("empty", "zeros", "cut"), ("text", "swapped bytes", "foreign")):
+        for path, how in zip(files, hows, strict=True):
+            if how == "foreign":
+                np.savez(path, a=[1.0])
+            else:
+                path.write_bytes(damaged(path.read_bytes(), how))
+        with pytest.warns(UserWarning, match="3 chunks cannot be read and are computed again: chunk-00000000") as seen:
+            np.testing.assert_array_equal(run(copy).q, rides.q)
+        assert len(seen) == 1
+        assert contents(copy) == contents(finished)
+
+
+def test_a_chunk_of_other_shapes_is_not_taken(copy, rides):
+    first, _, last = sorted(copy.glob("chunk-*.npz"))
+    last.write_bytes(first.read_bytes())  # 32 members where 6 belong
+    with pytest.warns(UserWarning, match="1 chunks cannot be read"):
+        np.testing.assert_array_equal(run(copy).q, rides.q)
+
+
+def test_chunks_that_changed_places_are_computed_again(copy, finished, rides):
+    first, second, _ = sorted(copy.glob("chunk-*.npz"))
+    whole = first.read_bytes()
+    first.write_bytes(second.read_bytes())
+    second.write_bytes(whole)
+    with pytest.warns(UserWarning, match=r"2 chunks cannot be read .*it belongs elsewhere"):
+        np.testing.assert_array_equal(run(copy).q, rides.q)
+    assert contents(copy) == contents(finished)
+
+
+def test_a_file_in_the_place_of_the_folder(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ValueError, match="file is a file: `folder` is the name of a folder"):
+        run(tmp_path / "file")
+
+
+def manifest(name):
+    return {"system": {"class": name}, "times": "", "layout": {}, "program": name}
+
+
+def test_of_two_sweeps_that_begin_at_once_one_is_refused(tmp_path):
+    for i in range(20):
+        start, opened, refused = threading.Barrier(4), [], []
+
+        def begin(name, path, start=start, opened=opened, refused=refused):
+            start.wait()
+            try:
+                opened.append(Folder(path, manifest(name)).path)
+            except ValueError as error:
+                refused.append(str(error))
+
+        threads = [threading.Thread(target=begin, args=(name, tmp_path / str(i))) for name in "aabb"]
+        [t.start() for t in threads]
+        [t.join() for t in threads]
+        assert (len(opened), len(refused)) == (2, 2)
+        assert all("holds another sweep" in text for text in refused)
+        assert json.loads((tmp_path / str(i) / "sweep.json").read_text())["program"] in "ab"
+        assert [path.name for path in (tmp_path / str(i)).iterdir()] == ["sweep.json"]
+
+
+def test_the_same_sweep_twice_at_once_gives_the_same_bytes(tmp_path, finished, rides):
+    found = []
+    threads = [threading.Thread(target=lambda: found.append(run(tmp_path).q)) for _ in range(2)]
+    [t.start() for t in threads]
+    [t.join() for t in threads]
+    assert len(found) == 2
+    for q in found:
+        np.testing.assert_array_equal(q, rides.q)
+    assert contents(tmp_path) == contents(finished)
+
+
+def test_a_chunk_is_not_missed_when_another_process_has_tidied_up(copy, monkeypatch):
+    folder = Folder(copy, json.loads((copy / "sweep.json").read_text()))
+    put, before = os.replace, contents(copy)
+
+    def tidied(scratch, path):
+        folder.tidy()
+        put(scratch, path)
+
+    monkeypatch.setattr(os, "replace", tidied)
+    folder.write(0, {"x": np.ones(1)})
+    assert contents(copy) == before
+    folder.file(0).unlink()
+    with pytest.raises(FileNotFoundError):
+        folder.write(0, {"x": np.ones(1)})
+
+
+def test_files_are_whole_or_not_there(tmp_path):
+    path = tmp_path / "file"
+
+    def broken(file):
+        file.write(b"half")
+        raise KeyboardInterrupt
+
+    for before in ([], ["file"]):
+        with contextlib.suppress(KeyboardInterrupt):
+            write_whole(path, broken)
+        assert [p.name for p in tmp_path.iterdir()] == before
+        assert write_whole(path, lambda file: file.write(b"whole"), replace=bool(before))
+        assert not write_whole(path, lambda file: file.write(b"other"), replace=False)
+        assert path.read_bytes() == b"whole"
+
+
+def test_batches_of_none_and_of_one():
+    for table, shape in (({"mass": []}, (0,)), (jk.sweep.grid(mass=[], x=[0.1, 0.2]), (0, 2))):
+        none = run(table=table)
+        assert none["x"].shape == (*shape, 3)
+        assert none.status.shape == none["mass"].shape == shape
+        assert none.reason == []
+        assert run(table=table, reduce=lambda ride: {"end": ride["x"][-1]})["end"].shape == shape
+    none = jk.sweep.sweep(Drop(mass=np.zeros(0)), REST, TS, step=0.1)
+    assert none.q.shape == (0, 3, 1)
+    one = run(table={"mass": [1.5]})
+    np.testing.assert_allclose(one["x"], [0.5 * GRAVITY * TS**2], rtol=1e-7)
+
+
+def test_what_is_given_twice_is_refused():
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame([[1.0, 2.0]], columns=["mass", "mass"])
+    with pytest.raises(ValueError, match="more than one column of the name mass"):
+        run(table=frame)
+    with pytest.raises(ValueError, match="more than one column of the name 1"):
+        run(table={"1": [1.0], 1: [2.0]})
+    for table in ({"mass": [1.0, 2.0]}, jk.sweep.grid(mass=[1.0, 2.0])):
+        with pytest.raises(ValueError, match=r"given twice: mass \(a column of the table, and in a batch of Drop\)"):
+            jk.sweep.sweep(dataclasses.replace(Drop(), mass=np.ones(2)), REST, TS, table=table)
+        with pytest.raises(ValueError, match=r"given twice: push \(a column of the table, and in `inputs`\)"):
+            jk.sweep.sweep(Drop(), REST, TS, {"push": 1.0}, table={**dict(mass=[1.0, 2.0]), "push": [0.0, 1.0]})
+    with pytest.raises(ValueError, match="`chunk` is a number of members"):
+        run(chunk=0)

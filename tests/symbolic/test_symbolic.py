@@ -1,0 +1,300 @@
+"""Equations as formulas: what the library computes, what the book prints, and what stays small."""
+
+import sys
+import types
+
+import numpy as np
+import pytest
+from test_export import Bob, Odd, case
+
+import jaxkane as jk
+from jaxkane.catalog import CATALOG
+
+sp = pytest.importorskip("sympy")
+import test_book  # noqa: E402
+
+from jaxkane.symbolic._sympy import exact, name_in_latex  # noqa: E402
+
+pytestmark = pytest.mark.filterwarnings("ignore:.*its description uses")
+
+
+def assert_close(found, expected, rtol):
+    expected = np.asarray(expected)
+    found = np.asarray(found, float).reshape(expected.shape)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=rtol * np.abs(expected).max(initial=1e-3))
+
+
+def numbers_of(system):
+    return [x for array in jk.export.parameters(system).values() for x in array.ravel()]
+
+
+FAST = ["DoublePendulum", "SpinningTop", "Bob", "Odd"]
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in CATALOG if name not in FAST]
+
+
+@pytest.mark.parametrize("name", [*FAST, *SLOW])
+def test_formulas_give_the_numbers_of_the_library(name):
+    """At three random states about the case's own, off the constraints too: formulas know of all coordinates."""
+    rtol = 1e-13
+    system, t, q, u, w = case(name)
+    found = jk.symbolic.equations(system)
+    matrices = [found.M, found.f, found.q_dot, *found.V, *found.W, found.configuration_constraints]
+    if system.dependent_speeds:
+        matrices += [found.J, found.J_dot, sp.Matrix(found.u_dep), found.velocity_constraints]
+    of_numbers = sp.lambdify(found.arguments, matrices, cse=found.cse)
+    rng = np.random.default_rng(0)
+    for _ in range(3):
+        q, u, w = (x + rng.uniform(-0.1, 0.1, x.shape) for x in (q, u, w))
+        if "e4" in system.coordinates:  # Euler parameters, which turn frames, come last
+            q = np.concatenate([q[:-4], q[-4:] / np.linalg.norm(q[-4:])])
+        M, f, q_dot, *rest = of_numbers(t, *q, *u, *w, *numbers_of(system))
+        now = (system, t, q, u)
+        inputs = dict(zip(system.inputs, w, strict=True))
+        expected = jk.equations_of_motion(*now, inputs)
+        assert_close(M, expected[0], rtol)
+        assert_close(f, expected[1], rtol)
+        assert_close(q_dot, jk.coordinate_rates(*now), rtol)
+        b = len(found.V)
+        V, W = jk.partial_velocities(*now, inputs)
+        assert_close(np.array(rest[: 2 * b], float).reshape(2, *V.shape), [V, W], rtol)
+        h = np.asarray(system.configuration_constraints(t, [*q]), float)
+        assert_close(rest[2 * b], h, 1e-12)
+        if system.dependent_speeds:
+            J, J_dot, u_dep, c = rest[2 * b + 1 :]
+            assert_close(J, jk.constraint_jacobian(system, t, q), rtol)
+            assert_close(J_dot, jk.constraint_jacobian_rate(*now), rtol)
+            assert_close(u_dep, jk.dependent_speeds(*now), rtol)
+            np.testing.assert_allclose(np.ravel(c), 0.0, atol=1e-12)
+
+
+# The book prints these: `tests/catalog/test_book.py` holds them as functions of numbers, which symbols can stand for.
+
+PRINTED = ["DoublePendulum", "RotatingFrameAndBar", "SpinningTop"]
+LONG = ["SpatialDoublePendulum"]  # on which `simplify` takes minutes; `test_book` compares its numbers
+MORE = [pytest.param(name, marks=pytest.mark.slow) for name in test_book.PRINTED if name not in PRINTED + LONG]
+
+
+def elementwise(f):
+    return lambda x: np.vectorize(f, otypes=[object])(x) if isinstance(x, np.ndarray) else f(x)
+
+
+def with_rationals(x):
+    """Numbers that Python divided, as the fractions that they were."""
+    x = sp.sympify(x)
+    return x.xreplace({number: exact(float(number), "float64") for number in x.atoms(sp.Float)})
+
+
+@pytest.mark.parametrize("name", [*PRINTED, *MORE])
+def test_what_the_book_prints(name):
+    system = CATALOG[name].example()
+    found = jk.symbolic.equations(system)
+    symbols = found.symbols
+    of_symbols = {"cos": elementwise(sp.cos), "sin": elementwise(sp.sin), "np": np}
+    in_book = {k: v for k, v in vars(test_book).items() if isinstance(v, types.FunctionType)}
+    for key in ("matrix_313", test_book.PRINTED[name].__name__, "factors"):
+        f = test_book.ROW_FACTORS.get(name) if key == "factors" else in_book[key]
+        if f:
+            of_symbols[key] = types.FunctionType(f.__code__, of_symbols)
+    p = {key: symbols[key] for key in vars(system)}
+    rates = sp.symbols([f"{s.name}_dot" for s in found.u], real=True)
+    inputs = {key: symbols[key] for key in system.inputs}
+    q, u, a = (np.array(x, dtype=object) for x in (found.q, found.u, rates))
+    printed = of_symbols[test_book.PRINTED[name].__name__](p, found.t, q, u, a, inputs)
+    factors = of_symbols["factors"](p, q) if name in test_book.ROW_FACTORS else [1] * len(u)
+    ours = found.M * sp.Matrix(rates) - found.f
+    for left, row, factor in zip(printed, ours, factors, strict=True):
+        difference = sp.expand(with_rationals(left) - factor * row)
+        assert sp.simplify(difference) == 0, f"{name}: {sp.simplify(difference)}"
+
+
+def test_simplified_formulas_are_those_of_the_book():
+    m, l = (jk.symbolic.equations(CATALOG["DoublePendulum"].example()).symbols[name] for name in ("mass", "length"))
+    found = jk.symbolic.equations(CATALOG["DoublePendulum"].example()).simplified()
+    th1, th2 = found.q
+    half = m * l**2 * sp.cos(th1 - th2) / 2
+    assert found.M == sp.ImmutableMatrix([[4 * m * l**2 / 3, half], [half, m * l**2 / 3]])
+    assert str(found) == "Equations of DoublePendulum: M (2, 2), f (2, 1); 106 operations"
+    latex = found._repr_latex_()
+    assert r"\frac{4 \mathit{length}^{2} \mathit{mass}}{3}" in latex
+    assert r"\left[\begin{matrix}\ddot{\theta}_{1}\\\ddot{\theta}_{2}\end{matrix}\right]" in latex
+    assert latex.startswith(r"$\displaystyle \begin{aligned}")
+
+
+def test_names_in_latex():
+    names = {"theta1": r"\theta_{1}", "theta1_dot": r"\dot{\theta}_{1}", "mB": "m_{B}", "I33": "I_{33}", "x": "x"}
+    names |= {
+        "IBxx": r"\mathit{IBxx}",
+        "engine_mass": r"\mathit{engine\_mass}",
+        "links[2].mass": r"\mathit{links[2].mass}",
+    }
+    assert {name: name_in_latex(name) for name in names} == names
+    assert name_in_latex("omega2", 1) == r"\dot{\omega}_{2}"
+    assert name_in_latex("roll_rate", 1) == r"\dot{\mathit{roll\_rate}}"
+
+
+def test_numbers_are_exact_where_a_small_fraction_rounds_to_them():
+    whole = {
+        0.5: "1/2",
+        1 / 12: "1/12",
+        -2.0: "-2",
+        9.81: "981/100",
+        0.1 + 0.2: "0.30000000000000004",
+        1e-7: "1/10000000",
+    }
+    whole |= {np.pi: "pi", np.pi / 180: "pi/180", np.inf: "oo", -np.inf: "-oo", np.nan: "nan"}
+    for value, said in whole.items():
+        assert str(exact(value, "float64")) == said
+    assert exact(True, "bool") is sp.true
+    for value in np.random.default_rng(0).normal(size=20):
+        assert float(exact(value, "float64")) == value
+
+
+def test_a_parameter_that_is_called_like_a_coordinate_is_another_symbol():
+    found = jk.symbolic.equations(Odd())
+    assert found.symbols["angle"] in found.q
+    assert found.symbols["angle_"] in found.parameters
+    assert len({*found.arguments}) == len(found.arguments)
+    assert found.symbols["register"].is_positive
+    assert found.symbols["θ0"].is_positive is None
+    assert {s.name for s in found.parameters} >= {"moments[0]", "moments[2]", "part.mass"}
+    taken = {s.name for s in found.arguments}
+    named = [s.name for s, _ in jk.symbolic.equations(Odd(), whole=False).replacements]
+    assert named
+    assert not taken & {*named}, "x0 is a coordinate"
+
+
+def test_functions_of_time_are_differentiated_by_it():
+    found = jk.symbolic.equations(CATALOG["SliderWithPinnedBar"].example(), of_time=True)
+    x, theta = found.q
+    assert str(x.diff(found.t)) == "Derivative(x(t), t)"
+    assert found.M[0, 1].diff(found.t).has(theta.diff(found.t))
+    assert r"\dot{x}" in found._repr_latex_()
+
+
+def test_dependent_speeds_stand_by_their_names_and_are_replaced_first():
+    found = jk.symbolic.equations(Bob())
+    ((vy, formula),) = found.replacements
+    x, y = found.q
+    assert sp.simplify(formula + x * found.u[0] / y) == 0
+    assert found.u_dep == (vy,)
+    assert found.q_dot == sp.ImmutableMatrix([found.u[0], vy])
+    assert found.velocity_constraints == sp.ImmutableMatrix([2 * x * found.u[0] + 2 * y * vy])
+    assert sp.simplify(found.J[0] + x / y) == 0
+    simple = found.simplified()
+    # d/dt (-x / y) = -vx / y + x vy / y^2
+    assert sp.simplify(simple.J_dot[0] - (x * vy - y * found.u[0]) / y**2) == 0
+    assert found.operations["J"] <= 5 < found.operations["all"]
+
+
+def test_a_large_system_never_becomes_a_tree():
+    """The bicycle's tree has more operations than could be counted one by one; its replacements no more than nodes."""
+    bicycle = CATALOG["WhippleBicycle"].example()
+    found = jk.symbolic.equations(bicycle)
+    assert not found.is_whole
+    assert [s.name for s, _ in found.replacements if s in found.u_dep] == [
+        *sorted(bicycle.dependent_speeds, key=[s.name for s, _ in found.replacements].index)
+    ]
+    written = sum(sp.count_ops(x) for _, x in found.replacements) + sum(map(sp.count_ops, (*found.M, *found.f)))
+    assert written < 2 * found.operations["all"] < 8000
+    known = {*found.arguments}
+    for symbol, x in found.replacements:
+        assert x.free_symbols <= known
+        known.add(symbol)
+    with pytest.raises(ValueError, match=r"too many for sympy\.simplify"):
+        found.simplified()
+    assert len(found._repr_latex_()) < 200
+
+
+# Linear models
+
+
+def test_the_linear_model_of_a_pendulum_is_that_of_the_book():
+    model = jk.symbolic.linearize(CATALOG["DoublePendulum"].example(), {"theta1": 0.0}).simplified()
+    g, l = model.symbols["gravity"], model.symbols["length"]
+    assert model.states == ("theta1", "theta2", "theta1_dot", "theta2_dot")
+    assert model.A[2:, :2] == sp.ImmutableMatrix([[-18, 9], [27, -24]]) * g / (7 * l)
+    m = model.symbols["mass"]
+    # M^-1 (M1 - M2, M2) with M = m l^2 [[4/3, 1/2], [1/2, 1/3]]
+    assert model.B[2:, :] == sp.ImmutableMatrix([[12, -30], [-18, 66]]) / (7 * m * l**2)
+    assert r"\ddot{\theta}_{1}" in model._repr_latex_()
+
+
+def at_numbers(model, system, **more):
+    values = {model.symbols[name]: x for name, x in jk.export.parameters(system).items()}
+    values |= {sp.Symbol(name, real=True): x for name, x in more.items()}
+    f = sp.lambdify([*values], [model.A, model.B], cse=model.cse)
+    return [np.asarray(x, float) for x in f(*values.values())]
+
+
+def test_linear_models_on_constraints_are_those_of_stability():
+    rtol = 1e-12
+    bob = Bob()
+    model = jk.symbolic.linearize(bob, {"y": "-length"}, states=("x", "vx"))
+    exact_model = jk.stability.linearize(bob, jk.assemble(bob, {"x": 0.0, "y": -1.0}), states=("x", "vx"))
+    A, _ = at_numbers(model, bob)
+    assert_close(A, exact_model.A, rtol)
+    assert str(sp.simplify(model.A[1, 0])) == "-981/(100*length)"
+
+
+@pytest.mark.slow
+def test_the_linear_model_of_the_bicycle_in_its_speed():
+    rtol = 1e-12
+    bicycle = CATALOG["WhippleBicycle"].example()
+    model = jk.symbolic.linearize(bicycle, {"rear_wheel_rate": "-v/rR"})
+    assert model.operations < 1000
+    assert not model.A.has(sp.Piecewise, sp.nan)
+    state = jk.assemble(bicycle, {}, {"rear_wheel_rate": -4.6 / bicycle.rR})
+    expected = jk.stability.linearize(bicycle, state)
+    assert model.states == expected.states
+    A, B = at_numbers(model, bicycle, v=4.6)
+    assert_close(A, expected.A, rtol)
+    assert_close(B, expected.B, rtol)
+    with pytest.raises(ValueError, match=r"too many for sympy\.simplify"):
+        model.simplified()
+
+
+def test_what_is_no_linear_model_is_refused():
+    pendulum = CATALOG["DoublePendulum"].example()
+    with pytest.raises(ValueError, match=r"not steady: theta1_dot is accelerated by .*steady=False"):
+        jk.symbolic.linearize(pendulum, {"theta1": 1})
+    jk.symbolic.linearize(pendulum, {"theta1": 1}, steady=False)
+    with pytest.raises(ValueError, match=r"not steady: configuration constraint 0 is violated by 1\.25"):
+        jk.symbolic.linearize(Bob(), {"y": 1.5})
+    with pytest.raises(ValueError, match="divided by zero"):
+        jk.symbolic.linearize(CATALOG["LightShaftAndBar"].example())
+    with pytest.raises(ValueError, match="has no theta3; did you mean"):
+        jk.symbolic.linearize(pendulum, {"theta3": 1})
+    with pytest.raises(ValueError, match="at` says theta2 = theta1, but theta1 has a value of its own"):
+        jk.symbolic.linearize(pendulum, {"theta2": "theta1"})
+    for strange in ("1 +", "f(", "theta1 > 1", "I*v", None, [1], float("nan"), float("inf"), "1/0"):
+        with pytest.raises(ValueError, match=r"DoublePendulum: `at` says theta2 = .* neither a finite number nor"):
+            jk.symbolic.linearize(pendulum, {"theta2": strange})
+    with pytest.raises(ValueError, match="no state can be mass"):
+        jk.symbolic.linearize(pendulum, states=("mass",))
+    with pytest.raises(ValueError, match=r"1 configuration constraints .* 0 are named"):
+        jk.symbolic.linearize(Bob(), {"y": -1}, dependent=())
+
+
+def test_what_came_from_sympy_goes_back():
+    """A model of `sympy.physics.mechanics`, made a system, has SymPy's own mass matrix and right side again."""
+    me = pytest.importorskip("sympy.physics.mechanics")
+    q, u = me.dynamicsymbols("q u")
+    m, l, g = sp.symbols("m l g")
+    N, O = me.ReferenceFrame("N"), me.Point("O")
+    O.set_vel(N, 0)
+    A = N.orientnew("A", "Axis", [q, N.z])
+    A.set_ang_vel(N, u * N.z)
+    P = O.locatenew("P", -l * A.y)
+    P.v2pt_theory(O, N, A)
+    kane = me.KanesMethod(N, [q], [u], kd_eqs=[q.diff() - u])
+    kane.kanes_equations([me.Particle("P", P, m)], [(P, -m * g * N.y)])
+    found = jk.symbolic.equations(jk.convert.from_sympy(kane, {m: 1.0, l: 0.5, g: 9.81})).simplified()
+    back = {found.symbols[x.name]: x for x in (m, l, g)} | dict(zip((*found.q, *found.u), (q, u), strict=True))
+    assert sp.simplify(found.M.xreplace(back) - kane.mass_matrix).is_zero_matrix
+    assert sp.simplify(found.f.xreplace(back) - kane.forcing).is_zero_matrix
+
+
+def test_sympy_is_asked_for_by_name(monkeypatch):
+    monkeypatch.setitem(sys.modules, "sympy", None)
+    with pytest.raises(ImportError, match=r'pip install "jaxkane\[symbolic\]"'):
+        jk.symbolic.equations(Bob())

@@ -1,0 +1,276 @@
+"""What makes a description pleasant to write: defaults, fields, named values, inertia about any point."""
+
+import re
+from pathlib import Path
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import matplotlib
+
+matplotlib.use("Agg")
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import jaxkane as jk
+from jaxkane._system.system import Values, units_of
+
+
+class Beads(jk.System):
+    """Beads on a line, in any number."""
+
+    masses: jax.Array = jk.parameter([1.0, 2.0, 3.0], positive=True)  # [kg]
+    matrix: jax.Array = jk.parameter(np.eye(2))
+    gains: jax.Array = jk.parameter(jnp.array([1, 2]))
+    links: int = eqx.field(static=True, default=3)
+
+    @property
+    def coordinates(self):
+        return tuple(f"x{i}" for i in range(self.links))
+
+    @property
+    def speeds(self):
+        return tuple(f"v{i}" for i in range(self.links))
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion(
+            [jk.Body(self.masses[i], 0.0, O.moving(q[i] * N.x, u[i] * N.x), name=f"{i}") for i in range(self.links)]
+        )
+
+
+def test_parameters_have_arrays_and_lists_as_defaults():
+    beads = Beads()
+    assert beads.masses.shape == (3,)
+    assert beads.gains.dtype == jnp.float64
+    np.testing.assert_array_equal(jk.mass_matrix(beads, 0.0, [0.0] * 3, [0.0] * 3), np.diag([1.0, 2.0, 3.0]))
+    with pytest.raises(ValueError, match=r"Beads\.masses must have the shape \(3,\)"):
+        Beads(masses=[1.0, 2.0])
+    with pytest.raises(ValueError, match=r"masses = .* must be positive"):
+        Beads(masses=[1.0, -2.0, 1.0])
+    default = [1.0, 2.0]
+    Changed = type("Changed", (jk.System,), {"__annotations__": {"x": jax.Array}, "x": jk.parameter(default)})
+    default[0] = 5.0
+    np.testing.assert_array_equal(Changed().x, [1.0, 2.0])
+
+
+@pytest.mark.parametrize("value", [4, True, "left", (1, 2)])
+def test_a_field_that_should_be_static_is_named_with_the_remedy(value):
+    annotations = {"links": type(value)}
+    Chain = type("Chain", (jk.System,), {"__annotations__": annotations})
+    with pytest.raises(TypeError, match=r"Chain\.links = .*equinox\.field\(static=True\).*jk\.parameter"):
+        Chain(value)
+    Chain = type("Chain", (jk.System,), {"__annotations__": annotations, "links": eqx.field(static=True)})
+    assert Chain(value).links == value
+
+
+def test_values_by_name_and_their_arithmetic():
+    q = Values([1.0, 2.0, 3.0, 4.0], ("x", "e1", "e2", "e3"))
+    assert list(q["e1":"e3"]) == [2.0, 3.0, 4.0]
+    assert q["e1":"e3"].names == ("e1", "e2", "e3")
+    assert list(q[:"e1"]) == [1.0, 2.0]
+    assert list(q["x", "e3"]) == list(q[[0, -1]]) == [1.0, 4.0]
+    assert q["x", "e3"]["e3"] == 4.0
+    assert "e1" in q
+    assert "roll" not in q
+    array = np.array([1.0, 2.0, 3.0, 4.0])
+    for f in (
+        lambda a: a**2,
+        lambda a: 2.0**a,
+        abs,
+        lambda a: +a,
+        lambda a: a % 3.0,
+        lambda a: a // 2.0,
+        lambda a: a > 2,
+        lambda a: a == 2.0,
+        lambda a: 2.0 != a,
+        lambda a: a == jnp.array([1.0, 0.0, 3.0, 0.0]),
+    ):
+        np.testing.assert_array_equal(f(q), f(array))
+    for compare in (lambda: q == "e1", lambda: q < "e1", lambda: q == None):  # noqa: E711
+        with pytest.raises(TypeError, match="meet numbers and arrays alone"):
+            compare()
+    with pytest.raises(KeyError, match="did you mean 'e1'"):
+        q["e11":]
+    with pytest.raises(AttributeError, match=r"no `\.sum`: jnp\.asarray\(q\) is an array"):
+        q.sum()
+    with pytest.raises(AttributeError, match=r"read as q\['roll'\]"):
+        _ = q.roll
+    with pytest.raises(TypeError, match="`in` asks for a name"):
+        _ = 1.0 in q
+
+
+class Rod(jk.System):
+    """A rod on a pin, with its inertia about the pin or about its mass centre."""
+
+    mass: jk.Scalar = jk.parameter(2.0)
+    about_pin: bool = eqx.field(static=True, default=True)
+    wrong: bool = eqx.field(static=True, default=False)
+    coordinates, speeds = ("angle", "tilt"), ("rate", "tilt_rate")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, q["angle"], u["rate"])
+        B = A.rotate(1, q["tilt"], u["tilt_rate"])
+        r = B.vector(0.3, 0.4, -0.5)
+        G = O.fixed(r)
+        if not self.about_pin:
+            return jk.Motion([jk.Body(self.mass, np.diag([1.0, 2.0, 2.5]), G, B)])
+        x = np.array([0.3, 0.4, -0.5])
+        inertia = np.diag([1.0, 2.0, 2.5]) + self.mass * jnp.asarray(x @ x * np.eye(3) - np.outer(x, x))
+        about = O.moving(0.0 * A.x, 1.0 * A.x) if self.wrong else O
+        return jk.Motion([jk.Body(self.mass, inertia, G, B, about=about)])
+
+
+class AboutWhatSlides(Rod):
+    """The same, about a point that slides along the rod."""
+
+
+def test_inertia_about_another_point():
+    at = ([0.3, 0.4], [0.5, 0.6])
+    for function in (jk.mass_matrix, jk.forcing):
+        about_pin, central = (function(Rod(about_pin=b), 0.0, *at) for b in (True, False))
+        np.testing.assert_allclose(about_pin, central, rtol=1e-13, atol=1e-14)
+    with pytest.raises(ValueError, match=r"'body'.*about a point that moves in its frame"):
+        jk.mass_matrix(AboutWhatSlides(wrong=True), 0.0, *at)
+
+
+@pytest.mark.slow
+def test_degrees_go_by_the_units_that_were_declared():
+    class Cart(jk.System):
+        coordinates, speeds, inputs = ("q0", "q1"), ("u0", "u1"), ("push",)
+        units = {"q0": "rad", "push": "N"}
+
+        def motion(self, t, q, u):
+            N, O = jk.inertial()
+            B = N.rotate(3, q["q0"], u["u0"])
+            return jk.Motion([jk.Body(1.0, (1.0, 1.0, 1.0), O.moving(q["q1"] * N.x, u["u1"] * N.x), B)])
+
+    coarse = {"step": 0.5, "solver": diffrax.Euler()}
+    ride = jk.simulate(Cart(), jk.State([1.0, 2.0], [0.5, 0.0]), [0.0, 0.5, 1.0], **coarse)
+    axes = jk.plot.trajectories(ride, ["q0", "u0", "q1"], degrees=True)
+    assert [ax.get_ylabel() for ax in axes] == ["q0\n[deg]", "u0\n[deg/s]", "q1"]
+    np.testing.assert_allclose(axes[0].lines[0].get_ydata(), np.degrees(ride["q0"]))
+    with pytest.raises(ValueError, match=r"none of q1 is declared to be an angle.*units = \{'q1': \"rad\"\}"):
+        jk.plot.trajectories(ride, ["q1"], degrees=True)
+    several = jk.sweep.sweep(Cart(), jk.State({"q0": np.array([0.1, 0.2])}, {}), [0.0, 0.5, 1.0], **coarse)
+    assert dict(several.trajectory.units) == {"q0": "rad", "push": "N", "u0": "rad/s"}
+    with pytest.raises(ValueError, match=r"Wrong\.units names what is no coordinate, speed, input or state: q9"):
+        jk.simulate(type("Wrong", (Cart,), {"units": {"q9": "m"}})(), jk.State([0.0, 0.0], [0.0, 0.0]), [0.0, 1.0])
+    assert units_of(type("Renamed", (Cart,), {"coordinates": ("angle", "q1")})()) == {"push": "N"}
+    plt.close("all")
+
+
+def test_a_sensor_sits_on_its_body_by_a_quaternion():
+    N, _ = jk.inertial()
+    B = N.rotate(1, 0.5, 2.0)
+    S = B.rotate_euler((0.0, 0.0, 0.6, 0.8))  # about z, by 2 atan(0.6 / 0.8): cosine 0.28, sine 0.96
+    np.testing.assert_allclose(S.matrix(B), [[0.28, 0.96, 0], [-0.96, 0.28, 0], [0, 0, 1]], atol=1e-15)
+    np.testing.assert_allclose(S.angular_velocity.to(N), [2.0, 0.0, 0.0], atol=1e-15)
+
+
+def test_the_pendulum_of_the_page_for_sympys_users_moves_as_sympys():
+    """Figures: SymPy 1.14, `kane.mass_matrix.LUsolve(kane.forcing)` of the page at x = 0.6, vx = 0.5, m = 2, l = 1."""
+    page = (Path(__file__).parents[2] / "docs" / "coming_from_sympy.md").read_text(encoding="utf-8")
+    block = next(b for b in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "class Bob" in b)
+    names = {}
+    exec(block, names)
+    np.testing.assert_allclose([names["rates"]["vx"], names["rates"]["vy"]], [-4.943175, -3.2191], rtol=1e-12)
+    np.testing.assert_allclose(names["f"] / names["M"][0], -4.943175, rtol=1e-12)
+
+
+class Slider(jk.System):
+    """A particle on a line, and a light arm beside it; `what` acts on them."""
+
+    what: object = eqx.field(static=True, default=None)
+    coordinates, speeds, inputs = ("x", "angle"), ("v", "rate"), ("push",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, q["angle"], u["rate"])
+        bead = jk.Body(2.0, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x), name="bead")
+        arm = jk.Body(1.0, (0.0, 0.0, 0.5), O, A, name="arm")
+        return jk.Motion([bead, arm])
+
+    def loads(self, t, q, u, motion, inputs):
+        return self.what(motion, inputs)
+
+
+def on_the_bead(motion, inputs):
+    return jk.Torque(motion.N.z, motion["bead"])
+
+
+def against_the_bead(motion, inputs):
+    return jk.loads.torsional_damper(motion["arm"], motion["bead"], motion.N.z, 0.1)
+
+
+@pytest.mark.parametrize("what", [on_the_bead, against_the_bead])
+def test_a_torque_on_a_particle_is_refused(what):
+    with pytest.raises(ValueError, match="'bead' is a particle"):
+        jk.accelerations(Slider(what), 0.0, [0.1, 0.2], [0.3, 0.4])
+
+
+def test_an_input_that_a_description_misspells_is_named_with_those_there_are():
+    misspelt = Slider(lambda motion, inputs: jk.Force(inputs["pusch"] * motion.N.x, motion["bead"]))
+    with pytest.raises(KeyError, match="'pusch' in the inputs of Slider; did you mean 'push'"):
+        jk.accelerations(misspelt, 0.0, [0.1, 0.2], [0.3, 0.4])
+
+
+@pytest.mark.parametrize("q", ["a", None, object()])
+def test_what_are_no_coordinates_is_refused_by_name(q):
+    with pytest.raises((TypeError, ValueError), match=r"Slider: q must be 2 numbers \(x, angle\), got"):
+        jk.accelerations(Slider(lambda motion, inputs: []), 0.0, q, [0.3, 0.4])
+
+
+@pytest.mark.parametrize(
+    ("system", "q", "inputs", "words"),
+    [
+        (Slider, [0.1, 0.2], None, "Make one: Slider(...)"),
+        (Slider(), [0.1j, 0.2], None, "Slider: q must be 2 real numbers"),
+        (Slider(), [0.1, 0.2], 3.0, "Slider: the inputs are numbers by name"),
+        (Slider(), [0.1, 0.2], {"push": "x"}, "the input 'push' must be one number"),
+        (Slider(), [0.1, 0.2], {"push": [1.0, 2.0]}, "the input 'push' must be one number"),
+    ],
+)
+def test_arguments_of_another_kind_are_refused_by_name(system, q, inputs, words):
+    with pytest.raises(TypeError, match=re.escape(words)):
+        jk.accelerations(system, 0.0, q, [0.3, 0.4], inputs)
+
+
+N, O = jk.inertial()
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: N.x.dot(3.0), "dot takes a Vector"),
+        (lambda: N.x.cross([1, 2, 3]), "cross takes a Vector"),
+        (lambda: N.x.to(O), "asked for in a Frame"),
+        (lambda: O.fixed(3.0), "Point.fixed takes a Vector"),
+        (lambda: O.moving(N.x, 2.0), "Point.moving, as the velocity, takes a Vector"),
+        (lambda: jk.Body(1.0, (1, 1, 1), O, N, angular_velocity=3.0, name="wheel"), "'wheel' is a Vector"),
+        (lambda: jk.Body(1.0, (1, 1, 1), O, N, about=N.x, name="wheel"), "'wheel' is about a Point"),
+        (lambda: jk.Body(1.0, 2.0, O, N, name="wheel"), "wheel: the inertia is three principal moments"),
+        (lambda: jk.Body(1.0, 0.0, O, about=O.fixed(N.x), name="wheel"), "'wheel' has an inertia, but no frame"),
+    ],
+)
+def test_what_is_no_vector_frame_or_point_is_refused_in_words(call, words):
+    with pytest.raises((TypeError, ValueError), match=re.escape(words)):
+        call()
+
+
+@pytest.mark.parametrize(
+    "ask",
+    [
+        lambda s: jk.accelerations(s, 0.0, [0.1, 0.2], [0.0, 0.0]),
+        lambda s: jk.positions(s, 0.0, [0.1, 0.2], [0.0, 0.0]),
+        lambda s: jk.simulate(s, jk.State([0.1, 0.2], [0.0, 0.0]), [0.0, 1.0]),
+        lambda s: jk.stability.equilibrium(s),
+    ],
+)
+def test_one_instant_refuses_a_batch_of_systems_by_its_name(ask):
+    with pytest.raises(ValueError, match=r"DoublePendulum: mass has more axes than it was declared with.*jax.vmap"):
+        ask(jk.catalog.DoublePendulum(mass=np.array([1.0, 2.0])))
