@@ -114,6 +114,7 @@ def _tried(machine: Machine) -> tuple[str | None, bool]:
     environment = kept | {"JAX_PLATFORMS": "cpu", "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     try:
         run = subprocess.run(
+            # -P: its folder, where files have names such as numpy.py, is no place to import from
             [sys.executable, "-P", str(Path(__file__).with_name("probe_worker.py"))],
             input=json.dumps(asked),
             env=environment,
