@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxkane as jk
-from jaxkane._kane.rhs import _packed_rates, packed_rates
+from jaxkane._kane.rhs import _vector_field, vector_field
 from jaxkane.bicycles import Bicycle, LateralSlip, LeaningRider, SteeringMotor, Tyre, separate_rider
 
 from ._bicycle import agree
@@ -64,7 +64,7 @@ def operations(bicycle: jk.System, y: jnp.ndarray) -> int:
     """Scalar operations of the right-hand side, as they are traced."""
     inputs = dict.fromkeys(bicycle.inputs, jnp.zeros(()))
     leaves, structure = jax.tree.flatten((bicycle, jnp.zeros(()), y, inputs))
-    plain = _packed_rates.__wrapped__
+    plain = _vector_field.__wrapped__
     return len(jax.make_jaxpr(lambda *x: plain(*jax.tree.unflatten(structure, x)))(*leaves).jaxpr.eqns)
 
 
@@ -100,7 +100,7 @@ def in_c(setting: Setting, bicycle: jk.System, y: jnp.ndarray) -> tuple[Callable
     built.module.batch(p, together, dy)
     found = np.concatenate([dy[:, :n_y], dy[:, -x.shape[1] :]], axis=1)
     inputs = dict.fromkeys(bicycle.inputs, jnp.zeros(()))
-    known = jax.jit(jax.vmap(lambda y: packed_rates(bicycle, jnp.zeros(()), y, inputs)))(y)
+    known = jax.jit(jax.vmap(lambda y: vector_field(bicycle, jnp.zeros(()), y, inputs)))(y)
     agree("SymPy + C", found, known, 1e-9)
     return lambda: built.module.batch(p, together, dy), built.operations
 
@@ -110,7 +110,7 @@ def measure(setting: Setting) -> Iterator[Figure]:
     for name, bicycle in assemblies().items():
         y = states(bicycle, n)
         inputs = dict.fromkeys(bicycle.inputs, jnp.zeros(()))
-        of_all = jax.jit(jax.vmap(lambda y, b=bicycle, w=inputs: packed_rates(b, jnp.zeros(()), y, w)))
+        of_all = jax.jit(jax.vmap(lambda y, b=bicycle, w=inputs: vector_field(b, jnp.zeros(()), y, w)))
         assert np.isfinite(np.asarray(of_all(y))).all(), name
         rivals[name] = lambda of_all=of_all, y=y: of_all(y).block_until_ready()
         counted[name] = operations(bicycle, y[0])

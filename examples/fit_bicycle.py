@@ -75,11 +75,11 @@ def waves(rng, t, size, frequencies):
 def fit_simulated():
     truth = WhippleBicycle.benchmark()
     rides = simulated_rides(truth)
-    first_guess = truth
+    initial_guess = truth
     for name, factor in OFF.items():
-        first_guess = eqx.tree_at(lambda b, name=name: getattr(b, name), first_guess, factor * getattr(truth, name))
+        initial_guess = eqx.tree_at(lambda b, name=name: getattr(b, name), initial_guess, factor * getattr(truth, name))
     print("Three rides, four parameters that start 20 % off. Compiling takes a while the first time.")
-    result = fit_bicycle(rides, first_guess, tuple(OFF), window=2.5, steps=60, progress=True)
+    result = fit_bicycle(rides, initial_guess, tuple(OFF), window=2.5, steps=60, progress=True)
     print(f"\n{result}\n\n{result.table(truth)}")
     known = {name: float(getattr(truth, name)) for name in OFF}
     assert result.ok, result.message

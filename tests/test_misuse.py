@@ -124,7 +124,7 @@ def test_units_that_are_inherited_may_name_more():
 KEPT = {}
 
 
-def keeping(part):
+def saveat_and_adjoint(part):
     """A description that holds on to a part of its motion."""
 
     def motion(self, t, q, u):
@@ -148,7 +148,7 @@ def keeping(part):
 @pytest.mark.parametrize("part", ["motion", "center", "number", "loads", "rates"])
 def test_what_is_kept_from_an_earlier_call_is_refused(part):
     KEPT.clear()
-    pendulum = keeping(part)()
+    pendulum = saveat_and_adjoint(part)()
     with pytest.raises(TypeError, match=r"Keeping: its description returns what it has kept from an earlier call"):
         [acceleration(pendulum, q=(angle,)) for angle in (0.3, 0.4)]
     with pytest.raises(TypeError, match=r"Keeping: its description returns what it has kept from an earlier call"):
@@ -158,7 +158,7 @@ def test_what_is_kept_from_an_earlier_call_is_refused(part):
 def test_a_motion_of_numbers_that_was_kept_is_refused():
     """Which would be a motion that does not depend on the coordinates."""
     KEPT.clear()
-    pendulum = keeping("motion")()
+    pendulum = saveat_and_adjoint("motion")()
     pendulum.motion(0.0, [0.3], [0.1])
     with pytest.raises(TypeError, match="what it has kept from an earlier call"):
         pendulum.motion(0.0, [0.4], [0.1])

@@ -128,19 +128,19 @@ def test_steer_damping_takes_power():
 
 def test_dependent_speeds_become_singular_where_the_design_says():
     """det C_dep changes sign at a steer of 91.77 degrees, upright; its condition number is about 120 at 90."""
-    from jaxkane._kane.kane import Instant
+    from jaxkane._kane.kane import KaneEquations
     from jaxkane._scalarjit.linear import determinant, stack
 
     def det(degrees):
         q = jnp.zeros(8).at[2].set(jnp.deg2rad(degrees))
-        return float(determinant(Instant(BIKE, 0.0, q.at[4].set(pitch(degrees)), jnp.zeros(3)).C_dep))
+        return float(determinant(KaneEquations(BIKE, 0.0, q.at[4].set(pitch(degrees)), jnp.zeros(3)).C_dep))
 
     def pitch(degrees):
         return jk.assemble(BIKE, {"steer": float(np.deg2rad(degrees))}).q[4]
 
     assert det(91.7) * det(91.85) < 0 < det(90.0) * det(91.7)
     q = jk.assemble(BIKE, {"steer": np.pi / 2}).q
-    condition = np.linalg.cond(np.asarray(stack(Instant(BIKE, 0.0, q, jnp.zeros(3)).C_dep)))
+    condition = np.linalg.cond(np.asarray(stack(KaneEquations(BIKE, 0.0, q, jnp.zeros(3)).C_dep)))
     assert 50 < condition < 300
 
 

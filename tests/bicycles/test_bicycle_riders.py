@@ -387,5 +387,5 @@ def test_a_bicycle_with_arms_is_one_program_of_scalars():
     args = (bicycle, jnp.array(0.0), q, u, dict.fromkeys(bicycle.inputs, jnp.array(0.0)))
     leaves, treedef = jax.tree.flatten(args)
     program = _Program(jax.make_jaxpr(lambda *x: _motion_rates.__wrapped__(*jax.tree.unflatten(treedef, x)))(*leaves))
-    assert program.is_plain
+    assert program.is_fusable
     assert len(program.program.jaxpr.eqns) <= 6600

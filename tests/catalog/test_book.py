@@ -16,7 +16,7 @@ from numpy import cos, sin
 
 import jaxkane as jk
 from jaxkane import catalog
-from jaxkane._kane.kane import Instant
+from jaxkane._kane.kane import KaneEquations
 
 RTOL = 1e-12
 # Under jit, where inertias are not checked: those drawn or given at random need not be a body's.
@@ -369,7 +369,7 @@ def test_independent_figures(place):
         inputs = {word: given[letter] for letter, word in INPUT_LETTERS[place].items()}
 
         def rates(q, u, system=system):
-            return jnp.stack(Instant(system, 0.0, q, u).q_dot)
+            return jnp.stack(KaneEquations(system, 0.0, q, u).q_dot)
 
         if "qd" in state:  # given as rates and their rates: the speeds are found from q_dot = Q(q) u
             q, q_dot = jnp.array(state["q"]), jnp.array(state["qd"])
@@ -400,14 +400,14 @@ def test_euler_parameters_turn_as_printed():
     e1, e2, e3, e4 = q = np.array(catalog.CATALOG["SpinningTop"].q)
     u = np.array([0.8, -0.6, 4.0])
     E = np.array([[e4, -e3, e2, e1], [e3, e4, -e1, e2], [-e2, e1, e4, e3], [-e1, -e2, -e3, e4]])
-    q_dot = Instant(catalog.SpinningTop(), 0.0, q, u).q_dot
+    q_dot = KaneEquations(catalog.SpinningTop(), 0.0, q, u).q_dot
     np.testing.assert_allclose(q_dot, 0.5 * E @ [*u, 0.0], rtol=1e-14)
 
 
 def test_angles_turn_as_printed():
     # Example 6, note 3
     q, u = np.array(catalog.CATALOG["SpatialDoublePendulum"].q), np.array([0.7, -0.4, 0.5, -0.6, 0.3, 0.9])
-    q_dot = np.array(Instant(catalog.SpatialDoublePendulum(), 0.0, q, u).q_dot)
+    q_dot = np.array(KaneEquations(catalog.SpatialDoublePendulum(), 0.0, q, u).q_dot)
     for (_, th2, th3), (w1, w2, w3), rates in zip(q.reshape(2, 3), u.reshape(2, 3), q_dot.reshape(2, 3), strict=True):
         printed = [
             (w1 * sin(th3) + w2 * cos(th3)) / sin(th2),

@@ -34,7 +34,7 @@ def test_the_programs_do_not_grow(name):
     # One operation that cannot be written as scalars would cost a factor of ten to three thousand.
     cotangent = tangent.transposed((False,) * len(leaves) + (True,) * len(leaves))
     for one in (program, tangent, cotangent):
-        assert one.is_plain
+        assert one.is_fusable
         assert Scalars(one.program).graph.nodes  # raises, with the operation, where one is unknown
 
 
@@ -55,4 +55,4 @@ def test_every_public_function_is_one_program_of_scalars(name, monkeypatch):
     for f in (getattr(jk, name) for name in names):
         jax.eval_shape(lambda system, q, u, f=f: f(system, 0.0, q, u), system, q, u)
     assert len(programs) >= len(names)
-    assert all(one.is_plain and Scalars(one.program).graph.nodes for one in programs)
+    assert all(one.is_fusable and Scalars(one.program).graph.nodes for one in programs)

@@ -9,7 +9,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import jaxkane as jk
-from jaxkane._kane.kane import Instant
+from jaxkane._kane.kane import KaneEquations
 from jaxkane.catalog import CATALOG
 
 T = 0.3  # [s]: by then the engines of Example 5 have changed their speed
@@ -26,14 +26,14 @@ class Example:
         self.inputs = {name: float(x) for name, x in zip(self.system.inputs, INPUTS, strict=False)}
         self.at = (self.system, T, self.q, self.u)
         self.u_dot = jk.accelerations(*self.at, self.inputs)
-        self.q_dot = jnp.stack(Instant(*self.at).q_dot)
+        self.q_dot = jnp.stack(KaneEquations(*self.at).q_dot)
 
     def along_motion(self, f):
         """f(t, q, u) and its time derivative."""
         return jax.jvp(f, (jnp.array(T), self.q, self.u), (jnp.array(1.0), self.q_dot, self.u_dot))
 
     def motion(self, t, q, u):
-        now = Instant(self.system, t, q, u)
+        now = KaneEquations(self.system, t, q, u)
         return now.motion(now.t, now.q, now.u_all)
 
     def velocities(self, t, q, u):
@@ -53,7 +53,7 @@ class Example:
 
     def loads(self, u, inputs):
         """Forces and torques (l, 3), and the velocities they work on (l, 3), in N."""
-        now = Instant(self.system, T, self.q, u, inputs)
+        now = KaneEquations(self.system, T, self.q, u, inputs)
         loads = now.loads(now.motion(now.t, now.q, now.u_all))
         if not loads:
             return jnp.zeros((0, 3)), jnp.zeros((0, 3))
@@ -85,7 +85,7 @@ def assert_close(a, b, rtol, scale=None):
 
 
 def test_the_state_of_an_entry_is_consistent(example):
-    system, q = example.system, Instant(*example.at)
+    system, q = example.system, KaneEquations(*example.at)
     assert len(example.entry.q) == len(system.coordinates)
     assert len(example.entry.u) == len(system.speeds)
     assert_close(np.array([float(x) for x in q.configuration(T, q.q)]), 0.0, 1e-14, scale=1.0)
@@ -104,7 +104,7 @@ def test_some_entries_have_constraints():
 @pytest.mark.parametrize("name", CONSTRAINED)
 def test_rates_keep_the_configuration_constraints(name):
     example = _example(name)
-    now = Instant(*example.at)
+    now = KaneEquations(*example.at)
     _, h_dot = example.along_motion(lambda t, q, u: jnp.stack(now.configuration(t, tuple(q))))
     assert_close(h_dot, 0.0, 1e-13, scale=np.abs(example.q_dot).max())
 
@@ -112,7 +112,7 @@ def test_rates_keep_the_configuration_constraints(name):
 @pytest.mark.parametrize("name", DEPENDENT)
 def test_dependent_speeds_keep_the_velocity_constraints_and_change_as_their_accelerations_say(name):
     example = _example(name)
-    now = Instant(*example.at)
+    now = KaneEquations(*example.at)
     assert_close(jnp.stack(now.residuals(now.t, now.q, now.u_all)), 0.0, 1e-13, scale=np.abs(now.u_all).max())
     u_dep, u_dep_dot = example.along_motion(lambda t, q, u: jk.dependent_speeds(example.system, t, q, u))
     assert u_dep.shape == (len(example.system.dependent_speeds),)

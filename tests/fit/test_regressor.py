@@ -11,7 +11,7 @@ import pytest
 
 import jaxkane as jk
 from jaxkane.catalog import CATALOG
-from jaxkane.fit import Inertia, Instants, Trial, base_parameters, first_guess, inertia_of, instants_of, regressor
+from jaxkane.fit import Inertia, Instants, Trial, base_parameters, first_estimate, inertia_of, instants_of, regressor
 from jaxkane.fit._base_parameters import random_states
 from jaxkane.fit._kinematics import max_spacing
 from jaxkane.fit._parameters import parameters_of
@@ -483,7 +483,7 @@ def test_first_guess_of_a_measured_double_pendulum():
     """Free swings: ratios of four base parameters of its makers' estimates within 3 %; friction has its sign."""
     recording = jk.data.multi_arm_pendulum(2)
     authors = recording.parameters
-    guess = first_guess(Swing(I2=3e-3), recording.trials[:8], FREE, spacing=0.025)
+    guess = first_estimate(Swing(I2=3e-3), recording.trials[:8], FREE, spacing=0.025)
     assert guess.ok
     assert guess.base.ratios_only
     assert guess.base.count == 5
@@ -512,14 +512,14 @@ def test_bodies_that_can_be():
     exact = random_instants(ball, 40)
     body = inertia_of(ball, "bob")
     assert (body.mass, body.center[0], body.moments[2]) == ("mass.bob", "center.bob.x", "inertia.bob.zz")
-    same = first_guess(ball, exact, body)
+    same = first_estimate(ball, exact, body)
     assert same.ok
     assert same.values["inertia.bob.zz"] == pytest.approx(0.03, rel=1e-6)
     column = jax.jit(jax.vmap(lambda *x: regressor(ball, 0.0, *x, bodies={"bob": "Izz"}).matrix[:, 0]))(
         *map(jnp.asarray, (exact.q, exact.u, exact.u_dot))
     )
     asked = {name: x - 0.06 * column[:, i] for i, (name, x) in enumerate(exact.inputs.items())}
-    guess = first_guess(ball, dataclasses.replace(exact, inputs=asked), body)
+    guess = first_estimate(ball, dataclasses.replace(exact, inputs=asked), body)
     assert guess.base.estimates[list(guess.base.texts).index("bob.Izz")] == pytest.approx(0.0404 - 0.06)
     xx, yy, zz, xy, xz, yz = (guess.values[f"inertia.bob.{ij}"] for ij in ("xx", "yy", "zz", "xy", "xz", "yz"))
     moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
@@ -537,7 +537,7 @@ def test_a_first_guess_may_start_with_a_centre_at_the_joint():
     """There the moment of inertia about the joint does not change with it, and elsewhere it does."""
     truth, at = swings()
     start = dataclasses.replace(truth, a2=0.0)
-    guess = first_guess(start, at, ("a2", "k2"))
+    guess = first_estimate(start, at, ("a2", "k2"))
     assert guess.values["a2"] == pytest.approx(float(truth.a2), rel=1e-6)
     assert guess.ok
 
@@ -550,7 +550,7 @@ def test_what_a_first_guess_refuses():
         ("k9", "no parameter"),
     ):
         with pytest.raises(ValueError, match=said):
-            first_guess(Swing(), at, free)
+            first_estimate(Swing(), at, free)
 
 
 def test_inertia_of_a_body_by_its_name():
@@ -690,7 +690,7 @@ def test_first_guess_of_a_driven_double_pendulum():
     small beside the links', and drawn towards zero by noise."""
     free = ("m1", "r1", "I1", "m2", "r2", "I2", "Ir", "b1", "b2", "c1", "c2")
     trials = [trial for trial in jk.data.driven_double_pendulum().trials if not trial.name.endswith("sysid_00")]
-    guess = first_guess(Driven(), trials, free)
+    guess = first_estimate(Driven(), trials, free)
     assert guess.base.count == 9
     assert guess.strain < 3
     assert guess.base.unexplained < 0.1

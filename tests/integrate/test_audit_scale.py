@@ -58,7 +58,7 @@ def operations(f, system, *more):
     args = (system, jnp.array(0.4), jnp.full(n, 0.3), jnp.full(m, 0.2), {}, *more)
     leaves, treedef = jax.tree.flatten(args)
     program = _Program(jax.make_jaxpr(lambda *x: f.__wrapped__(*jax.tree.unflatten(treedef, x)))(*leaves))
-    return len(program.program.jaxpr.eqns), program.is_plain
+    return len(program.program.jaxpr.eqns), program.is_fusable
 
 
 @pytest.mark.slow
@@ -68,8 +68,8 @@ def test_the_audit_costs_what_the_accelerations_cost(held):
     counts = {}
     for n in (4, 6, 8):
         system = TiltedChain(n=n, held=held)
-        counts[n], is_plain = operations(balance._measured, system, jnp.ones(n - held))
-        assert is_plain
+        counts[n], is_fusable = operations(balance._measured, system, jnp.ones(n - held))
+        assert is_fusable
     assert counts[6] < operations(rates._motion_rates, TiltedChain(n=6, held=held))[0]
     # Linear but for the weights and the columns of the constraint, which pass all frames: less than quadratic
     assert counts[8] - counts[6] < 1.6 * (counts[6] - counts[4])

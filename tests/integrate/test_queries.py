@@ -170,7 +170,7 @@ OF_A_TRAJECTORY = {
     "jaxkane.animate": jk.animate,
     "jaxkane.fit.instants_of": fit.instants_of,
     "jaxkane.fit.base_parameters": fit.base_parameters,
-    "jaxkane.fit.first_guess": lambda system, ride: fit.first_guess(system, ride, "push"),
+    "jaxkane.fit.first_estimate": lambda system, ride: fit.first_estimate(system, ride, "push"),
 }
 OTHERS = {
     "coordinates": {"coordinates": ("x", "angle")},

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._integrate.diffrax_compat import WrittenOut
+from jaxkane._integrate.diffrax_compat import UnrolledERK
 from jaxkane._kane.rhs import rates_are_native
 from jaxkane._scalarjit.backends import native
 from jaxkane._system.system import packed
@@ -42,7 +42,7 @@ def motion(solver, jump, args):
 def test_the_same_steps_numbers_and_derivatives(method, jump):
     rtol = 1e-11
     found = []
-    for solver in (method(), WrittenOut(method())):
+    for solver in (method(), UnrolledERK(method())):
         of_gravity = jax.jit(lambda x, s=solver: jax.jvp(lambda x: motion(s, jump, x), (x,), (1.0,)))
         found.append(of_gravity(9.81))
     ((y, steps), (slope, _)), ((other, others), (other_slope, _)) = found

@@ -11,7 +11,7 @@ import jaxkane as jk
 from jaxkane._integrate import diffrax_compat as loops
 from jaxkane._integrate import integrate as ride
 from jaxkane._integrate.settings import settings_for
-from jaxkane._integrate.step_control import ByError
+from jaxkane._integrate.step_control import ErrorController
 from jaxkane._scalarjit.function import fused
 
 
@@ -30,7 +30,7 @@ def van_der_pol(controller):
 
 def test_steps_by_error_are_those_of_diffrax():
     expected = van_der_pol(diffrax.PIDController(rtol=1e-6, atol=1e-8))
-    found = van_der_pol(ByError(jnp.array([1e-6, 1e-8, 1e-12])))
+    found = van_der_pol(ErrorController(jnp.array([1e-6, 1e-8, 1e-12])))
     assert {k: int(v) for k, v in found.stats.items()} == {k: int(v) for k, v in expected.stats.items()}
     assert found.stats["num_rejected_steps"] > 10
     np.testing.assert_allclose(found.ys, expected.ys, rtol=1e-11, atol=1e-11)
@@ -45,7 +45,7 @@ def test_a_step_shorter_than_the_shortest_ends_the_solution():
         2.0,
         0.1,
         jnp.array([1.0]),
-        stepsize_controller=ByError(jnp.array([1e-6, 1e-8, 1e-9])),
+        stepsize_controller=ErrorController(jnp.array([1e-6, 1e-8, 1e-9])),
         throw=False,
     )
     assert found.result == diffrax.RESULTS.dt_min_reached

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxkane as jk
-from jaxkane._kane.kane import Instant
+from jaxkane._kane.kane import KaneEquations
 from jaxkane.catalog import CATALOG
 
 
@@ -43,7 +43,7 @@ def test_VC_dot_of_the_bicycle_and_the_books_order_of_products():
 
     def of_point(pick):  # partial velocities (3,3) of a point, in C
         def columns(q):
-            now = Instant(bicycle, 0.0, q, jnp.zeros(3))
+            now = KaneEquations(bicycle, 0.0, q, jnp.zeros(3))
 
             def velocity(u):
                 motion = now.motion(0.0, now.q, (*u, *(J @ u)))

@@ -8,7 +8,7 @@ from test_other_systems import FIGURES, FourBarLinkage, RollingDiscDependent
 
 import jaxkane as jk
 from jaxkane import constraint_forces, constraint_multipliers
-from jaxkane._kane.kane import Instant
+from jaxkane._kane.kane import KaneEquations
 from jaxkane.catalog import CATALOG
 
 RTOL = 1e-12
@@ -18,7 +18,7 @@ def momentum_rate(system, q, u, inputs=None, bodies=slice(None)):
     """d/dt of the linear momentum (3,) of some bodies, in N, by differentiation along the motion."""
 
     def momentum(t, q, u):
-        now = Instant(system, t, q, u)
+        now = KaneEquations(system, t, q, u)
         motion = now.motion(now.t, now.q, now.u_all)
         return sum(jnp.asarray(b.mass, float) * b.center.velocity.to(motion.N) for b in motion.bodies[bodies])
 

@@ -149,12 +149,12 @@ def test_wheels_turn_although_their_frames_do_not(ride, weaving):
 
 def test_the_bicycle_stands_on_the_ground_and_is_followed(weaving):
     scene = weaving.scene
-    x, leader = scene.at(np.linspace(0.0, 10.0, 50))
+    x, center_of_mass = scene.at(np.linspace(0.0, 10.0, 50))
     tracks = [s.first for s in scene.shapes if s.kind == "trace"]
     np.testing.assert_allclose(x[:, tracks[0], 2], 0.0, atol=1e-6)
     assert scene.ground == pytest.approx(0.0, abs=0.01)
     assert scene.view.follow
-    assert np.ptp(leader[:, 0]) == pytest.approx(50.0, rel=1e-3)
+    assert np.ptp(center_of_mass[:, 0]) == pytest.approx(50.0, rel=1e-3)
 
 
 def test_up_is_opposite_to_the_weights(swing):
@@ -344,8 +344,8 @@ def test_a_browser_projects_as_the_library_does(weaving, page, tmp_path):
     page.value("(() => { const v = canvas.viewer; v.state.playing = false; v.state.time = 3.217; v.draw(); })()")
     width, height = page.value("[canvas.clientWidth, canvas.clientHeight]")
     scene = weaving.scene
-    x, leader = scene.at(3.217)
-    p = project(x[0], leader[0], scene.view, scene.view.span_following)
+    x, center_of_mass = scene.at(3.217)
+    p = project(x[0], center_of_mass[0], scene.view, scene.view.span_following)
     expected = np.array([width / 2, height / 2]) + min(width, height) * p[:, :2] * [1, -1]
     seen = np.array(page.value(f"Array.from({{length: {len(p)}}}, (_, v) => canvas.viewer.see(v))"))
     np.testing.assert_allclose(seen[:, :2], expected, atol=0.05)

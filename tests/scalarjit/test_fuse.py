@@ -13,7 +13,7 @@ import pytest
 from jaxkane._scalarjit import function as fuse
 from jaxkane._scalarjit import jaxpr as pieces
 from jaxkane._scalarjit.function import fused
-from jaxkane._scalarjit.jaxpr import without_repetition
+from jaxkane._scalarjit.jaxpr import cse
 from jaxkane._scalarjit.linear import determinant, solve
 
 
@@ -89,7 +89,7 @@ def test_a_long_program_in_pieces(name, by_xla, monkeypatch):
 
 
 def test_repetition_goes():
-    once = without_repetition(jax.make_jaxpr(lambda x: jnp.sin(x) + jnp.sin(x) * jnp.cos(x) + 0.0 * jnp.tan(x))(1.0))
+    once = cse(jax.make_jaxpr(lambda x: jnp.sin(x) + jnp.sin(x) * jnp.cos(x) + 0.0 * jnp.tan(x))(1.0))
     names = [e.primitive.name for e in once.jaxpr.eqns]
     assert names.count("sin") == 1
 
@@ -199,7 +199,7 @@ def test_numbers_that_print_alike_are_not_the_same():
     """Common ones are found by their bits: arrays print eight digits, -0.0 equals 0.0, and no NaN is itself."""
     near = [np.array(0.1234567891234), np.array(0.1234567895678)]
     f = lambda x: [x * near[0], x * near[1], jnp.arctan2(x * 0.0, -1.0), jnp.arctan2(x * -0.0, -1.0), x + jnp.nan]  # noqa: E731
-    once = without_repetition(jax.make_jaxpr(lambda x: [*f(x), *f(x)])(1.0))
+    once = cse(jax.make_jaxpr(lambda x: [*f(x), *f(x)])(1.0))
     assert [e.primitive.name for e in once.jaxpr.eqns].count("mul") == 4
     assert [e.primitive.name for e in once.jaxpr.eqns].count("add") == 1
     np.testing.assert_array_equal(jnp.stack(fused(f)(3.0)), [3 * near[0], 3 * near[1], np.pi, -np.pi, np.nan])

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._common.files import digest, write_whole
+from jaxkane._common.files import atomic_write, digest
 from jaxkane.sweep._chunks import digest_of
 from jaxkane.sweep._files import Folder
 
@@ -330,10 +330,10 @@ def test_files_are_whole_or_not_there(tmp_path):
 
     for before in ([], ["file"]):
         with contextlib.suppress(KeyboardInterrupt):
-            write_whole(path, broken)
+            atomic_write(path, broken)
         assert [p.name for p in tmp_path.iterdir()] == before
-        assert write_whole(path, lambda file: file.write(b"whole"), replace=bool(before))
-        assert not write_whole(path, lambda file: file.write(b"other"), replace=False)
+        assert atomic_write(path, lambda file: file.write(b"whole"), replace=bool(before))
+        assert not atomic_write(path, lambda file: file.write(b"other"), replace=False)
         assert path.read_bytes() == b"whole"
 
 

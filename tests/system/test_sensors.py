@@ -169,9 +169,9 @@ class Filtered(jk.System):
 
 
 def jk_values(names, now):
-    from jaxkane._system.system import Values
+    from jaxkane._system.system import NamedVector
 
-    return Values([now[name] for name in names], names)
+    return NamedVector([now[name] for name in names], names)
 
 
 def test_filters_are_their_transfer_functions():

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._system.system import Values, units_of
+from jaxkane._system.system import NamedVector, units_of
 
 
 class Beads(jk.System):
@@ -68,7 +68,7 @@ def test_a_field_that_should_be_static_is_named_with_the_remedy(value):
 
 
 def test_values_by_name_and_their_arithmetic():
-    q = Values([1.0, 2.0, 3.0, 4.0], ("x", "e1", "e2", "e3"))
+    q = NamedVector([1.0, 2.0, 3.0, 4.0], ("x", "e1", "e2", "e3"))
     assert list(q["e1":"e3"]) == [2.0, 3.0, 4.0]
     assert q["e1":"e3"].names == ("e1", "e2", "e3")
     assert list(q[:"e1"]) == [1.0, 2.0]

@@ -46,11 +46,11 @@ def write_gif(
     start = scene.t[0]
     length = scene.t[-1] - start if seconds is None else min(seconds, scene.t[-1] - start)
     times = start + np.arange(0.0, length, 0.01 * hundredths * speed)
-    x, leader = scene.at(times)
+    x, center_of_mass = scene.at(times)
     painter = _Painter(scene, size, dark)
     images = []
     for i in range(len(times)):
-        target, span = (leader[i], view.span_following) if view.follow else (view.center, view.span)
+        target, span = (center_of_mass[i], view.span_following) if view.follow else (view.center, view.span)
         image = Image.new("RGB", (size[0] * _FINE, size[1] * _FINE), painter.color("paper"))
         see = functools.partial(project, target=target, view=view, span=span)
         painter.paint(ImageDraw.Draw(image, "RGBA"), i, x, see, grid(target, span))
@@ -198,8 +198,8 @@ def _scene(found: Record, figure: Any, speed: float, up, follow, ground, title, 
     turned = turned_by(found.t, found.spin, found.orientation)
     kept = _frames(found.t, _FRAMES_PER_SECOND / speed)
     total = found.mass.sum()
-    leader = (found.place * found.mass[:, None]).sum(axis=1) / (total if total > 0 else 1.0)
-    scale = float(np.linalg.norm(found.place - leader[:, None], axis=-1).max())
+    center_of_mass = (found.place * found.mass[:, None]).sum(axis=1) / (total if total > 0 else 1.0)
+    scale = float(np.linalg.norm(found.place - center_of_mass[:, None], axis=-1).max())
     scale += float(np.sqrt(np.trace(found.inertia.sum(axis=0)) / (total if total > 0 else 1.0)))
     upright = UPRIGHT[up or which_way_is_up(found.forces)]
 
@@ -219,12 +219,12 @@ def _scene(found: Record, figure: Any, speed: float, up, follow, ground, title, 
         style = {"width": e.width, "closed": e.closed, "fill": e.fill, "label": e.label}
         build.shape(e.kind, e.color, e.places.shape[1], **style)
 
-    leader = leader[kept] @ upright.T
+    center_of_mass = center_of_mass[kept] @ upright.T
     scene = Scene(
         t=found.t[kept],
         **build.arrays(upright),
         shapes=tuple(build.shapes),
-        leader=leader,
+        center_of_mass=center_of_mass,
         ground=None,
         view=None,  # type: ignore[arg-type]
         title=name if title is None else title,
@@ -318,7 +318,7 @@ def _compact(scene: Scene, speed: float) -> dict[str, Any]:
         "start": float(scene.t[0]),
         "position": encode(scene.position, "f4"),
         "rotation": encode(np.round(scene.rotation * 32767), "i2"),
-        "leader": encode(scene.leader, "f4"),
+        "center_of_mass": encode(scene.center_of_mass, "f4"),
         "vertex": encode(scene.vertex, "f4"),
         "owner": encode(scene.owner, "i2"),
         "shapes": [dataclasses.asdict(shape) for shape in scene.shapes],

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from .._integrate.trajectory import Trajectory, reached_times
 from .._scalarjit.cache_key import version_of
-from .._scalarjit.captured_values import Reads
+from .._scalarjit.captured_values import CapturedValues
 from .._scalarjit.function import fused
 from .._scalarjit.linear import stack
 from .._system.bodies import Body
@@ -195,7 +195,7 @@ def record(system: System, trajectory: Trajectory, figure: Figure | None) -> Rec
     name = type(system).__name__
     reached = reached_times("animate", system, trajectory)
     numbers, rest = eqx.partition(system, eqx.is_array)
-    drawing = None if figure is None else _Drawing(weakref.ref(figure), Reads(figure).version)
+    drawing = None if figure is None else _Drawing(weakref.ref(figure), CapturedValues(figure).version)
     t, q, u, u_dep = (np.asarray(x)[reached] for x in (trajectory.t, trajectory.q, trajectory.u, trajectory.u_dep))
     u = np.concatenate([u, u_dep], axis=1)
     found = jax.tree.map(np.asarray, _along(numbers, rest, drawing, version_of(system), t, q, u))

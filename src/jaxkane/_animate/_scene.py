@@ -60,7 +60,7 @@ def which_way_is_up(forces: np.ndarray) -> str:
     return ("-" if down[axis] > 0 else "") + "xyz"[axis]
 
 
-def view_of(x: np.ndarray, moves: np.ndarray, leader: np.ndarray, follow: bool | None) -> View:
+def view_of(x: np.ndarray, moves: np.ndarray, center_of_mass: np.ndarray, follow: bool | None) -> View:
     """A view of vertices (F, V, 3): from the front of what moves in a plane, else obliquely from above.
 
     `moves` (V,): which vertices belong to parts; the others stand still.
@@ -69,8 +69,8 @@ def view_of(x: np.ndarray, moves: np.ndarray, leader: np.ndarray, follow: bool |
     center = 0.5 * (low + high)
     reach = float(np.linalg.norm(x - center, axis=-1).max())
     carried = x[:, moves] if moves.any() else x
-    size = float(np.linalg.norm(carried - leader[:, None], axis=-1).max())
-    travel = float(np.linalg.norm(np.ptp(leader, axis=0)))
+    size = float(np.linalg.norm(carried - center_of_mass[:, None], axis=-1).max())
+    travel = float(np.linalg.norm(np.ptp(center_of_mass, axis=0)))
     if follow is None:
         follow = travel > 4.0 * size
     depth = np.abs(x - x[:1]).max(axis=(0, 1))  # how far anything moves along each axis
@@ -120,7 +120,7 @@ class Scene:
     - `t` (F,) [s]; `rotation` (F, R, 4): unit quaternions, scalar last, of the first R parts; `position` (F, P, 3) [m]
         of all parts. The parts after R are points.
     - `vertex` (V, 3) [m] in the part `owner` (V,), or in N where that is -1.
-    - `leader` (F, 3): the mass centre of the whole, which the camera may follow.
+    - `center_of_mass` (F, 3): the mass centre of the whole, which the camera may follow.
     - `ground`: height of the ground [m], or None.
     """
 
@@ -130,19 +130,19 @@ class Scene:
     vertex: np.ndarray
     owner: np.ndarray
     shapes: Sequence[Shape]
-    leader: np.ndarray
+    center_of_mass: np.ndarray
     ground: float | None
     view: View
     title: str
     name: str
 
     def at(self, t: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices (n, V, 3) and the leader (n, 3) at times (n,), interpolated."""
+        """Vertices (n, V, 3) and the center_of_mass (n, 3) at times (n,), interpolated."""
         t = np.clip(np.atleast_1d(t), self.t[0], self.t[-1])
         i = np.clip(np.searchsorted(self.t, t, side="right") - 1, 0, len(self.t) - 2)
         s = ((t - self.t[i]) / (self.t[i + 1] - self.t[i]))[:, None, None]
         position = (1.0 - s) * self.position[i] + s * self.position[i + 1]
-        leader = (1.0 - s[:, 0]) * self.leader[i] + s[:, 0] * self.leader[i + 1]
+        center_of_mass = (1.0 - s[:, 0]) * self.center_of_mass[i] + s[:, 0] * self.center_of_mass[i + 1]
         x = np.broadcast_to(self.vertex, (len(t), *self.vertex.shape)).copy()
         for k in range(self.position.shape[1]):
             mine = self.owner == k
@@ -150,7 +150,7 @@ class Scene:
                 R = Slerp(self.t, Rotation.from_quat(self.rotation[:, k]))(t).as_matrix()
                 x[:, mine] = np.einsum("nij,vj->nvi", R, self.vertex[mine])
             x[:, mine] += position[:, k, None]
-        return x, leader
+        return x, center_of_mass
 
 
 _SAME = 1e-6  # relative to the size of the scene: what moves less stands still

@@ -151,7 +151,7 @@ def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
 SCRATCH = ".tmp"
 
 
-def write_whole(path: Path, put: Callable[[BinaryIO], Any], *, replace: bool = True) -> bool:
+def atomic_write(path: Path, put: Callable[[BinaryIO], Any], *, replace: bool = True) -> bool:
     """Write under a name of its own (`*.tmp`), bring that to the disk, rename it: no reader ever sees a part.
 
     **Arguments:** `put` writes into the open file. `replace`: with False a file that is there already stays.

@@ -69,7 +69,7 @@ def _is_as_expected() -> bool:
     return "save_state" in state and saved == {"saveat_ts_index", "ts", "ys", "save_index"} and "term" in term
 
 
-def keeping(ts: Array, adjoint: diffrax.AbstractAdjoint, anew: bool = False) -> dict[str, Any]:
+def saveat_and_adjoint(ts: Array, adjoint: diffrax.AbstractAdjoint, anew: bool = False) -> dict[str, Any]:
     """What `diffeqsolve` is asked for that is to keep the states at rising times (n_t,), and the last one: `adjoint`
     and `saveat`. `anew`: as diffrax does it, for an adjoint of the user, or a progress meter that asks for the end.
     """
@@ -85,7 +85,7 @@ def keeping(ts: Array, adjoint: diffrax.AbstractAdjoint, anew: bool = False) -> 
 _AS_EXPECTED = _is_as_expected()
 
 
-class WrittenOut(diffrax.AbstractAdaptiveSolver[Any]):
+class UnrolledERK(diffrax.AbstractAdaptiveSolver[Any]):
     """An explicit Runge-Kutta method of diffrax whose stages are written out, each a weighted sum and one call.
 
         y_i = y0 + sum_j a_ij k_j,   k_i = h f(t0 + c_i h, y_i),   y1 = y0 + sum_i b_i k_i

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._kane.kane import Instant
+from .._kane.kane import KaneEquations
 from .._scalarjit.components import Component
 from .._scalarjit.function import fused
 from .._scalarjit.linear import as_vector, determinant
@@ -172,7 +172,7 @@ class Watched(NamedTuple):
 def watched(system: System, t: Component, y: Array, y_dot: Array | None) -> Watched:
     """What may end a motion, of a packed state. `y_dot`: None where no event reads speeds."""
     state, like = unpacked(system, y), y
-    now = Instant(system, t, state.q, state.u)
+    now = KaneEquations(system, t, state.q, state.u)
     det = determinant(now.C_dep) if now.k else 1.0
     u_all_dot: Any = (0.0,) * len(now.u_all)
     if y_dot is not None:
@@ -263,7 +263,7 @@ class Limits(eqx.Module):
         return self.numbers[2]
 
 
-class Stopping(NamedTuple):
+class EventState(NamedTuple):
     """The state of a controller that stops: that of its inner controller; the quantities at the step's start; which one
     ended the motion, as a float, -1 for none and n for the bound; the end of a step that was taken back, else
     -infinity; and the end of the first step over the bound, else infinity."""
@@ -275,7 +275,7 @@ class Stopping(NamedTuple):
     last: Array
 
 
-class ToStops(diffrax.AbstractStepSizeController[Any, Any]):
+class EventController(diffrax.AbstractStepSizeController[Any, Any]):
     """A controller that begins with a given step, and whose last step ends at the last time, or where a quantity
     vanishes. The solution then ends as one with an event.
 
@@ -297,7 +297,7 @@ class ToStops(diffrax.AbstractStepSizeController[Any, Any]):
     first: Array
     limits: Limits
 
-    def wrap(self, direction: Any) -> ToStops:
+    def wrap(self, direction: Any) -> EventController:
         return eqx.tree_at(lambda c: c.controller, self, self.controller.wrap(direction))
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):  # type: ignore[override]
@@ -305,10 +305,10 @@ class ToStops(diffrax.AbstractStepSizeController[Any, Any]):
         start = self._watched(t0, y0, args)
         if start is not None:
             start = _begun(self.limits, start)
-        return end, Stopping(inner, start, *(jnp.full_like(t0, x) for x in (-1.0, -jnp.inf, jnp.inf)))
+        return end, EventState(inner, start, *(jnp.full_like(t0, x) for x in (-1.0, -jnp.inf, jnp.inf)))
 
     def adapt_step_size(self, t0: Any, t1: Any, y0, y1_candidate, args, y_error, error_order, controller_state):  # type: ignore[override]
-        state: Stopping = controller_state
+        state: EventState = controller_state
         following: Any = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, state.inner
         )
@@ -350,7 +350,7 @@ class _Decision(NamedTuple):
     ends: Array
     lost: Array
     unchanged: Array
-    state: Stopping
+    state: EventState
 
 
 @fused
@@ -361,7 +361,7 @@ def _begun(limits: Limits, start: Quantities) -> Quantities:
 
 
 @fused
-def _decision(limits: Limits, state: Stopping, now: Quantities | None, step: Step) -> _Decision:
+def _decision(limits: Limits, state: EventState, now: Quantities | None, step: Step) -> _Decision:
     # One function of scalars: as a hundred operations it would be as many programs, and half of XLA's work.
     # What is left of a step that was taken back is gone at once: a fixed step stays on its grid.
     going_on = step.keep & (step.t1 < state.until)
@@ -377,7 +377,7 @@ def _decision(limits: Limits, state: Stopping, now: Quantities | None, step: Ste
     return found._replace(next_t1=jnp.where(near, last, found.next_t1), ends=found.ends | arrived)
 
 
-def _watching(limits: Limits, state: Stopping, now: Quantities, step: Step, going_on: Array) -> _Decision:
+def _watching(limits: Limits, state: EventState, now: Quantities, step: Step, going_on: Array) -> _Decision:
     start: Any = state.start
     t0, t1 = jax.lax.stop_gradient((step.t0, step.t1))
     h, kept = t1 - t0, step.keep
@@ -403,7 +403,7 @@ def _watching(limits: Limits, state: Stopping, now: Quantities, step: Step, goin
         ends=there | at_start | at_bound,
         lost=lost,
         unchanged=going_on | taken_back,
-        state=Stopping(
+        state=EventState(
             inner=None,
             start=_where(kept & ~taken_back, now, start),
             which=which,
@@ -431,8 +431,8 @@ def _first(limits: Limits, start: Quantities, now: Quantities, h: Array) -> tupl
     return first, where
 
 
-class AdaptiveToStops(ToStops, diffrax.AbstractAdaptiveStepSizeController[Any, Any]):
-    """`ToStops` around a controller with tolerances, which implicit solvers ask for."""
+class AdaptiveToStops(EventController, diffrax.AbstractAdaptiveStepSizeController[Any, Any]):
+    """`EventController` around a controller with tolerances, which implicit solvers ask for."""
 
     @property
     def rtol(self) -> Any:  # type: ignore[override]

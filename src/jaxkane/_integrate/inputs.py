@@ -325,7 +325,7 @@ def signals_are_sound(signals: Any) -> Array:
     return jnp.all(jnp.stack([jnp.array(True), *finite, *(jnp.all(x.ts[1:] > x.ts[:-1]) for x in samples_of(signals))]))
 
 
-def without_nonsense(signals: Any, valid: Array) -> Any:
+def mask_invalid_inputs(signals: Any, valid: Array) -> Any:
     """The signals where they are valid, else others of the same shapes that spoil no derivative."""
 
     times: dict[int, Array] = {}  # signals that share their times go on sharing them: see `kinks_of`

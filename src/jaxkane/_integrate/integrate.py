@@ -16,8 +16,8 @@ from .._common.lookup import not_there
 from .._kane.arguments import checked_inputs
 from .._kane.checks import configuration_is_met
 from .._kane.constraints import correction, has_configuration_constraints, projected
-from .._kane.kane import Instant
-from .._kane.rhs import outputs_at, packed_rates, rates_are_native, values_of
+from .._kane.kane import KaneEquations
+from .._kane.rhs import outputs_at, rates_are_native, values_of, vector_field
 from .._scalarjit.cache_key import captured, compiled, reads_any
 from .._scalarjit.components import Component
 from .._scalarjit.function import fused
@@ -25,7 +25,7 @@ from .._scalarjit.linear import as_vector
 from .._scalarjit.nan import all_finite, derivative_free_where_not_finite, flat, nan_derivative_where, nan_where
 from .._system.parameters import ANY, ParameterInfo, parameters_in
 from .._system.system import State, System, names_of, packed, units_of, unpacked
-from .diffrax_compat import WrittenOut, keeping
+from .diffrax_compat import UnrolledERK, saveat_and_adjoint
 from .events import Events, at_zero, events_of
 from .inputs import (
     Kinks,
@@ -33,10 +33,10 @@ from .inputs import (
     evaluate,
     for_fixed_steps,
     kinks_of,
+    mask_invalid_inputs,
     samples_of,
     signals_are_sound,
     with_own_times,
-    without_nonsense,
 )
 from .settings import SCALARS_UP_TO, Settings, refuse_held
 from .step_control import Times, controller_of, times_of
@@ -135,7 +135,7 @@ class Now(eqx.Module):
             if values is not None and name in names:
                 return values[names.index(name)]
         if name in system.dependent_speeds:
-            now = Instant(system, self.t, self.q, self.u)
+            now = KaneEquations(system, self.t, self.q, self.u)
             return jnp.asarray(now.u_dep[system.dependent_speeds.index(name)])
         raise not_there(name, [each for names in names_of(system) for each in names], "the state")
 
@@ -199,7 +199,7 @@ def solve(
     # what all members of a batch share remains shared, of which a kernel computes its part once.
     stepped = sound(system)
     system, state = safe(valid, (system, state))
-    signals = without_nonsense(signals, valid)
+    signals = mask_invalid_inputs(signals, valid)
     y = packed(state)
     state_at = lambda t, y: _now(system, t, unpacked(system, y))  # noqa: E731
     kinks = kinks_of(signals, _calling_samples(system), times.start, y, state_at, fixed=settings.step is not None)
@@ -228,7 +228,7 @@ def _calling_samples(system: System) -> dict[str, Callable[..., Any]]:
     outside, by the system's name."""
 
     def rates(t: Array, now: Now) -> Array:
-        return packed_rates(system, t, packed(State(now.q, now.u, now.x)), {})
+        return vector_field(system, t, packed(State(now.q, now.u, now.x)), {})
 
     return {type(system).__name__: rates} if samples_of(system) or reads_any(Samples, system) else {}
 
@@ -252,7 +252,7 @@ def _rates(valid: Array, stabilize: float) -> Callable[..., Any]:
         inputs, more = inputs_at(system, signals, t, state), None
         if disturbance is not None:
             inputs, more = disturbance(t, inputs, state)
-        y_dot = packed_rates(system, t, y, inputs)
+        y_dot = vector_field(system, t, y, inputs)
         if more is not None:
             y_dot += packed(more)
         if stabilize:
@@ -275,7 +275,7 @@ def _integrated(asked: _Asked) -> _Found:
     solver: Any = settings.solver
     inputs = inputs_at(asked.system, asked.signals, times.start, unpacked(asked.system, asked.start))
     if isinstance(solver, diffrax.AbstractERK) and rates_are_native(stepped, times.start, asked.start, inputs):
-        solver = WrittenOut(solver)
+        solver = UnrolledERK(solver)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(asked.rates if forward else trial_rates),
         solver,
@@ -285,7 +285,7 @@ def _integrated(asked: _Asked) -> _Found:
         asked.start,
         asked.args,
         stepsize_controller=controller_of(times, asked.rates, asked.events, stepped, asked.kinks, settings),
-        **keeping(asked.ts, settings.adjoint, anew=settings.progress),
+        **saveat_and_adjoint(asked.ts, settings.adjoint, anew=settings.progress),
         max_steps=settings.max_steps,
         progress_meter=diffrax.TqdmProgressMeter() if settings.progress else diffrax.NoProgressMeter(),
         throw=False,
@@ -393,7 +393,7 @@ def inputs_at(system: System, signals: Any, t: Component, state: State, all_of_t
 @fused
 def _dependent_speeds_of(system: System, t: Array, y: Array) -> Array:
     state = unpacked(system, y)
-    return as_vector(Instant(system, t, state.q, state.u).u_dep, y)
+    return as_vector(KaneEquations(system, t, state.q, state.u).u_dep, y)
 
 
 def _status(solution: diffrax.Solution, events: Events) -> Array:

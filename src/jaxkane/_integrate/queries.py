@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._kane.equations import InputValues, _arrays, _dependent_accelerations, finite_or_explained
-from .._kane.kane import Instant, motion_rates
+from .._kane.kane import KaneEquations, motion_rates
 from .._kane.reactions import forces_now, multipliers_now
 from .._kane.rhs import outputs_at, rates
 from .._scalarjit.cache_key import compiled
@@ -164,32 +164,32 @@ def constraint_multipliers(
     return along(multipliers_now, system, t, q, u, inputs)
 
 
-def _points(now: Instant) -> dict[str, Point]:
+def _points(now: KaneEquations) -> dict[str, Point]:
     motion = now.motion(now.t, now.q, now.u_all)
     return {body.name: body.center for body in motion.bodies} | motion.points
 
 
-def _frames(now: Instant) -> dict[str, Frame]:
+def _frames(now: KaneEquations) -> dict[str, Frame]:
     motion = now.motion(now.t, now.q, now.u_all)
     return {body.name: body.frame for body in motion.bodies} | motion.frames
 
 
 @fused
 def _positions(system, t, q, u, inputs):
-    points = _points(Instant(system, t, q, u, inputs))
+    points = _points(KaneEquations(system, t, q, u, inputs))
     found = {name: point.position for name, point in points.items() if point.has_position}
     return {name: as_vector(r.components_in(r.frame.root), q) for name, r in found.items()}
 
 
 @fused
 def _velocities(system, t, q, u, inputs):
-    found = {name: point.velocity for name, point in _points(Instant(system, t, q, u, inputs)).items()}
+    found = {name: point.velocity for name, point in _points(KaneEquations(system, t, q, u, inputs)).items()}
     return {name: as_vector(v.components_in(v.frame.root), q) for name, v in found.items()}
 
 
 @fused
 def _orientations(system, t, q, u, inputs):
-    frames = _frames(Instant(system, t, q, u, inputs))
+    frames = _frames(KaneEquations(system, t, q, u, inputs))
     return {name: frame.matrix(frame.root).astype(q.dtype) for name, frame in frames.items()}
 
 

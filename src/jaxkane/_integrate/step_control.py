@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from .._scalarjit.function import fused
 from .._system.system import System
-from .events import AdaptiveToStops, Events, Limits, Quantities, ToStops, watched
+from .events import AdaptiveToStops, EventController, Events, Limits, Quantities, watched
 from .inputs import Kinks
 from .settings import SCALARS_UP_TO, Settings
 
@@ -28,7 +28,7 @@ def rms(y: Array) -> Array:
     return jnp.sqrt(jnp.mean(jnp.square(y)))
 
 
-class ByError(diffrax.AbstractAdaptiveStepSizeController[Any, Any]):
+class ErrorController(diffrax.AbstractAdaptiveStepSizeController[Any, Any]):
     """The steps of `diffrax.PIDController(rtol, atol)`, to rounding errors, by one program of scalars: as twenty
     operations of arrays they would take XLA a tenth of its time.
 
@@ -51,7 +51,7 @@ class ByError(diffrax.AbstractAdaptiveStepSizeController[Any, Any]):
     def atol(self) -> Array:  # type: ignore[override]
         return self.tolerance[1]
 
-    def wrap(self, direction: Any) -> ByError:
+    def wrap(self, direction: Any) -> ErrorController:
         return self
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):  # type: ignore[override]
@@ -89,7 +89,7 @@ def _adapted(tolerance: _Tolerance, t0: Array, t1: Array, y0: Array, y1: Array, 
     return keep, next_t0, next_t0 + step, step < shortest
 
 
-class ToKinks(diffrax.AbstractAdaptiveStepSizeController[Any, Any]):
+class ClipToDiscontinuities(diffrax.AbstractAdaptiveStepSizeController[Any, Any]):
     """A controller whose steps do not run over those of `times` (n,), in rising order, that come before `end`.
 
     A step over a kink would be of first order, whatever the solver. What is left before a kink is gone in one step, or
@@ -122,8 +122,8 @@ class ToKinks(diffrax.AbstractAdaptiveStepSizeController[Any, Any]):
     def norm(self) -> Any:  # type: ignore[override]
         return self.controller.norm
 
-    def wrap(self, direction: Any) -> ToKinks:
-        return ToKinks(self.controller.wrap(direction), jnp.sort(self.times * direction), self.anew)
+    def wrap(self, direction: Any) -> ClipToDiscontinuities:
+        return ClipToDiscontinuities(self.controller.wrap(direction), jnp.sort(self.times * direction), self.anew)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):  # type: ignore[override]
         end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
@@ -203,22 +203,22 @@ def controller_of(
     system: System,
     kinks: Kinks | None,
     settings: Settings,
-) -> ToStops:
+) -> EventController:
     """The controller of the steps, which ends the motion: at the last time, at the events, and before the dependent
     speeds are singular."""
 
     def watch(t, y, args):
         return Quantities(*watched(args[0], t, y, vector_field(t, y, args) if events.read_speeds else None))
 
-    controller: Any = ByError(times.tolerance)  # pyright: ignore[reportCallIssue]
+    controller: Any = ErrorController(times.tolerance)  # pyright: ignore[reportCallIssue]
     kind: Any = AdaptiveToStops
     first = times.first
     if settings.step is not None:
         # A fixed step is spread evenly over the whole time: a rounding error must not make it one step more, after
         # which no step would end where a sample of an input stands.
         first = (1.0 + jnp.finfo(times.end.dtype).eps ** 0.5) * settings.step
-        controller, kind = diffrax.ConstantStepSize(), ToStops
+        controller, kind = diffrax.ConstantStepSize(), EventController
     elif kinks is not None:
-        controller = ToKinks(controller, kinks.times, kinks.anew, end=times.end)
+        controller = ClipToDiscontinuities(controller, kinks.times, kinks.anew, end=times.end)
     stops = events.names or system.dependent_speeds
     return kind(controller, watch if stops else None, first, Limits(events.directions, times.end, times.numbers))

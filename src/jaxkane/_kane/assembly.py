@@ -22,7 +22,7 @@ from .arguments import as_array, check_is_system, check_time
 from .checks import check_system, configuration_tolerance, implied_residual, is_concrete
 from .consistency import configuration_residual
 from .equations import dependent_speeds
-from .evaluate import structure_of, with_trial_numbers
+from .evaluate import at_random_point, structure_of
 
 
 class Plan(NamedTuple):
@@ -73,7 +73,7 @@ def euler_parameters(system: System) -> list[tuple[int, ...]]:
         rng = np.random.default_rng(0)
         probe = rng.uniform(0.2, 0.9, len(system.coordinates)).astype(jnp.result_type(float))
         with concretely():
-            trial = with_trial_numbers((system, np.zeros((), probe.dtype), probe), rng)
+            trial = at_random_point((system, np.zeros((), probe.dtype), probe), rng)
             values = np.abs(in_numbers(configuration_residual, *trial))
         found = _EULER_PARAMETERS[structure] = [
             (i, i + 1, i + 2, i + 3)

@@ -24,8 +24,8 @@ from .._system.system import State, System
 from .arguments import Row
 from .consistency import check_description, configuration_residual
 from .constraints import constraint_rows, dependent_speeds_from
-from .evaluate import Reading
-from .kane import Instant, rates_and_equations
+from .evaluate import DescriptionEvaluator
+from .kane import KaneEquations, rates_and_equations
 
 ROUNDING, MEASURED = 2e-3, 0.05
 
@@ -62,7 +62,7 @@ def _value(x: Any) -> Any:
 
 @fused
 def _masses_and_inertias(system: System, t: Any, q: Any):
-    bodies = Reading(system).read("bodies", t, *_at_rest(system, q))
+    bodies = DescriptionEvaluator(system).read("bodies", t, *_at_rest(system, q))
     return [(jnp.asarray(mass), stack(inertia)) for mass, inertia in bodies]
 
 
@@ -82,7 +82,7 @@ def check_bodies(system: System, t: Any, q: Any) -> None:
         mass, I = float(mass), np.asarray(I, dtype=float)  # [kg], (3,3) [kg m^2]
         fault = _fault(mass, I) or (_excess_in_words(I) if system.check_inertia else "")
         if fault:
-            body = Reading(system).motion(t, *_at_rest(system, q)).bodies[i]
+            body = DescriptionEvaluator(system).motion(t, *_at_rest(system, q)).bodies[i]
             message = f"{type(system).__name__}, body {body.name!r}: {fault}"
             if why_no_body(mass, I, system.check_inertia):
                 raise ValueError(message)
@@ -284,7 +284,7 @@ def diagnosis(system: System, t: Any, q: Any, u: Any, inputs: Any = None) -> str
 
 
 def _loads_not_finite(system: System, t: Any, q: Any, u: Any, inputs: Any) -> str:
-    now = Instant(system, t, q, u, inputs)
+    now = KaneEquations(system, t, q, u, inputs)
     motion = now.motion(now.t, now.q, now.u_all)
     reason = system.why_not_finite(motion, now.inputs)
     if reason:

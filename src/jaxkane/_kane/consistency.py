@@ -20,14 +20,14 @@ from .._system.frames import Frame
 from .._system.motion import Motion
 from .._system.points import Point
 from .._system.system import System
-from .evaluate import Reading, frames_of, structure_of, turning_bodies, with_trial_numbers
+from .evaluate import DescriptionEvaluator, at_random_point, frames_of, structure_of, turning_bodies
 
 Found = dict[tuple[Any, ...], Any]  # (number, kind, names ...) -> numbers; the number keeps the order of the reading
 
 
 @fused
-def facts_of(system: System, t: Any, q: Any, u: Any, inputs: Any) -> Found:
-    reading = Reading(system, inputs)
+def consistency_quantities(system: System, t: Any, q: Any, u: Any, inputs: Any) -> Found:
+    reading = DescriptionEvaluator(system, inputs)
     q, u, like = tuple(q[i] for i in range(len(q))), tuple(u[i] for i in range(len(u))), q
     motion = reading.motion(t, q, u)
     loads = reading.loads_at(t, q, u, motion)
@@ -45,7 +45,7 @@ def facts_of(system: System, t: Any, q: Any, u: Any, inputs: Any) -> Found:
 def turning_of(system: System, t: Any, q: Any, u: Any) -> tuple[Any, Any, Any]:
     """Orientations of frames in their parents (f, 3, 3); of bodies that turn in their frames, how, and their inertia
     (b, 4, 3); and the velocity residuals (k,)."""
-    reading, like = Reading(system), q
+    reading, like = DescriptionEvaluator(system), q
     q, u = tuple(q[i] for i in range(len(q))), tuple(u[i] for i in range(len(u)))
     orientations, spins = reading.read("orientations", t, q, u)
     as_arrays = lambda xs: [stack(x).astype(like.dtype) for x in xs]  # noqa: E731
@@ -55,7 +55,7 @@ def turning_of(system: System, t: Any, q: Any, u: Any) -> tuple[Any, Any, Any]:
 Fact = tuple[tuple[str, ...], list[tuple[Component, ...]]]
 
 
-def _of_speeds(reading: Reading, t: Any, q: Any, u: Any) -> Iterator[Fact]:
+def _of_speeds(reading: DescriptionEvaluator, t: Any, q: Any, u: Any) -> Iterator[Fact]:
     for name, rate in zip(reading.system.coordinates, reading.rates(t, q, u), strict=True):
         yield ("rate", name), [(rate,)]
     for i, residual in enumerate(reading.residuals(t, q, u)):
@@ -124,7 +124,7 @@ def _is_sure(point: Point) -> bool:
 @fused
 def configuration_residual(system: System, t: Any, q: Any):
     """Residuals (h,) of the configuration constraints."""
-    return as_vector(Reading(system).configuration(t, tuple(q[i] for i in range(len(q)))), q)
+    return as_vector(DescriptionEvaluator(system).configuration(t, tuple(q[i] for i in range(len(q)))), q)
 
 
 _CHECKED = LRUCache()  # structures
@@ -150,7 +150,7 @@ def check_description(system: System, t: Any, q: Any) -> None:
     structure = structure_of(system)
     if structure not in _CHECKED:
         rng = np.random.default_rng(0)
-        if _Description(*with_trial_numbers((system, t, q), rng), rng=rng).check():
+        if _Description(*at_random_point((system, t, q), rng), rng=rng).check():
             _CHECKED[structure] = None
     if q is not None and not any(isinstance(x, Tracer) for x in jax.tree.leaves((system, t, q))):
         _check_numbers(system, t, q)
@@ -165,7 +165,7 @@ def _check_numbers(system: System, t: Any, q: Any) -> None:
     wrong = [i for i, R in enumerate(orientations) if _rotation_error(R) > ROTATION_ERROR]  # NaN is another check's
     if not wrong and all(map(_is_symmetric, spins)):
         return
-    name, motion = type(system).__name__, Reading(system).motion(t, tuple(q), tuple(u))
+    name, motion = type(system).__name__, DescriptionEvaluator(system).motion(t, tuple(q), tuple(u))
     if wrong:
         raise ValueError(f"{name}: " + _no_rotation(frames_of(motion)[wrong[0]], orientations[wrong[0]]))
     _, spins, _ = read(_on_residuals(lambda u: read(u)[2], u))
@@ -231,14 +231,14 @@ class _Description:
         return self._check_state(beside.astype(self.q.dtype)) or judged
 
     def read(self, q: np.ndarray, u: np.ndarray) -> Found:
-        return in_numbers(facts_of, self.system, self.t, q, u.astype(q.dtype), self.inputs)
+        return in_numbers(consistency_quantities, self.system, self.t, q, u.astype(q.dtype), self.inputs)
 
     def read_along(self, q: np.ndarray, u: np.ndarray, now: Found) -> Found:
         """How all that is read changes along the motion [1/s]."""
         q_dot = np.concatenate([x.ravel() for x in _of_kind(now, "rate").values()])
         at = self.system, self.t, q, u.astype(q.dtype), self.inputs
         along = None, np.ones((1,), q.dtype), q_dot[:, None], None, None
-        return jax.tree.map(lambda x: x[..., 0], derivative_in_numbers(facts_of, at, along))
+        return jax.tree.map(lambda x: x[..., 0], derivative_in_numbers(consistency_quantities, at, along))
 
     def _trial_speeds(self) -> np.ndarray:
         n = len(self.speeds)

@@ -20,7 +20,7 @@ from .._scalarjit.linear import as_vector, solve, stack
 from .._system.system import System
 from .arguments import as_array, check_is_system, check_time, refuse_incomplete
 from .consistency import configuration_residual
-from .kane import Instant
+from .kane import KaneEquations
 
 
 def correction(system: System, t: Component, q: Array) -> Float[Array, " n_q"]:
@@ -127,7 +127,7 @@ def best_dependent_speeds(system: System, t: Component, q: Any) -> DependentSpee
 @fused
 def constraint_rows(system: System, t: Component, q: Array) -> tuple[Array, Array]:
     """C (k, n + k) and c0 (k,) of the velocity residuals."""
-    now = Instant(system, t, q, jnp.zeros(len(system.speeds), q.dtype))
+    now = KaneEquations(system, t, q, jnp.zeros(len(system.speeds), q.dtype))
     rows = [(*a, *b) for a, b in zip(now.C_ind, now.C_dep, strict=True)]
     c0 = now.residuals(now.t, now.q, (0.0,) * (now.n + now.k))
     return stack(rows).astype(q.dtype), as_vector(c0, q)

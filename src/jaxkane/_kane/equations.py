@@ -1,4 +1,4 @@
-"""The public functions of Kane's method, as arrays. Knows `Instant`, which holds the method itself.
+"""The public functions of Kane's method, as arrays. Knows `KaneEquations`, which holds the method itself.
 
 Each is one compiled function (`_scalarjit.function`), alone, under `jax.jit` and in a derivative of any order.
 """
@@ -21,7 +21,7 @@ from .._system.system import System
 from .arguments import as_array, as_row, check_is_system, check_time, checked_values, refuse_incomplete
 from .checks import check_system, diagnosis, is_concrete, met_or_refused
 from .evaluate import jvp
-from .kane import Instant, motion_rates, rates_and_equations
+from .kane import KaneEquations, motion_rates, rates_and_equations
 
 InputValues = Mapping[str, Component] | None
 
@@ -110,7 +110,7 @@ def partial_velocities(
 
 @fused
 def _partial_velocities(system, t, q, u, inputs):
-    now = Instant(system, t, q, u, inputs)
+    now = KaneEquations(system, t, q, u, inputs)
     motion, partials = now.motion(now.t, now.q, now.u_all), now.partials()
     V, W = [], []
     for i, body in enumerate(motion.bodies):
@@ -129,7 +129,7 @@ def generalized_active_forces(
 
 @fused
 def _generalized_active_forces(system, t, q, u, inputs):
-    now = Instant(system, t, q, u, inputs)
+    now = KaneEquations(system, t, q, u, inputs)
     return as_vector(now.active_forces(now.partials()), q)
 
 
@@ -149,7 +149,7 @@ def generalized_inertia_forces(
 
 @fused
 def _generalized_inertia_forces(system, t, q, u, inputs, u_dot):
-    now = Instant(system, t, q, u, inputs)
+    now = KaneEquations(system, t, q, u, inputs)
     partials = now.partials()
     Fr_star = now.inertia_forces(partials)
     if u_dot is not None:
@@ -165,7 +165,7 @@ def coordinate_rates(system: System, t: Component, q: Any, u: Any) -> Float[Arra
 
 @fused
 def _coordinate_rates(system, t, q, u, inputs):
-    return as_vector(Instant(system, t, q, u).q_dot, q)
+    return as_vector(KaneEquations(system, t, q, u).q_dot, q)
 
 
 def dependent_speeds(system: System, t: Component, q: Any, u: Any) -> Float[Array, " k"]:
@@ -175,7 +175,7 @@ def dependent_speeds(system: System, t: Component, q: Any, u: Any) -> Float[Arra
 
 @fused
 def _dependent_speeds(system, t, q, u, inputs):
-    return as_vector(Instant(system, t, q, u).u_dep, q)
+    return as_vector(KaneEquations(system, t, q, u).u_dep, q)
 
 
 def dependent_accelerations(
@@ -188,7 +188,7 @@ def dependent_accelerations(
 
 @fused
 def _dependent_accelerations(system, t, q, u, inputs, u_dot):
-    now = Instant(system, t, q, u, inputs)
+    now = KaneEquations(system, t, q, u, inputs)
     return as_vector(now.dependent_accelerations(as_row(u_dot, system.speeds, "u_dot")), q)
 
 
@@ -199,7 +199,7 @@ def constraint_jacobian(system: System, t: Component, q: Any) -> Float[Array, "k
 
 @fused
 def _constraint_jacobian(system, t, q, u, inputs):
-    return stack(Instant(system, t, q, u).J).astype(q.dtype).T
+    return stack(KaneEquations(system, t, q, u).J).astype(q.dtype).T
 
 
 def constraint_jacobian_rate(system: System, t: Component, q: Any, u: Any) -> Float[Array, "k n"]:
@@ -214,9 +214,9 @@ def constraint_jacobian_rate(system: System, t: Component, q: Any, u: Any) -> Fl
 
 @fused
 def _constraint_jacobian_rate(system, t, q, u, inputs):
-    now = Instant(system, t, q, u)
+    now = KaneEquations(system, t, q, u)
     still = (0.0,) * now.n
-    _, J_dot = jvp(lambda t, *q: Instant(system, t, q, still).J, (now.t, *now.q), (1.0, *now.q_dot))
+    _, J_dot = jvp(lambda t, *q: KaneEquations(system, t, q, still).J, (now.t, *now.q), (1.0, *now.q_dot))
     return stack(J_dot).astype(q.dtype).T
 
 
@@ -227,5 +227,5 @@ def kinetic_energy(system: System, t: Component, q: Any, u: Any) -> Float[Array,
 
 @fused
 def _kinetic_energy(system, t, q, u, inputs):
-    now = Instant(system, t, q, u)
+    now = KaneEquations(system, t, q, u)
     return as_vector([kinetic_energy_of(now.motion(now.t, now.q, now.u_all))], q)[0]

@@ -78,7 +78,7 @@ def unit(n: int, r: int) -> Row:
     return tuple(1.0 if i == r else 0.0 for i in range(n))
 
 
-class Reading:
+class DescriptionEvaluator:
     """What the description of a system says, at any time, coordinates and speeds.
 
     `read` gives parts of it as components, from a record of the description; `motion` reads the description itself.
@@ -97,7 +97,7 @@ class Reading:
         self._memory: dict[Any, Any] = {}
 
     def read(self, part: str, t: Component, q: Row, u: Row) -> Any:
-        """One of the parts of `Parts`."""
+        """One of the parts of `EvaluatedDescription`."""
         return _parts(part, self.system, (dict(self.inputs), t, tuple(q), tuple(u)), self._memory)
 
     def motion(self, t: Component, q: Row, u: Row) -> Motion:
@@ -131,10 +131,10 @@ class Reading:
         return (*rolling, *h_dot)
 
 
-class Parts:
+class EvaluatedDescription:
     """What a description says at one time, coordinates and speeds, in parts that are components."""
 
-    def __init__(self, reading: Reading, t: Component, q: Row, u: Row):
+    def __init__(self, reading: DescriptionEvaluator, t: Component, q: Row, u: Row):
         self.reading, self.t, self.q, self.u = reading, t, q, u
 
     @functools.cached_property
@@ -214,7 +214,7 @@ def frames_of(motion: Motion, loads: Iterable[Load] = ()) -> list[Frame]:
 @recorded
 def _parts(system: System, components: Any) -> dict[str, Any]:
     inputs, t, q, u = components
-    said = Parts(Reading(system, inputs), t, q, u)
+    said = EvaluatedDescription(DescriptionEvaluator(system, inputs), t, q, u)
     parts = "rates configuration rolling bodies orientations velocities momenta turning forces"
     return {part: getattr(said, part)() for part in parts.split()}
 
@@ -237,7 +237,7 @@ def dtype_of(system: System) -> Any:
     return np.result_type(*dtypes) if dtypes else jnp.result_type(float)
 
 
-def with_trial_numbers(tree: tuple[System, Any, Any], rng: np.random.Generator) -> tuple[System, Any, Any]:
+def at_random_point(tree: tuple[System, Any, Any], rng: np.random.Generator) -> tuple[System, Any, Any]:
     """Numbers for what is traced: positive parameters, small coordinates; arrays of length 1, as axes and quaternions
     are, and unit matrices."""
     system, t, q = tree

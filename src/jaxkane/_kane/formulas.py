@@ -16,7 +16,7 @@ import numpy as np
 
 from .._scalarjit.compat import FUSES, ClosedJaxpr, jaxpr_as_fun
 from .._scalarjit.graph import Graph, NotScalarError, unrolled
-from .._scalarjit.jaxpr import jacobian, without_repetition
+from .._scalarjit.jaxpr import cse, jacobian
 from .._scalarjit.linear import as_vector, is_written_out
 from .._system.parameters import ANY, ParameterInfo, declared, in_batches, leaf_name
 from .._system.system import System
@@ -31,7 +31,7 @@ from .equations import (
     kinetic_energy,
     partial_velocities,
 )
-from .evaluate import Reading
+from .evaluate import DescriptionEvaluator
 from .kane import motion_rates
 from .rhs import rates
 
@@ -47,16 +47,16 @@ class Function(NamedTuple):
 
 def _all_rates(system, t, q, u, w, u_dep):
     """Rates of the coordinates by all speeds, dependent ones too."""
-    now = Reading(system)
+    now = DescriptionEvaluator(system)
     return (as_vector(now.rates(t, as_row(q, system.coordinates, "q"), (*u, *u_dep)), q),)
 
 
 def _velocity_residuals(system, t, q, u, w, u_dep):
-    return (as_vector(Reading(system).residuals(t, as_row(q, system.coordinates, "q"), (*u, *u_dep)), q),)
+    return (as_vector(DescriptionEvaluator(system).residuals(t, as_row(q, system.coordinates, "q"), (*u, *u_dep)), q),)
 
 
 def _configuration_residuals(system, t, q, u, w, u_dep):
-    return (as_vector(Reading(system).configuration(t, as_row(q, system.coordinates, "q")), q),)
+    return (as_vector(DescriptionEvaluator(system).configuration(t, as_row(q, system.coordinates, "q")), q),)
 
 
 FUNCTIONS: dict[str, Function] = {
@@ -178,7 +178,7 @@ class Formulas:
             raise ValueError(f"{self.name} has no states of the first order, so that there is no {function!r}.")
         specs = [jax.ShapeDtypeStruct(a.shape, self.dtype) for a in self.arguments]
         with jax.enable_x64(self.dtype == "float64"):
-            return without_repetition(jax.make_jaxpr(functools.partial(self.evaluate, function))(*specs))
+            return cse(jax.make_jaxpr(functools.partial(self.evaluate, function))(*specs))
 
     def _nodes(self, function: str) -> dict[str, np.ndarray]:
         """The outputs of a function by name, as nodes."""

@@ -34,10 +34,10 @@ from .._system.forces import Load
 from .._system.motion import Motion
 from .._system.system import System
 from .arguments import Row, as_row
-from .evaluate import Reading, jvp, transposed, unit
+from .evaluate import DescriptionEvaluator, jvp, transposed, unit
 
 
-class Instant(Reading):
+class KaneEquations(DescriptionEvaluator):
     """A system at one time, with its coordinates and independent speeds, and what its description says there.
 
     `u_dep`, `q_dot` and the columns of `J` are formed at once, since everything else needs them.
@@ -232,30 +232,30 @@ def accelerations_and_mass_matrix(
 
 @fused
 def _motion_rates(system, t, q, u, inputs):
-    now = Instant(system, t, q, u, inputs)
+    now = KaneEquations(system, t, q, u, inputs)
     return as_vector(now.q_dot, q), as_vector(now.accelerations(), q)
 
 
 @fused
 def _equations_written_out(system, t, q, u, inputs):
-    now = Instant(system, t, q, u, inputs)
+    now = KaneEquations(system, t, q, u, inputs)
     M, f = now.equations()
     return as_vector(now.q_dot, q), stack(M).astype(q.dtype), as_vector(f, q)
 
 
 @fused
 def _accelerations_and_mass_matrix(system, t, q, u, inputs):
-    M, f = Instant(system, t, q, u, inputs).equations()
+    M, f = KaneEquations(system, t, q, u, inputs).equations()
     return as_vector(solve_positive(M, f), q), stack(M).astype(q.dtype)
 
 
 @fused
 def _rates_and_forcing(system, t, q, u, inputs):
-    now = Instant(system, t, q, u, inputs)
+    now = KaneEquations(system, t, q, u, inputs)
     return as_vector(now.q_dot, q), as_vector(now.forcing(), q)
 
 
 @fused
 def _mass_times(system, t, q, u, inputs, direction):
-    now = Instant(system, t, q, u, inputs)
+    now = KaneEquations(system, t, q, u, inputs)
     return as_vector(now.mass_times(as_row(direction, system.speeds, "direction")), q)

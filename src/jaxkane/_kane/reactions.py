@@ -26,8 +26,8 @@ from .._system.points import Point
 from .._system.system import System
 from .arguments import Row, as_row
 from .equations import InputValues
-from .evaluate import Parts, unit
-from .kane import Instant, motion_rates
+from .evaluate import EvaluatedDescription, unit
+from .kane import KaneEquations, motion_rates
 
 
 @compiled
@@ -62,7 +62,7 @@ class _Forces(NamedTuple):
     of_residuals: Row  # of the constraint residuals that depend on its motion
 
 
-class Reactions(Instant):
+class Reactions(KaneEquations):
     """An instant of the motion with its accelerations `u_dot` (n,), and the multipliers of its residuals.
 
     The accelerations are given: they are a program of their own, which for many speeds calls into libraries.
@@ -82,7 +82,7 @@ class Reactions(Instant):
 
     def read(self, part: str, t: Component, q: Row, u: Row) -> Any:
         # The description itself: a record knows neither virtual velocities nor auxiliary speeds.
-        return getattr(Parts(self, t, q, u), part)()
+        return getattr(EvaluatedDescription(self, t, q, u), part)()
 
     def unbalanced(self, partial: Any) -> Component:
         """R = sum F . V + T . W - V . dp/dt - W . dH/dt along one direction."""

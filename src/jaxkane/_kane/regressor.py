@@ -24,8 +24,8 @@ from .._system.points import Point
 from .._system.system import System
 from .._system.vectors import Vector
 from .arguments import Row
-from .evaluate import Parts, Reading, dtype_of, jvp, structure_of, with_trial_numbers
-from .kane import Instant
+from .evaluate import DescriptionEvaluator, EvaluatedDescription, at_random_point, dtype_of, jvp, structure_of
+from .kane import KaneEquations
 
 TEN = ("m", "mx", "my", "mz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
 """Mass [kg], first moment [kg m], and inertia [kg m^2] as matrix entries, about the body's own point."""
@@ -139,7 +139,7 @@ def _read_parts(system: System) -> tuple[tuple[Part, ...], tuple[int, ...]]:
     motions: list[Motion] = []
 
     def read(leaves: Any, t: Any, q: Any, u: Any) -> tuple[list[Any], list[Any]]:
-        motion = Reading(jax.tree.unflatten(structure, leaves)).motion(t, tuple(q), tuple(u))
+        motion = DescriptionEvaluator(jax.tree.unflatten(structure, leaves)).motion(t, tuple(q), tuple(u))
         motions[:] = [motion]
         bodies = [body for body in motion.bodies if not is_zero(body.mass)]
         spins = [body.angular_velocity - body.frame.angular_velocity for body in bodies]
@@ -165,7 +165,7 @@ def _read_parts(system: System) -> tuple[tuple[Part, ...], tuple[int, ...]]:
 
 def _at_trial_numbers(f: Callable[..., Any], system: System, n_u: int) -> Any:
     rng = np.random.default_rng(0)
-    system, t, q = with_trial_numbers((system, 0.3, None), rng)
+    system, t, q = at_random_point((system, 0.3, None), rng)
     u = rng.uniform(0.5, 1.5, n_u).astype(q.dtype)
     with concretely():
         return jax.device_get(jax.jit(f)(jax.tree.leaves(system), jnp.asarray(t, q.dtype), list(q), list(u)))
@@ -219,10 +219,10 @@ class Carried(NamedTuple):
     g: Float[Array, "b 3"]  # weight by mass [m/s^2]
 
 
-class _SaidOfPoints(Parts):
-    """As `Parts`, with the velocities of the bodies' points in the place of momenta."""
+class _SaidOfPoints(EvaluatedDescription):
+    """As `EvaluatedDescription`, with the velocities of the bodies' points in the place of momenta."""
 
-    def __init__(self, reading: Reading, parts: tuple[Part, ...], *at: Any):
+    def __init__(self, reading: DescriptionEvaluator, parts: tuple[Part, ...], *at: Any):
         super().__init__(reading, *at)
         self.parts = parts
 
@@ -242,11 +242,11 @@ class _SaidOfPoints(Parts):
 @recorded
 def _said(described: Described, components: Any) -> dict[str, Any]:
     inputs, t, q, u = components
-    said = _SaidOfPoints(Reading(described.system, inputs), described.parts, t, q, u)
+    said = _SaidOfPoints(DescriptionEvaluator(described.system, inputs), described.parts, t, q, u)
     return {part: getattr(said, part)() for part in "rates configuration rolling velocities momenta turning".split()}
 
 
-class _Points(Instant):
+class _Points(KaneEquations):
     """An instant whose velocities and momenta are those of the bodies' points."""
 
     def __init__(self, described: Described, t: Any, q: Any, u: Any, inputs: Any):
@@ -270,7 +270,7 @@ class _Points(Instant):
             given = list(leaves)
             for i, x in zip(moved, own, strict=True):
                 given[i] = x
-            reading = Reading(jax.tree.unflatten(structure, given), self.inputs)
+            reading = DescriptionEvaluator(jax.tree.unflatten(structure, given), self.inputs)
             motion = reading.motion(self.t, self.q, u)
             bodies = [motion.bodies[part.place] for part in parts]
             for body, part in zip(bodies, parts, strict=True):
@@ -360,7 +360,7 @@ def columns_of(now: Carried, parts: Sequence[Part]) -> Float[Array, "n p"]:
 def values_of(described: Described, t, q, u) -> Float[Array, " p"]:
     """The parameters of the bodies, in the order of the columns; they are the same at all times, `u` (n + k,)."""
     rows = [tuple(x[i] for i in range(x.shape[0])) for x in (q, u)]
-    motion = Reading(described.system).motion(t, *rows)
+    motion = DescriptionEvaluator(described.system).motion(t, *rows)
     ten = [_ten(motion.bodies[part.place]) for part in described.parts]
     values = [ten[i][k] for i, part in enumerate(described.parts) for k in part.kind]
     return as_vector(values, q) if values else jnp.zeros(0, q.dtype)
@@ -384,7 +384,7 @@ def _times(x: Float[Array, "b 3"]) -> Float[Array, "b 3 6"]:
 @fused
 def unbalanced(system: System, t, q, u, inputs, u_dot) -> Float[Array, " n"]:
     """-(F_r + F*_r) (n,) at accelerations `u_dot`: zero in the motion."""
-    now = Instant(system, t, q, u, inputs)
+    now = KaneEquations(system, t, q, u, inputs)
     row = tuple(u_dot[i] for i in range(now.n))
     partials = now.partials()
     rates = now.momentum_rates((*row, *now.dependent_accelerations(row)))

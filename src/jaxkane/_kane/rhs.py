@@ -21,11 +21,11 @@ from .._scalarjit.linear import as_vector, is_written_out
 from .._system.frames import Frame
 from .._system.motion import Motion
 from .._system.points import Point
-from .._system.system import State, System, Values, packed, unpacked
+from .._system.system import NamedVector, State, System, packed, unpacked
 from .._system.vectors import Vector
 from .arguments import Inputs, Row, as_row, inputs_of
 from .evaluate import jvp
-from .kane import Instant, motion_rates
+from .kane import KaneEquations, motion_rates
 from .reactions import Reactions
 
 
@@ -35,7 +35,7 @@ class Now(Inputs):
     Attributes: `u_dot`, the time derivatives of all speeds, dependent ones too, by place and by name.
     """
 
-    def __init__(self, instant: Instant, N: Frame, u_dot: Values, answers: Iterator[Row] | None):
+    def __init__(self, instant: KaneEquations, N: Frame, u_dot: NamedVector, answers: Iterator[Row] | None):
         super().__init__(instant.inputs, inputs_of(instant.system))
         self.u_dot = u_dot
         self._instant, self._N, self._answers = instant, N, answers
@@ -93,14 +93,14 @@ class Now(Inputs):
 Read = Callable[[System, Component, Row, Row, Motion, Now], Any]
 
 
-def read_at(now: Instant, u_dot: Row, read: Read) -> Any:
+def read_at(now: KaneEquations, u_dot: Row, read: Read) -> Any:
     """What `read` finds in the description at an instant, whose independent speeds change with `u_dot` (n,)."""
     u_dot_all = (*u_dot, *now.dependent_accelerations(u_dot))
     names = (*now.system.speeds, *now.system.dependent_speeds)
 
     def reading(t: Component, q: Row, u: Row, answers: Iterator[Row] | None = None) -> tuple[Any, Now]:
         motion = now.motion(t, q, u)
-        given = Now(now, motion.N, Values(u_dot_all, names), answers)
+        given = Now(now, motion.N, NamedVector(u_dot_all, names), answers)
         return read(now.system, t, q, u, motion, given), given
 
     # Points that are made while it is read divide by speeds, perhaps: by no exact zero.
@@ -181,7 +181,7 @@ def outputs_at(system: System, t: Array, q: Array, u: Array, inputs: Mapping[str
 
 @fused
 def _outputs_now(system, t, q, u, inputs, u_dot):
-    now = Instant(system, t, q, u, inputs)
+    now = KaneEquations(system, t, q, u, inputs)
     found = read_at(now, as_row(u_dot, system.speeds, "u_dot"), _outputs)
     return {name: as_vector([x], q)[0] for name, x in found.items()}
 
@@ -221,14 +221,14 @@ def rates(system: System, t: Array, q: Array, u: Array, values: dict[str, Array]
     if not system.states:
         return State(*motion_rates(system, t, q, u, values))
     x = as_vector([values[name] for name in system.states], q)
-    return unpacked(system, packed_rates(system, t, packed(State(q, u, x)), values))
+    return unpacked(system, vector_field(system, t, packed(State(q, u, x)), values))
 
 
-def packed_rates(system: System, t: Array, y: Array, inputs: Mapping[str, Any]) -> Array:
+def vector_field(system: System, t: Array, y: Array, inputs: Mapping[str, Any]) -> Array:
     """The right-hand side as a solver asks for it: of a packed state (n_q + n_u + n_x,), packed, so that one array goes
     through the steps."""
     if is_written_out(len(system.speeds)):
-        return _packed_rates(system, t, y, dict(inputs))
+        return _vector_field(system, t, y, dict(inputs))
     state = unpacked(system, y)
     values = values_of(system, state.x, inputs)
     q_dot, u_dot = motion_rates(system, t, state.q, state.u, values)
@@ -237,8 +237,8 @@ def packed_rates(system: System, t: Array, y: Array, inputs: Mapping[str, Any]) 
 
 
 def rates_are_native(system: System, t: Array, y: Array, inputs: Mapping[str, Any]) -> bool:
-    """Whether `packed_rates` of these is one native kernel."""
-    return is_written_out(len(system.speeds)) and is_native(_packed_rates, system, t, y, dict(inputs))
+    """Whether `vector_field` of these is one native kernel."""
+    return is_written_out(len(system.speeds)) and is_native(_vector_field, system, t, y, dict(inputs))
 
 
 def values_of(system: System, x: Array | None, inputs: Mapping[str, Any]) -> dict[str, Any]:
@@ -247,9 +247,9 @@ def values_of(system: System, x: Array | None, inputs: Mapping[str, Any]) -> dic
 
 
 @fused
-def _packed_rates(system, t, y, inputs):
+def _vector_field(system, t, y, inputs):
     state = unpacked(system, y)
-    now = Instant(system, t, state.q, state.u, values_of(system, state.x, inputs))
+    now = KaneEquations(system, t, state.q, state.u, values_of(system, state.x, inputs))
     u_dot = now.accelerations()
     x_dot = read_at(now, u_dot, _state_rates) if system.states else ()
     return as_vector((*now.q_dot, *u_dot, *x_dot), y)
@@ -258,5 +258,5 @@ def _packed_rates(system, t, y, inputs):
 @fused
 def first_order_rates(system, t, q, u, inputs, u_dot):
     """x_dot (n_x,) at the accelerations u_dot (n,)."""
-    now = Instant(system, t, q, u, inputs)
+    now = KaneEquations(system, t, q, u, inputs)
     return as_vector(read_at(now, as_row(u_dot, system.speeds, "u_dot"), _state_rates), q)

@@ -16,12 +16,12 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from .captured_values import NUMBERS, Reads, is_of_library
+from .captured_values import NUMBERS, CapturedValues, is_of_library
 from .compat import is_under_way, settings
 
 _MOST_KEPT = 256
 
-_known: dict[int, Reads] = {}
+_known: dict[int, CapturedValues] = {}
 _count = itertools.count()
 _lock = threading.Lock()
 _forgotten = b"0"
@@ -32,24 +32,24 @@ class _Tracing(threading.local):
     """What is being traced in this thread: a trace belongs to what was read when it began."""
 
     def __init__(self) -> None:
-        self.reads: dict[int, Reads] = {}
+        self.reads: dict[int, CapturedValues] = {}
 
 
 _tracing = _Tracing()
 
 
-def _reads_of(root: Any) -> Reads:
+def _reads_of(root: Any) -> CapturedValues:
     reads = _tracing.reads.get(id(root))
     if reads is not None:
         return reads
     reads = _known.get(id(root))
     if reads is None or reads.root is not root or not reads.unchanged():
-        reads = _kept(Reads(root))
+        reads = _kept(CapturedValues(root))
     reads.used = next(_count)
     return reads
 
 
-def _kept(reads: Reads) -> Reads:
+def _kept(reads: CapturedValues) -> CapturedValues:
     if reads.tracers:
         return reads
     with _lock:
@@ -137,7 +137,7 @@ def kept_from_a_trace(label: str) -> TypeError:
 
 
 @contextlib.contextmanager
-def naming_what_is_kept(label: str) -> Iterator[None]:
+def explain_leaked_tracer(label: str) -> Iterator[None]:
     """Where JAX meets a number of another trace, the error says what that comes from."""
     try:
         yield
@@ -161,7 +161,7 @@ def settling(f: Callable[..., Any]) -> Callable[..., Any]:
         for reads in before:
             now = _known.get(id(reads.root))
             if now is not None and now.version == reads.version and not now.unchanged():
-                after = Reads(reads.root)
+                after = CapturedValues(reads.root)
                 after.version = reads.version
                 _kept(after)
         return found
@@ -196,7 +196,7 @@ def compiled(f: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(f)
     def call(*args: Any, **kwargs: Any) -> Any:
-        with naming_what_is_kept(type(args[0]).__name__ if args else f.__name__):
+        with explain_leaked_tracer(type(args[0]).__name__ if args else f.__name__):
             return jitted(version_of(args, kwargs), args, kwargs)
 
     vars(call)["compiled"] = jitted

@@ -74,7 +74,7 @@ def is_of_library(kind: type) -> bool:
     return _is_library(kind.__module__)
 
 
-class Reads:
+class CapturedValues:
     """All places that the code of `root` reads, with what was found there; `version` is a digest of it.
 
     `lasting`: the digest is the same in another process, where what cannot be looked into is told by its pickle.
@@ -134,7 +134,7 @@ def _same_numbers(array: np.ndarray, copy: np.ndarray) -> bool:
 class _Walk:
     """Goes from a root to everything that its code reads, noting the places and hashing what stands there."""
 
-    def __init__(self, reads: Reads):
+    def __init__(self, reads: CapturedValues):
         self.reads = reads
         self.sha = hashlib.blake2b(digest_size=16)
         self.seen: dict[Any, tuple[int, Any]] = {}

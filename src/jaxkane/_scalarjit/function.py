@@ -26,7 +26,7 @@ from jax.core import Tracer
 
 from .backends import native
 from .backends.native import Scalars
-from .cache_key import Key, key_of, naming_what_is_kept, on_forget, settling
+from .cache_key import Key, explain_leaked_tracer, key_of, on_forget, settling
 from .compat import (
     FUSES,
     ClosedJaxpr,
@@ -42,7 +42,7 @@ from .compat import (
 )
 from .components import add, is_exact, mul, sub
 from .graph import OPERATORS, NotScalarError
-from .jaxpr import PROGRAM, foreign, in_pieces, is_plain, reads_of, replaced, without_repetition
+from .jaxpr import PROGRAM, cse, in_pieces, is_fusable, reads_of, replaced, unsupported_primitives
 
 _MOST_LANES = 128  # in XLA's hands: with more, intermediates no longer stay in the cache
 
@@ -63,7 +63,7 @@ def fused(f: Callable[..., Any]) -> Callable[..., Any]:
         program, out = jax.make_jaxpr(lambda *leaves: traced(*unflatten(leaves)), return_shape=True)(*_specs(key.types))
         if any(isinstance(c, Tracer) for c in program.consts):
             raise _CapturedError
-        inside = list(foreign(program.jaxpr))
+        inside = list(unsupported_primitives(program.jaxpr))
         if any(where for _, where in inside):
             _tell_foreign(label, dict.fromkeys(name for name, where in inside if where))
         steady = range(key.structure.children()[0].num_leaves)
@@ -76,7 +76,7 @@ def fused(f: Callable[..., Any]) -> Callable[..., Any]:
             return [], None
         label, (leaves, key) = _label(args[0]), key_of(*args)
         try:
-            with naming_what_is_kept(label):
+            with explain_leaked_tracer(label):
                 return leaves, program_for(key, label)
         except _CapturedError:
             return leaves, None
@@ -85,7 +85,7 @@ def fused(f: Callable[..., Any]) -> Callable[..., Any]:
     def call(*args):
         leaves, found = find(*args)
         if found is None:
-            with naming_what_is_kept(_label(args[0])):
+            with explain_leaked_tracer(_label(args[0])):
                 return f(*args)
         program, structure = found
         return jax.tree.unflatten(structure, program(*leaves))
@@ -143,10 +143,10 @@ class _Program:
 
     def __init__(self, program: ClosedJaxpr, label: str = "A function", steady: frozenset[int] = frozenset()):
         self.label, self.steady = label, steady
-        self.program = without_repetition(program)
+        self.program = cse(program)
         self.evaluate = jaxpr_as_fun(self.program)
         self.in_avals, self.out_avals = self.program.in_avals, self.program.out_avals
-        self.is_plain = is_plain(self.program.jaxpr)
+        self.is_fusable = is_fusable(self.program.jaxpr)
         self.reads = reads_of(self.program.jaxpr)
         # A memory for each instance, since a cached method would keep the instance itself alive.
         self.tangent = functools.cache(self._tangent)
@@ -350,7 +350,7 @@ def _as_one_function(*args, program, sizes, where):
     if math.prod(sizes) > _MOST_LANES and sizes[0] > 1:
         return _in_chunks(args, program, sizes, where)
     program = program.batched(sizes, where) if sizes else program
-    if not program.is_plain or 0 in sizes:
+    if not program.is_fusable or 0 in sizes:
         return program.evaluate(*args)
     return in_pieces(program.program, args)
 
@@ -421,7 +421,7 @@ def recorded(f: Callable[..., dict[str, Any]]) -> Callable[..., Any]:
         (given, key), row = key_of(arrays), jax.tree.leaves(components)  # of components only numbers are read
         dtype = jnp.result_type(*([x for x in row if not is_exact(x)] or [float]))
         treedef = jax.tree.structure((arrays, components))
-        with naming_what_is_kept(type(arrays).__name__):
+        with explain_leaked_tracer(type(arrays).__name__):
             record = record_for(treedef, key, len(row), dtype)
             if record is None:
                 return f(arrays, components)[part]
@@ -446,7 +446,7 @@ class _Record:
 
         program: ClosedJaxpr = jax.make_jaxpr(results)(*specs)
         captured = any(isinstance(c, Tracer) for c in program.consts)
-        self.program = without_repetition(program) if is_plain(program.jaxpr) and not captured else program
+        self.program = cse(program) if is_fusable(program.jaxpr) and not captured else program
         traced = iter(self.program.jaxpr.outvars)
         row = iter([x if is_exact(x) else next(traced) for x in leaves])
         self.results = {part: [next(row) for _ in range(s.num_leaves)] for part, s in self.structures.items()}

@@ -58,7 +58,7 @@ BY_LAPACK = "by_lapack"
 PROGRAM = "scalar_program"
 
 
-def without_repetition(program: ClosedJaxpr) -> ClosedJaxpr:
+def cse(program: ClosedJaxpr) -> ClosedJaxpr:
     """The same program with every common subexpression once, and without what no output needs; products of small
     matrices, which XLA would hand to a library, are sums of products.
 
@@ -148,20 +148,20 @@ def reads_of(program: Jaxpr) -> tuple[bool, ...]:
     return found if any(found) else (True, *found[1:])
 
 
-def is_plain(program: Jaxpr) -> bool:
+def is_fusable(program: Jaxpr) -> bool:
     """Whether a program can be one compiled function."""
-    return not any(foreign(program))
+    return not any(unsupported_primitives(program))
 
 
-def foreign(program: Jaxpr, is_ours: bool = False) -> Iterator[tuple[str, bool]]:
+def unsupported_primitives(program: Jaxpr, is_ours: bool = False) -> Iterator[tuple[str, bool]]:
     """The operations that cannot be part of one compiled function, and whether they are the description's own: the
     method itself has LAPACK solve what is too large to be written out (`_linear`)."""
     for equation in program.eqns:
         name, inner = equation.primitive.name, opened(equation)
         if inner is not None:
-            yield from foreign(inner.jaxpr, is_ours or BY_LAPACK in equation.params.get("name", ""))
+            yield from unsupported_primitives(inner.jaxpr, is_ours or BY_LAPACK in equation.params.get("name", ""))
         elif name == "dot_general" and is_small(equation):
-            continue  # see `without_repetition`
+            continue  # see `cse`
         elif name not in _PLAIN:
             yield name, not is_ours
         elif name.startswith("reduce_") and getattr(equation.invars[0].aval, "size", 0) > _LARGEST_SUM:
@@ -288,7 +288,7 @@ def _tangents(program: ClosedJaxpr, moving: Sequence[int]) -> tuple[ClosedJaxpr,
         return jax.jvp(of_moving, [xs[i] for i in moving], dxs)[1]
 
     avals = [specs[i] for i in moving]
-    return without_repetition(jax.make_jaxpr(tangents)(specs, avals)), avals
+    return cse(jax.make_jaxpr(tangents)(specs, avals)), avals
 
 
 def _outputs(equation: Any, values: dict[Any, np.ndarray], graph: Any) -> list[np.ndarray]:

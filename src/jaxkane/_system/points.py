@@ -35,7 +35,7 @@ class Point:
         self.name = name
         self._base = base
         self._offset = offset
-        self._claim: Claim | None = None
+        self._claim: RelativeMotion | None = None
 
     def __repr__(self) -> str:
         return f"Point({self.name})"
@@ -64,7 +64,7 @@ class Point:
         """
         carrier = frame or _own_frame(r, "fixed")
         point = Point(self.velocity + carrier.angular_velocity.cross(r), self, r, name or f"{self.name}'")
-        point._claim = Claim(carrier, Vector(carrier, ZERO3)) if frame is None else None
+        point._claim = RelativeMotion(carrier, Vector(carrier, ZERO3)) if frame is None else None
         return point
 
     def moving(self, r: Vector, velocity: Vector, frame: Frame | None = None, name: str | None = None) -> Point:
@@ -79,7 +79,7 @@ class Point:
         check_vector(velocity, "Point.moving, as the velocity,")
         carried = self.velocity + frame.angular_velocity.cross(r)
         point = Point(carried + velocity, self, r, name or f"{self.name}'")
-        point._claim = Claim(frame, velocity)
+        point._claim = RelativeMotion(frame, velocity)
         return point
 
     def located(
@@ -113,7 +113,7 @@ class Point:
         has no position, since the ground under the wheel is another point at every instant.
         """
         point = Point(velocity, None, position, name)
-        point._claim = None if position is None else Claim(velocity.frame.root, velocity)
+        point._claim = None if position is None else RelativeMotion(velocity.frame.root, velocity)
         return point
 
     def position_from(self, other: Point) -> Vector:
@@ -147,7 +147,7 @@ def _own_frame(r: Vector, verb: str) -> Frame:
     return r.frame
 
 
-class Claim(NamedTuple):
+class RelativeMotion(NamedTuple):
     """How a point is said to move: its place, as seen in `frame` from the point it was made from, with `velocity`.
 
     The place is a function of time and coordinates, the velocity was given beside it: the two may contradict. A point

@@ -21,7 +21,7 @@ from .motion import Motion, now
 from .parameters import check_fields, check_parameter, parameter_info, to_float
 
 
-class Values(Sequence[Component]):
+class NamedVector(Sequence[Component]):
     """Numbers by place and by name. JAX takes it for an array of shape (n,).
 
         q[0], q["roll"]; q["e1":"e4"], of which both ends are meant; q["x", "y"]; q[3:7]; a, b = q; "roll" in q
@@ -46,10 +46,10 @@ class Values(Sequence[Component]):
         if isinstance(key, slice):
             start, stop = (self._place(end) if isinstance(end, str) else end for end in (key.start, key.stop))
             places = slice(start, stop + 1 if isinstance(key.stop, str) else stop, key.step)  # type: ignore[operator]
-            return Values(self._items[places], self.names[places])
+            return NamedVector(self._items[places], self.names[places])
         if isinstance(key, (tuple, list)):
             places = [self._place(k) if isinstance(k, str) else range(len(self))[k] for k in key]
-            return Values([self._items[i] for i in places], [self.names[i] for i in places if self.names])
+            return NamedVector([self._items[i] for i in places], [self.names[i] for i in places if self.names])
         return self._items[key]
 
     def _place(self, name: str) -> int:
@@ -89,7 +89,7 @@ class Values(Sequence[Component]):
 
 
 def _elementwise(name: str) -> Callable[..., Array]:
-    def operator(self: Values, other: Any) -> Array:
+    def operator(self: NamedVector, other: Any) -> Array:
         try:
             array = jnp.asarray(other)
         except (TypeError, ValueError):
@@ -102,10 +102,10 @@ def _elementwise(name: str) -> Callable[..., Array]:
 
 
 for _name in ("add", "sub", "mul", "truediv", "floordiv", "mod", "pow", "matmul"):
-    setattr(Values, f"__{_name}__", _elementwise(f"__{_name}__"))
-    setattr(Values, f"__r{_name}__", _elementwise(f"__r{_name}__"))
+    setattr(NamedVector, f"__{_name}__", _elementwise(f"__{_name}__"))
+    setattr(NamedVector, f"__r{_name}__", _elementwise(f"__r{_name}__"))
 for _name in ("eq", "ne", "lt", "le", "gt", "ge"):
-    setattr(Values, f"__{_name}__", _elementwise(f"__{_name}__"))
+    setattr(NamedVector, f"__{_name}__", _elementwise(f"__{_name}__"))
 
 
 METHODS = ("motion", "q_dot", "loads", "configuration_constraints", "implied_constraints", "events")
@@ -141,7 +141,7 @@ def checked_names(system: str, kind: str, given: Any) -> tuple[str, ...]:
     return tuple(given)
 
 
-class Kind(type(eqx.Module)):
+class SystemMeta(type(eqx.Module)):
     """The metaclass of systems.
 
     What is set on an existing class, as `Pendulum.loads = f` in a notebook, is prepared as what its body
@@ -211,15 +211,15 @@ def _named(method: Callable[..., Any], name: str) -> Callable[..., Any]:
     return call
 
 
-def _values(values: Any, names: Sequence[str], label: str, n_optional: int = 0) -> Values:
-    if isinstance(values, Values) and values.names == tuple(names):
+def _values(values: Any, names: Sequence[str], label: str, n_optional: int = 0) -> NamedVector:
+    if isinstance(values, NamedVector) and values.names == tuple(names):
         return values
     items = list(values)
     if len(items) == len(names) - n_optional:
         items += [0.0] * n_optional  # auxiliary speeds are zero in the motion
     if len(items) != len(names):
         raise ValueError(f"{label} must have {len(names)} entries ({', '.join(names)}), got {len(items)}.")
-    return Values(items, names)
+    return NamedVector(items, names)
 
 
 class State(eqx.Module):
@@ -247,7 +247,7 @@ def unpacked(system: System, y: Float[Array, "*batch n"]) -> State:
     return State(q, u, x if system.states else None)
 
 
-class System(eqx.Module, metaclass=Kind):
+class System(eqx.Module, metaclass=SystemMeta):
     """A mechanism: its array leaves are its parameters, its methods describe it.
 
     A subclass names its coordinates and speeds, and writes `motion`; and, where it needs them, `loads`, `q_dot`,

@@ -21,8 +21,8 @@ from ._design import design as design
 from ._extensions import Suspect as Suspect
 from ._extensions import Suspects as Suspects
 from ._extensions import suspects as suspects
-from ._first_estimate import FirstGuess as FirstGuess
-from ._first_estimate import first_guess as first_guess
+from ._first_estimate import FirstEstimate as FirstEstimate
+from ._first_estimate import first_estimate as first_estimate
 from ._fit import fit as fit
 from ._identifiability import Direction as Direction
 from ._identifiability import Identifiability as Identifiability

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._common.lookup import not_there
-from .._kane.evaluate import Reading
+from .._kane.evaluate import DescriptionEvaluator
 from .._kane.regressor import origin_of
 from .._scalarjit.cache_key import compiled
 from .._system.parameters import leaf_name
@@ -217,7 +217,7 @@ def _numbers(system: System) -> list[tuple[str, Any]]:
     zero = jnp.zeros((), jnp.result_type(float))
     n_u = len(system.speeds) + len(system.dependent_speeds)
     q = tuple(zero + 0.3 for _ in system.coordinates)
-    motion = Reading(system).motion(zero + 0.2, q, (zero,) * n_u)
+    motion = DescriptionEvaluator(system).motion(zero + 0.2, q, (zero,) * n_u)
     found = []
     for body in motion.bodies:
         if body.is_particle:

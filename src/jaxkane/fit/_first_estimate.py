@@ -85,7 +85,7 @@ _TRIED = 7  # spacings of knots
 
 
 @dataclasses.dataclass(frozen=True)
-class FirstGuess:
+class FirstEstimate:
     """What the equations of motion determine of the free parameters, without any simulation.
 
     - `system`: with what was found in it; a fit may begin from it.
@@ -128,17 +128,17 @@ class FirstGuess:
     __repr__ = __str__
 
 
-def first_guess(
+def first_estimate(
     system: System,
     motions: Motions,
     free: Any,
     *,
     sigma: Mapping[str, float] | None = None,
     spacing: float | None = None,
-) -> FirstGuess:
+) -> FirstEstimate:
     """Parameters of bodies, dampers and springs from measured motion by linear least squares, to begin a fit from.
 
-        guess = first_guess(system, trials, free)
+        guess = first_estimate(system, trials, free)
         result = fit(guess.system, trials, free, unknown=...)
 
     The base parameters of what is free are found from Y pi = tau at the measured instants (see `base_parameters`). Then
@@ -157,7 +157,7 @@ def first_guess(
     - `spacing` [s]: of the knots of the splines that give accelerations; by default that one, of some beginning with
         what `sigma` of the trials allows, with which the equations are met best.
 
-    **Returns:** a `FirstGuess`; print it.
+    **Returns:** a `FirstEstimate`; print it.
 
     **Raises:** `ValueError` as `fit`, `regressor` and `instants_of`; for gains and delays, and parameters that change
     lengths or places, in which the equations are not linear.
@@ -172,7 +172,7 @@ def first_guess(
     x, strain = nearest(chosen, parameters, base)
     at = jnp.asarray(x, parameters.start.dtype)
     found, values = parameters.apply(system, at)[0], np.asarray(parameters.values(at))
-    return FirstGuess(
+    return FirstEstimate(
         found,
         dict(zip(parameters.names, values.tolist(), strict=True)),
         dict(zip(parameters.names, np.asarray(parameters.start).tolist(), strict=True)),
@@ -189,8 +189,8 @@ def _refuse_roles(parameters: Parameters) -> None:
     roles = [entry.name for entry in parameters.entries if entry.role is not None]
     if roles:
         raise ValueError(
-            f"first_guess: {', '.join(roles)} is no parameter in which the equations of motion are linear: leave it to "
-            "the fit."
+            f"first_estimate: {', '.join(roles)} is no parameter in which the equations of motion are linear: "
+            "leave it to the fit."
         )
 
 

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from .._common.files import digest, write_whole
+from .._common.files import atomic_write, digest
 from .._system.parameters import leaf_name
 from ._kalman import filtered
 from ._problem import Problem
@@ -25,7 +25,7 @@ def write_state(path: Path, key: Mapping[str, Any], trees: Mapping[str, Any]) ->
         leaves = jax.tree.leaves(eqx.filter(tree, eqx.is_array_like))
         arrays |= {f"{name}/{i}": np.asarray(leaf) for i, leaf in enumerate(leaves)}
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(path, lambda file: np.savez(file, **arrays))
+    atomic_write(path, lambda file: np.savez(file, **arrays))
 
 
 def read_state(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

@@ -92,7 +92,7 @@ def covered(t: np.ndarray, channels: Mapping[str, np.ndarray], spacing: float) -
 
 @dataclasses.dataclass(frozen=True)
 class Instants:
-    """Instants of one or several motions, for `base_parameters` and `first_guess`.
+    """Instants of one or several motions, for `base_parameters` and `first_estimate`.
 
         Instants(t, q, u, u_dot, {"torque": torque})
 

@@ -16,7 +16,7 @@ from .._common.lru_cache import LRUCache
 from .._kane.arguments import as_array, check_is_system, check_time, checked_values, refuse_incomplete
 from .._kane.checks import check_system
 from .._kane.equations import InputValues
-from .._kane.evaluate import structure_of, with_trial_numbers
+from .._kane.evaluate import at_random_point, structure_of
 from .._kane.regressor import UNITS, Bodies, Carried, Described, carried, columns_of, described, unbalanced, values_of
 from .._scalarjit.cache_key import compiled
 from .._scalarjit.compat import concretely
@@ -168,7 +168,7 @@ class _Linearity:
 
     def __init__(self, chosen: Chosen, system: System, t: Any, q: Any):
         rng = np.random.default_rng(0)
-        self.system, t, q = with_trial_numbers((system, t, q), rng)
+        self.system, t, q = at_random_point((system, t, q), rng)
         self.name = type(system).__name__
         # Of the bodies that are named every parameter: what is known of them moves with the others.
         every = described(system, [part.name for part in chosen.described.parts])

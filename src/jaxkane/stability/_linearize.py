@@ -26,7 +26,7 @@ from .._scalarjit.function import fused
 from .._scalarjit.linear import as_vector, solve, stack
 from .._scalarjit.nan import nan_where
 from .._system.parameters import parameters_in
-from .._system.system import State, System, Values
+from .._system.system import NamedVector, State, System
 from ._eig import Eig, eig, eigvals
 from ._steady import SteadyMotion, check_dependent, check_state, cyclic_coordinates, inputs_by_name, is_wrong, jacobian
 
@@ -38,15 +38,15 @@ class _Respeeded(System):
     independent: tuple[str, ...] = eqx.field(static=True)
     dependent: tuple[str, ...] = eqx.field(static=True)
 
-    def _in_order(self, u: Any) -> Values:
+    def _in_order(self, u: Any) -> NamedVector:
         names = (*self.inner.speeds, *self.inner.dependent_speeds, *self.inner.auxiliary_speeds)
-        return Values([u[name] for name in names], names)
+        return NamedVector([u[name] for name in names], names)
 
     def _of_inner(self, now: Any) -> Any:
         """The same instant, with the accelerations in the order of the inner system's speeds."""
         names = (*self.inner.speeds, *self.inner.dependent_speeds)
         other = copy.copy(now)
-        other.u_dot = Values([now.u_dot[name] for name in names], names)
+        other.u_dot = NamedVector([now.u_dot[name] for name in names], names)
         return other
 
     def q_dot(self, t, q, u):
@@ -308,7 +308,7 @@ def _at_deviation(x, w, at, T, choice: _Choice, functions: dict[str, Callable[..
     y = []
     for k in choice.outputs:
         if k in functions:
-            value = functions[k](t, Values(q, names), Values([known[s] for s in speeds], speeds))
+            value = functions[k](t, NamedVector(q, names), NamedVector([known[s] for s in speeds], speeds))
             if not is_one_number(value):
                 raise TypeError(f"{type(system).__name__}: the output {k!r} must be one number, got {value!r}.")
             y.append(jnp.asarray(value, q.dtype))

@@ -23,7 +23,7 @@ from .._integrate.trajectory import Trajectory
 from .._kane.checks import with_possible_bodies
 from .._scalarjit.backends import native as kernels
 from .._scalarjit.cache_key import compiled, on_forget, version_of
-from .._scalarjit.captured_values import Reads
+from .._scalarjit.captured_values import CapturedValues
 from .._system.system import State
 from ._members import start_of, system_and_signals
 
@@ -125,7 +125,7 @@ def traced(job: Job, own: Any) -> tuple[str, Part]:
 
 def digest_of(program: Any) -> str:
     """The digest of a program of JAX; of functions that it calls back, with all that their code reads."""
-    return digest(program, lambda f: Reads(f, lasting=True).version)
+    return digest(program, lambda f: CapturedValues(f, lasting=True).version)
 
 
 def versions() -> dict[str, str]:

@@ -14,7 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._common.files import SCRATCH, differences, digest, write_whole
+from .._common.files import SCRATCH, atomic_write, differences, digest
 from .._integrate.settings import Settings
 from .._scalarjit.backends.native import is_on
 from .._system.system import State, System
@@ -101,7 +101,7 @@ class Folder:
                     f"{self.path} is not empty, and holds no {MANIFEST}: a sweep wants a folder of its own."
                 )
             text = json.dumps(manifest, indent=1).encode()
-            if write_whole(described, lambda file: file.write(text), replace=False):
+            if atomic_write(described, lambda file: file.write(text), replace=False):
                 return
         _compare(self.path, _read(described), manifest)
 
@@ -115,7 +115,7 @@ class Folder:
     def write(self, start: int, part: Any) -> None:
         """Keep the chunk that begins with a member."""
         try:
-            write_whole(self.file(start), lambda file: np.savez(file, **self.mark(start), **_named(part)))
+            atomic_write(self.file(start), lambda file: np.savez(file, **self.mark(start), **_named(part)))
         except FileNotFoundError:
             # Another process was done with the whole sweep, this chunk too, and has tidied up.
             if not self.file(start).exists():

@@ -51,7 +51,7 @@ class Objects(NamedTuple):
 
     def write(self, name: str, code: bytes) -> None:
         try:
-            write_whole(self.folder / f"{name}.o", _seal(name, code) + code)
+            atomic_write(self.folder / f"{name}.o", _seal(name, code) + code)
         except OSError as error:
             text = f"Compiled code could not be kept in {self.folder}: {error.strerror or error}."
             warnings.warn(text, stacklevel=2)
@@ -61,7 +61,7 @@ def _seal(name: str, code: bytes) -> bytes:
     return _MARK + hashlib.sha256(name.encode() + b"\n" + code).hexdigest().encode() + b"\n"
 
 
-def write_whole(path: Path, content: bytes) -> None:
+def atomic_write(path: Path, content: bytes) -> None:
     """A file that is either there as a whole or not at all, whoever else writes it and whenever the power goes."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, scratch = tempfile.mkstemp(dir=path.parent, prefix=".scratch-")

@@ -21,7 +21,7 @@ import jaxlib
 import numpy as np
 
 from ..graph import Graph
-from .compiler import Machine, cache_folder, write_whole
+from .compiler import Machine, atomic_write, cache_folder
 from .ffi import handler_text
 from .llvm import Writer
 
@@ -50,7 +50,7 @@ def verdict(machine: Machine) -> str | None:
     if is_final:
         for folder in folders:
             try:
-                write_whole(folder / f"kernels-{key}.json", json.dumps({"cannot": found or ""}).encode())
+                atomic_write(folder / f"kernels-{key}.json", json.dumps({"cannot": found or ""}).encode())
                 break
             except OSError:
                 continue  # where nothing can be written every process tries for itself
