@@ -25,7 +25,7 @@ from jaxkane.fit import (
 )
 from jaxkane.fit._block_lsq import eliminate
 from jaxkane.fit._linearize import linearize
-from jaxkane.fit._optimize import moved, refined
+from jaxkane.fit._nuisance import moved, refined
 
 
 @dataclasses.dataclass(frozen=True)

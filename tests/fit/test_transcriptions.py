@@ -11,7 +11,7 @@ from systems import Cart
 import jaxkane as jk
 from jaxkane.fit import BFGS, Delay, Free, Gain, GradientDescent, LeastSquares, Problem, Simulation, Trial, minimize
 from jaxkane.fit._block_lsq import Blocks, eliminate
-from jaxkane.fit._optimize import solve_nuisance
+from jaxkane.fit._nuisance import solve_nuisance
 from jaxkane.fit._optimizers import _step
 
 TRUTH = Cart(mass=1.3, stiffness=5.0, damping=0.4)

@@ -31,7 +31,7 @@ from jaxkane.fit import (
     save_report,
 )
 from jaxkane.fit._diagnostics import doubled_trials, empty_columns, suspicious_records
-from jaxkane.fit._optimize import solve_nuisance
+from jaxkane.fit._nuisance import solve_nuisance
 from jaxkane.fit._statistics import residual_test
 
 NAMES = ("mass", "stiffness", "damping")

@@ -26,6 +26,7 @@ from ._first_estimate import first_estimate as first_estimate
 from ._fit import fit as fit
 from ._identifiability import Direction as Direction
 from ._identifiability import Identifiability as Identifiability
+from ._identifiability import identifiability as identifiability
 from ._kinematics import Instants as Instants
 from ._kinematics import instants_of as instants_of
 from ._model import Model as Model
@@ -55,7 +56,6 @@ from ._statistics import ResidualTest as ResidualTest
 from ._studies import MultiStart as MultiStart
 from ._studies import Profile as Profile
 from ._studies import contrary_signs as contrary_signs
-from ._studies import identifiability as identifiability
 from ._studies import multi_start as multi_start
 from ._studies import profile as profile
 from ._trial import Trial as Trial

@@ -19,7 +19,8 @@ from ._compare import Plausible, plausible_of
 from ._fit import solve
 from ._linearize import Linearization, linearize
 from ._model import Unknowns
-from ._optimize import minimize, uninterrupted, usable
+from ._nuisance import usable
+from ._optimize import minimize, uninterrupted
 from ._optimizers import LeastSquares
 from ._problem import Problem, refuse_other
 from ._result import Fit

@@ -23,7 +23,8 @@ from ._block_lsq import Eliminated, eliminate
 from ._density import half_cost
 from ._linearize import Linearization, cost, linearize
 from ._model import Unknowns
-from ._optimize import Iterate, Optimizer, minimize, moved, refined, solve_nuisance, usable
+from ._nuisance import moved, refined, solve_nuisance, usable
+from ._optimize import Iterate, Optimizer, minimize
 from ._problem import Problem
 
 

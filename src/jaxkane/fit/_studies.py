@@ -1,4 +1,4 @@
-"""Studies that fit again: many initial guesses, profile likelihoods, signs, and identifiability before a fit."""
+"""Studies that fit again: multiple starts, profile likelihoods, and a check of signs."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from tqdm import tqdm
 
 from .._common.lookup import hint, real_number
 from ._diagnostics import bad_channels
-from ._identifiability import Identifiability, identifiability_at
 from ._linearize import cost
 from ._model import Unknowns
-from ._optimize import Optimizer, minimize, solve_nuisance, uninterrupted
+from ._nuisance import solve_nuisance
+from ._optimize import Optimizer, minimize, uninterrupted
 from ._optimizers import LeastSquares
 from ._problem import Problem, refuse_other
 from ._result import Fit
@@ -252,27 +252,3 @@ def _if_better(fit: Fit, windows: Windows, what: str) -> list[str]:
     if min(costs) < 0.5 * fit.cost:
         return [f"{what} seems to have the wrong sign: turned round, the sum of squares is below {min(costs):.4g}."]
     return []
-
-
-def identifiability(problem: Problem, *, flat: float = 0.5, at: Unknowns | None = None) -> Identifiability:
-    """Which parameters, or combinations of them, the data determine if their noise is as `sigma` says, whatever they
-    are: a plan with simulated measurements will do. Of a `Fit`, `fit.identifiability` says it by the residuals left.
-
-        identifiability(Problem.of(system, trials, free, unknown=("roll",)))
-
-    The residuals' sensitivity to the scaled parameters, with the nuisance values eliminated, is taken apart by singular
-    values. A direction whose standard deviation exceeds `flat` of the parameters' scale is called undetermined.
-
-    **Arguments:**
-
-    - `problem`: a `Problem`.
-    - `flat`: where undetermined begins. `at`: a point of the problem; by default its start. The nuisance values are
-        found for it.
-
-    **Returns:** an `Identifiability`; print it for a table.
-
-    **Raises:** `ValueError` that names a window which cannot be simulated to its end.
-    """
-    refuse_other(problem, Problem, "identifiability", "identifiability(fit.problem), or fit.identifiability")
-    point, linearization = solve_nuisance(problem, problem.start if at is None else at)
-    return identifiability_at(problem, point, linearization, flat, given=True)

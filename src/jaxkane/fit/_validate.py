@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._model import Unknowns
-from ._optimize import Unsimulated, minimize, solve_nuisance, uninterrupted
+from ._nuisance import Unsimulated, solve_nuisance
+from ._optimize import minimize, uninterrupted
 from ._optimizers import LeastSquares
 from ._problem import Problem, refuse_other
 from ._result import Fit
