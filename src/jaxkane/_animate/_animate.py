@@ -194,34 +194,34 @@ def animate(
     return Animation(scene, speed, theme, height)
 
 
-def _scene(found: Record, figure: Any, speed: float, up, follow, ground, title, name) -> Scene:
-    turned = turned_by(found.t, found.spin, found.orientation)
-    kept = _frames(found.t, _FRAMES_PER_SECOND / speed)
-    total = found.mass.sum()
-    center_of_mass = (found.place * found.mass[:, None]).sum(axis=1) / (total if total > 0 else 1.0)
-    scale = float(np.linalg.norm(found.place - center_of_mass[:, None], axis=-1).max())
-    scale += float(np.sqrt(np.trace(found.inertia.sum(axis=0)) / (total if total > 0 else 1.0)))
-    upright = UPRIGHT[up or which_way_is_up(found.forces)]
+def _scene(motion: Record, figure: Any, speed: float, up, follow, ground, title, name) -> Scene:
+    turned = turned_by(motion.t, motion.spin, motion.orientation)
+    frames = _frames(motion.t, _FRAMES_PER_SECOND / speed)
+    total = motion.mass.sum()
+    center_of_mass = (motion.place * motion.mass[:, None]).sum(axis=1) / (total if total > 0 else 1.0)
+    scale = float(np.linalg.norm(motion.place - center_of_mass[:, None], axis=-1).max())
+    scale += float(np.sqrt(np.trace(motion.inertia.sum(axis=0)) / (total if total > 0 else 1.0)))
+    upright = UPRIGHT[up or which_way_is_up(motion.forces)]
 
     few = dataclasses.replace(
-        found,
-        orientation=found.orientation[kept],
-        place=found.place[kept],
-        points=found.points[kept],
-        frames=found.frames[kept],
+        motion,
+        orientation=motion.orientation[frames],
+        place=motion.place[frames],
+        points=motion.points[frames],
+        frames=motion.frames[frames],
     )
-    build = Builder(few.orientation, few.place, turned[kept], scale or 1.0)
+    build = Builder(few.orientation, few.place, turned[frames], scale or 1.0)
     if figure is None:
         bodies_and_points(few, build)
-    for e in found.elements:
-        body = None if e.body is None else found.numbers.index(e.body)
-        build.moving(np.asarray(e.places)[kept], body)
+    for e in motion.elements:
+        body = None if e.body is None else motion.numbers.index(e.body)
+        build.moving(np.asarray(e.places)[frames], body)
         style = {"width": e.width, "closed": e.closed, "fill": e.fill, "label": e.label}
         build.shape(e.kind, e.color, e.places.shape[1], **style)
 
-    center_of_mass = center_of_mass[kept] @ upright.T
+    center_of_mass = center_of_mass[frames] @ upright.T
     scene = Scene(
-        t=found.t[kept],
+        t=motion.t[frames],
         **build.arrays(upright),
         shapes=tuple(build.shapes),
         center_of_mass=center_of_mass,
@@ -241,7 +241,7 @@ def _scene(found: Record, figure: Any, speed: float, up, follow, ground, title, 
 
 
 def _frames(t: np.ndarray, rate: float) -> np.ndarray:
-    """The instants that are kept: those nearest to `rate` a second, or all where there are fewer."""
+    """The instants that are frames: those nearest to `rate` a second, or all where there are fewer."""
     n = int(min(max(np.ceil((t[-1] - t[0]) * rate) + 1, 2), _MOST_FRAMES))
     if n >= len(t):
         return np.arange(len(t))

@@ -198,10 +198,10 @@ def record(system: System, trajectory: Trajectory, figure: Figure | None) -> Rec
     drawing = None if figure is None else _Drawing(weakref.ref(figure), CapturedValues(figure).version)
     t, q, u, u_dep = (np.asarray(x)[reached] for x in (trajectory.t, trajectory.q, trajectory.u, trajectory.u_dep))
     u = np.concatenate([u, u_dep], axis=1)
-    found = jax.tree.map(np.asarray, _along(numbers, rest, drawing, version_of(system), t, q, u))
-    if not found.bodies:
+    motion = jax.tree.map(np.asarray, _along(numbers, rest, drawing, version_of(system), t, q, u))
+    if not motion.bodies:
         raise ValueError(f"animate({name}): no body has a position. Give points their places, see jaxkane.Point.at.")
-    return eqx.tree_at(lambda r: (r.mass, r.inertia), found, (found.mass[0], found.inertia[0]))
+    return eqx.tree_at(lambda r: (r.mass, r.inertia), motion, (motion.mass[0], motion.inertia[0]))
 
 
 class _Drawing(eqx.Module):
@@ -345,23 +345,23 @@ def figure_of(system: object) -> Figure | None:
     return next((FIGURES[c] for c in type(system).__mro__ if c in FIGURES), None)
 
 
-def bodies_and_points(found: Record, build: Builder) -> None:
+def bodies_and_points(motion: Record, build: Builder) -> None:
     """Every body as the uniform solid of its mass and inertia; points joined where nothing moves between them."""
-    color = {k: CYCLE[k % len(CYCLE)] for k in range(len(found.bodies))}
-    joined = _links(found, build)
+    color = {k: CYCLE[k % len(CYCLE)] for k in range(len(motion.bodies))}
+    joined = _links(motion, build)
     for k in color:
-        _solid(build, k, color[k], found.inertia[k] / found.mass[k])
-    for k, name in enumerate(found.bodies):
-        build.moving(found.place[:, k : k + 1])
+        _solid(build, k, color[k], motion.inertia[k] / motion.mass[k])
+    for k, name in enumerate(motion.bodies):
+        build.moving(motion.place[:, k : k + 1])
         build.shape("center", color[k], 1, width=5.0, label=name)
-        _trace(build, found.place[:, k : k + 1], color[k])
-    for i, name in enumerate(found.point_names):
+        _trace(build, motion.place[:, k : k + 1], color[k])
+    for i, name in enumerate(motion.point_names):
         if i == 0 and not joined:
             continue  # nothing hangs on the origin: it would only be a dot far away
-        x = found.points[:, i : i + 1]
+        x = motion.points[:, i : i + 1]
         build.moving(x)
         build.shape("dot", "grey", 1, width=3.0, label=name)
-        if np.abs(found.place - x).max(axis=(0, 2)).min() > build.tolerance:
+        if np.abs(motion.place - x).max(axis=(0, 2)).min() > build.tolerance:
             _trace(build, x, "grey")
 
 
@@ -416,13 +416,13 @@ def _ring(radius: float, z: float) -> np.ndarray:
     return np.stack([radius * np.cos(_AROUND), radius * np.sin(_AROUND), np.full_like(_AROUND, z)], axis=1)
 
 
-def _links(found: Record, build: Builder) -> bool:
+def _links(motion: Record, build: Builder) -> bool:
     """Lines between points and mass centres that stand still relative to each other in a frame that moves.
 
     Whether the origin, the first of the points, is among those that are joined.
     """
-    points = np.concatenate([found.points, found.place], axis=1)  # (T, n, 3)
-    frames = np.concatenate([found.orientation, found.frames], axis=1)
+    points = np.concatenate([motion.points, motion.place], axis=1)  # (T, n, 3)
+    frames = np.concatenate([motion.orientation, motion.frames], axis=1)
     frames = [R for R in np.moveaxis(frames, 1, 0) if np.abs(R - R[0]).max() > 1e-6]
     n = points.shape[1]
     group = list(range(n))

@@ -83,7 +83,7 @@ def driven_double_pendulum(torque: Literal["measured", "commanded"] = "measured"
     """
     columns = {"measured": "torque_measured", "commanded": "torque_command"}
     refuse_unknown([torque], list(columns), "driven_double_pendulum: no torque")
-    found = _recording(
+    recording = _recording(
         "driven_double_pendulum",
         "runs.csv.gz",
         file,
@@ -92,7 +92,7 @@ def driven_double_pendulum(torque: Literal["measured", "commanded"] = "measured"
         sigma=0.01,
         parameters=_json("driven_double_pendulum", "parameters_authors.json"),
     )
-    return dataclasses.replace(found, trials=tuple(_with_rates(trial) for trial in found.trials))
+    return dataclasses.replace(recording, trials=tuple(_with_rates(trial) for trial in recording.trials))
 
 
 def steer_by_wire(*, seconds: float = 1.0, file: File = None) -> Recording:
@@ -105,7 +105,7 @@ def steer_by_wire(*, seconds: float = 1.0, file: File = None) -> Recording:
     `parameters`: in Meijaard's names, for `WhippleBicycle.from_parameters`. Masses, lengths and the wheels' inertias
     were measured, the rest is guessed; `IByy`, `IHyy`, which its authors do not have, are 2.0 and 0.01 kg m^2.
     """
-    found = _recording(
+    recording = _recording(
         "steer_by_wire",
         "free_responses.csv.gz",
         file,
@@ -115,7 +115,7 @@ def steer_by_wire(*, seconds: float = 1.0, file: File = None) -> Recording:
         sigma=_BICYCLE,
         parameters={"IByy": 2.0, "IHyy": 0.01} | _json("steer_by_wire", "parameters.json"),
     )
-    return dataclasses.replace(found, trials=tuple(ride.between(0.0, seconds - 0.005) for ride in found.trials))
+    return dataclasses.replace(recording, trials=tuple(ride.between(0.0, seconds - 0.005) for ride in recording.trials))
 
 
 def robot_bicycle(channels: Sequence[str] = ("steer", "roll_rate"), *, file: File = None) -> Recording:
@@ -163,7 +163,7 @@ def davis_rider(*, file: File = None) -> Recording:
     `parameters`: `rigid_rider_and_bicycle`, `bicycle_alone`, `rider_alone` and `as_stored_in_the_run_file`, each in
     Meijaard's names; `identified` are the coefficients that the author found from 57 runs.
     """
-    found = _recording(
+    recording = _recording(
         "davis_rider",
         "run105.csv.gz",
         file,
@@ -175,7 +175,7 @@ def davis_rider(*, file: File = None) -> Recording:
         parameters=_json("davis_rider", "parameters.json")
         | {"identified": _json("davis_rider", "reference_moore.json")},
     )
-    return dataclasses.replace(found, trials=tuple(_with_median_speed(trial) for trial in found.trials))
+    return dataclasses.replace(recording, trials=tuple(_with_median_speed(trial) for trial in recording.trials))
 
 
 def tossed_elbow(*, file: File = None) -> Recording:

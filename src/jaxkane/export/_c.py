@@ -95,12 +95,12 @@ def without_end(text: str) -> str:
 
 COMPARE = """
 /* Prints the largest difference, as a part of the largest expected number. */
-static int compare(const char *name, int n, const {type} *found, const {type} *expected) {{
+static int compare(const char *name, int n, const {type} *computed, const {type} *expected) {{
     double difference = 0.0, size = 0.0;
     int i;
     for (i = 0; i < n; i++) {{
-        const double d = fabs((double)found[i] - (double)expected[i]);
-        if (found[i] == expected[i] || (found[i] != found[i] && expected[i] != expected[i])) continue;
+        const double d = fabs((double)computed[i] - (double)expected[i]);
+        if (computed[i] == expected[i] || (computed[i] != computed[i] && expected[i] != expected[i])) continue;
         if (!(d <= difference)) difference = d; /* also where it is not a number */
         if (fabs((double)expected[i]) > size) size = fabs((double)expected[i]);
     }}
@@ -123,12 +123,12 @@ def trial(formulas: Formulas, functions: Iterable[str]) -> tuple[dict[str, Any],
             for function in functions:
                 outputs = jax.tree.map(np.asarray, formulas.by_jax(function, *args))
                 expected[function] = dict(zip(formulas.nodes(function), outputs, strict=True))
-        if all(np.all(np.isfinite(x)) for found in expected.values() for x in found.values()):
+        if all(np.all(np.isfinite(x)) for outputs in expected.values() for x in outputs.values()):
             break
     return state, expected
 
 
-class Written(NamedTuple):
+class ExportedFiles(NamedTuple):
     """The files that `jaxkane.export.c` has written."""
 
     header: Path
@@ -143,7 +143,7 @@ def c(
     *,
     name: str | None = None,
     dtype: str = "float64",
-) -> Written:
+) -> ExportedFiles:
     """A system's equations as C99 that needs the mathematical library alone.
 
         jk.export.c(bicycle, "generated/bicycle.c")
@@ -176,7 +176,7 @@ def c(
     formulas = Formulas(system, dtype)
     functions = chosen(formulas, functions)
     module = _Module(formulas, functions, name or path.stem)
-    written = Written(path.with_suffix(".h"), path, path.with_name(f"{path.stem}_test.c"))
+    written = ExportedFiles(path.with_suffix(".h"), path, path.with_name(f"{path.stem}_test.c"))
     header = written.header.name
     texts = (module.header(), module.source(header), module.test(header))
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -195,7 +195,7 @@ class _Module:
         parameters = [a.name for a in formulas.of_kind("parameters")]
         self.members = dict(zip(parameters, identifiers(parameters, C_WORDS), strict=True))
         self.nodes = {function: formulas.nodes(function) for function in functions}
-        self.given = {
+        self.input_words = {
             int(k): self._element(a.kind, a.name, i, a.shape)
             for a, nodes in zip(formulas.arguments, formulas.inputs, strict=True)
             for i, k in enumerate(nodes.flat)
@@ -265,7 +265,7 @@ class _Module:
         return f"{shapes}: derivatives of (q_dot, u_dot) by {by}"
 
     def source(self, header: str) -> str:
-        outputs = [nodes for found in self.nodes.values() for nodes in found.values()]
+        outputs = [nodes for by_output in self.nodes.values() for nodes in by_output.values()]
         used = {self.formulas.graph.nodes[k].operation for k in needed(self.formulas.graph.nodes, outputs)}
         helpers = [text.format(type=self.type) for operation, text in HELPERS.items() if operation in used]
         values = self.formulas.values().values()
@@ -275,12 +275,12 @@ class _Module:
         return "\n".join([*parts, *(self._body(function) for function in self.functions)])
 
     def _body(self, function: str) -> str:
-        found = self.nodes[function]
-        lines, outputs = as_source(self.formulas.graph, list(found.values()), self.given, C)
-        for output, elements in zip(found, outputs, strict=True):
+        by_output = self.nodes[function]
+        lines, outputs = as_source(self.formulas.graph, list(by_output.values()), self.input_words, C)
+        for output, elements in zip(by_output, outputs, strict=True):
             lines += [f"{output}[{i}] = {text};" for i, text in enumerate(elements)]
         text = "\n    ".join(lines)
-        unused = [f"(void){word};" for word in ("t", "q", "u", "inputs", "p", *found) if not _is_read(word, text)]
+        unused = [f"(void){word};" for word in ("t", "q", "u", "inputs", "p", *by_output) if not _is_read(word, text)]
         return f"{self._signature(function)} {{\n    " + "\n    ".join([*unused, *lines]) + "\n}\n"
 
     def test(self, header: str) -> str:
@@ -294,12 +294,12 @@ class _Module:
         for function in self.functions:
             for output, numbers in expected[function].items():
                 lines.append(array(f"const {self.type} {function}_{output}", numbers, self.formulas.dtype))
-                lines.append(f"static {self.type} found_{function}_{output}[{max(1, numbers.size)}];")
-            outputs = "".join(f", found_{function}_{output}" for output in expected[function])
+                lines.append(f"static {self.type} computed_{function}_{output}[{max(1, numbers.size)}];")
+            outputs = "".join(f", computed_{function}_{output}" for output in expected[function])
             calls.append(f"    {self.name}_{function}({t}, q, u, inputs, &{self.name}_default{outputs});")
             for output, numbers in expected[function].items():
                 each = f"{function}_{output}"
-                calls.append(f'    wrong += compare("{each}", {numbers.size}, found_{each}, {each});')
+                calls.append(f'    wrong += compare("{each}", {numbers.size}, computed_{each}, {each});')
         tolerance = "1e-11" if self.formulas.dtype == "float64" else "1e-3"
         lines.append(COMPARE.format(type=self.type, tolerance=tolerance))
         return "\n".join([*lines, "int main(void) {", "    int wrong = 0;", *calls, "    return wrong;", "}", ""])

@@ -38,33 +38,33 @@ def casadi(system: System, function: str = "rates", *, name: str | None = None) 
     ca = _imported()
     formulas = Formulas(system)
     one_function(formulas, function, "casadi")
-    found = formulas.nodes(function)
+    by_output = formulas.nodes(function)
     columns: dict[str, list[Any]] = {kind: [] for kind in ("t", "q", "u", "inputs", "parameters")}
-    given = {}
+    symbols = {}
     for a, nodes in zip(formulas.arguments, formulas.inputs, strict=True):
         for element, k in zip(a.elements, nodes.flat, strict=True):
-            given[int(k)] = ca.SX.sym(element)
+            symbols[int(k)] = ca.SX.sym(element)
             if a.kind in columns:
-                columns[a.kind].append(given[int(k)])
+                columns[a.kind].append(symbols[int(k)])
     graph = formulas.graph
-    nodes = needed(graph.nodes, found.values())
+    nodes = needed(graph.nodes, by_output.values())
     if any(graph.nodes[k].dtype == "float32" for k in nodes):
         raise ValueError(f"{formulas.name}: its description computes in float32 in between, which CasADi has not.")
     try:
-        objects = as_objects(graph, nodes, given, table(ca), lambda v, _: ca.SX(float(v)), "CasADi")
+        objects = as_objects(graph, nodes, symbols, table(ca), lambda v, _: ca.SX(float(v)), "CasADi")
     except NotScalarError as error:
         raise ValueError(f"{formulas.name}: {function!r} holds {error}.") from None
-    outputs = [_matrix(ca, nodes, objects) for nodes in found.values()]
+    outputs = [_matrix(ca, nodes, objects) for nodes in by_output.values()]
     label = re.sub(r"_+", "_", in_ascii(name or f"{formulas.name}_{function}")).strip("_")  # as CasADi wants names
-    return ca.Function(label, [ca.vertcat(*x) for x in columns.values()], outputs, [*columns], [*found])
+    return ca.Function(label, [ca.vertcat(*x) for x in columns.values()], outputs, [*columns], [*by_output])
 
 
 def _matrix(ca: Any, nodes: np.ndarray, objects: dict[int, Any]) -> Any:
     rows = nodes.reshape(-1, nodes.shape[-1] if nodes.ndim > 1 else 1)
-    found = ca.SX(*rows.shape)
+    matrix = ca.SX(*rows.shape)
     for (i, j), k in np.ndenumerate(rows):
-        found[i, j] = objects[int(k)]
-    return found
+        matrix[i, j] = objects[int(k)]
+    return matrix
 
 
 def table(ca: Any) -> dict[str, Any]:

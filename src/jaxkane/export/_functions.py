@@ -20,8 +20,8 @@ def chosen(formulas: Formulas, functions: Sequence[str] | None, usual: Sequence[
     """The functions that were asked for; by default the usual ones that the system has."""
     if functions is None:
         needs = {"dependent_speeds": "u_dep", "input_jacobian": "inputs", "parameter_jacobian": "parameters"}
-        found = tuple(name for name in usual if name not in needs or formulas.names(needs[name]))
-        return (*found, "state_rates") if formulas.system.states else found
+        available = tuple(name for name in usual if name not in needs or formulas.names(needs[name]))
+        return (*available, "state_rates") if formulas.system.states else available
     if isinstance(functions, str):
         raise TypeError(f"functions is a sequence of names; one is ({functions!r},).")
     functions = tuple(dict.fromkeys(functions))
@@ -47,7 +47,7 @@ def parameters(system: System) -> dict[str, np.ndarray]:
     return Formulas(system).values()
 
 
-# Words that C99, C++ or their compilers have taken, macros of <math.h> and <stdio.h> among them.
+# Words that C99, C++ or their compilers have reserved, macros of <math.h> and <stdio.h> among them.
 C_WORDS = frozenset(
     """auto break case char const continue default do double else enum extern float for goto if inline int long register
     restrict return short signed sizeof static struct switch typedef union unsigned void volatile while
@@ -69,8 +69,8 @@ def in_ascii(name: str) -> str:
         if letter.isascii():
             words.append(letter)
         elif unicodedata.category(letter).startswith("L"):
-            said = unicodedata.name(letter, f"u{ord(letter):x}")
-            greek = re.fullmatch(r"GREEK (SMALL|CAPITAL) LETTER (?:FINAL )?(\w+).*", said)
+            letter_name = unicodedata.name(letter, f"u{ord(letter):x}")
+            greek = re.fullmatch(r"GREEK (SMALL|CAPITAL) LETTER (?:FINAL )?(\w+).*", letter_name)
             words.append(
                 (greek[2].lower() if greek[1] == "SMALL" else greek[2].title()) if greek else f"u{ord(letter):x}"
             )
@@ -78,17 +78,17 @@ def in_ascii(name: str) -> str:
     return word if word[:1].isalpha() else f"n{word}"
 
 
-def identifiers(names: Iterable[str], taken: Collection[str], in_ascii_only: bool = True) -> list[str]:
-    """For each name an identifier of its own: what is taken, or equal to another, gets an underscore or a number."""
-    found: list[str] = []
-    used = set(taken)
+def identifiers(names: Iterable[str], reserved: Collection[str], in_ascii_only: bool = True) -> list[str]:
+    """For each name an identifier of its own: what is reserved, or equal to another, gets an underscore or a number."""
+    unique: list[str] = []
+    used = set(reserved)
     for name in names:
         own = unicodedata.normalize("NFKC", name)  # as Python reads it
         word = own if own.isidentifier() and not in_ascii_only else in_ascii(name)
         candidates = (word, f"{word}_", *(f"{word}_{i}" for i in range(2, 10_000)))
-        found.append(next(c for c in candidates if c not in used))
-        used.add(found[-1])
-    return found
+        unique.append(next(c for c in candidates if c not in used))
+        used.add(unique[-1])
+    return unique
 
 
 def variable_units(system: System) -> dict[str, str]:

@@ -48,8 +48,10 @@ PYTHON = Language(
     lambda name, text, dtype: f"{name} = {text}",
     {name: name for name in DTYPES},
 )
-# What the text of a function, or Python, has taken.
-_TAKEN = frozenset((*keyword.kwlist, *keyword.softkwlist, *dir(builtins), *"np q u t inputs parameters _erf".split()))
+# Names that the text of a function, or Python, uses.
+_RESERVED = frozenset(
+    (*keyword.kwlist, *keyword.softkwlist, *dir(builtins), *"np q u t inputs parameters _erf".split())
+)
 
 
 def numpy(
@@ -92,7 +94,10 @@ def _source(formulas: Formulas, functions: Sequence[str]) -> str:
     units = {a.name: a.info.unit for a in formulas.of_kind("parameters")}
     unit_of = variable_units(formulas.system)
     bodies = [_function(formulas, function, unit_of) for function in functions]
-    lines = [f'"""{_said(formulas.name)}: Kane\'s equations M u_dot = f, written by jaxkane {__version__}."""', ""]
+    lines = [
+        f'"""{_in_docstring(formulas.name)}: Kane\'s equations M u_dot = f, written by jaxkane {__version__}."""',
+        "",
+    ]
     with_erf = any("_erf(" in body for body in bodies)
     lines += ["import math", ""] * with_erf + ["import numpy as np", ""]
     lines += ["_erf = np.vectorize(math.erf)", ""] * with_erf
@@ -110,7 +115,7 @@ def _finite(number: str) -> str:
     return f"np.{number}" if number in ("nan", "inf") else number
 
 
-def _said(text: str) -> str:
+def _in_docstring(text: str) -> str:
     return text.replace("\\", "/").replace('"""', "'''")
 
 
@@ -121,20 +126,20 @@ class _Names:
         kinds = ("q", "u", "inputs", "parameters")
         named = [(kind, name) for kind in kinds for name in _names_of(formulas, kind)]
         named += [("outputs", name) for name in outputs]
-        self.words = identifiers([name for _, name in named], _TAKEN, in_ascii_only=False)
+        self.words = identifiers([name for _, name in named], _RESERVED, in_ascii_only=False)
         self.of = dict(zip(named, self.words, strict=True))
 
-    def given(self, formulas: Formulas) -> dict[int, str]:
+    def input_words(self, formulas: Formulas) -> dict[int, str]:
         """The names of input nodes."""
-        found = {}
+        words = {}
         for a, nodes in zip(formulas.arguments, formulas.inputs, strict=True):
             for place, k in np.ndenumerate(nodes):
                 if a.kind == "parameters":
                     index = f"[{', '.join(map(str, place))}]" if place else ""
-                    found[int(k)] = self.of["parameters", a.name] + index
+                    words[int(k)] = self.of["parameters", a.name] + index
                 elif a.kind != "u_dep":
-                    found[int(k)] = self.of[a.kind, a.elements[place[0]]] if place else "t"
-        return found
+                    words[int(k)] = self.of[a.kind, a.elements[place[0]]] if place else "t"
+        return words
 
     def temporary(self) -> str:
         """The pattern of the names of intermediate results, which no other name fits."""
@@ -148,13 +153,15 @@ def _names_of(formulas: Formulas, kind: str) -> tuple[str, ...]:
 
 
 def _function(formulas: Formulas, function: str, unit_of: dict[str, str]) -> str:
-    found = formulas.nodes(function)
-    names = _Names(formulas, found)
-    body, outputs = as_source(formulas.graph, list(found.values()), names.given(formulas), PYTHON, names.temporary())
+    by_output = formulas.nodes(function)
+    names = _Names(formulas, by_output)
+    body, outputs = as_source(
+        formulas.graph, list(by_output.values()), names.input_words(formulas), PYTHON, names.temporary()
+    )
     text = "\n".join([*body, *(e for elements in outputs for e in elements)])
     lines = ["", '@np.errstate(all="ignore")']
     lines.append(f"def {function}(t, q, u, inputs=(), parameters=PARAMETERS):")
-    lines.append(f'    """{", ".join(found)}{_meaning(formulas, function)}."""')
+    lines.append(f'    """{", ".join(by_output)}{_meaning(formulas, function)}."""')
     for kind in ("q", "u", "inputs"):
         words = [names.of[kind, name] for name in formulas.names(kind)]
         if any(_reads(word, text) for word in words):
@@ -168,11 +175,11 @@ def _function(formulas: Formulas, function: str, unit_of: dict[str, str]) -> str
         if _reads(word, text):
             lines.append(f"    {word} = np.{formulas.dtype}(parameters[{name!r}])")
     lines += [f"    {line}" for line in body]
-    for output, nodes, elements in zip(found, found.values(), outputs, strict=True):
+    for output, nodes, elements in zip(by_output, by_output.values(), outputs, strict=True):
         array = f"np.array({_nested(elements, nodes.shape)}, np.{formulas.dtype})"
         array += "" if nodes.size else f".reshape({nodes.shape})"
         lines.append(f"    {names.of['outputs', output]} = {array}")
-    results = ", ".join(names.of["outputs", output] for output in found)
+    results = ", ".join(names.of["outputs", output] for output in by_output)
     return "\n".join([*lines, f"    return {results}", ""])
 
 

@@ -23,8 +23,8 @@ def mode_shapes(
 ) -> np.ndarray:
     """Each mode's eigenvector as arrows in the complex plane: how far and how much later each state moves.
 
-        found = jk.stability.eigenvalues(bicycle, speeds)
-        jk.plot.mode_shapes(found, at=5.0, only=("roll", "steer"))
+        modes = jk.stability.eigenvalues(bicycle, speeds)
+        jk.plot.mode_shapes(modes, at=5.0, only=("roll", "steer"))
 
     Every vector is turned and scaled so that its largest state has length one and phase zero. Of a conjugate pair one
     is drawn.
@@ -77,23 +77,23 @@ def mode_shapes(
     return axes
 
 
-def _one_point(found: Any, vectors: Any, states: Any, at: float | None, modes: Any) -> tuple[Any, ...]:
+def _one_point(model: Any, vectors: Any, states: Any, at: float | None, modes: Any) -> tuple[Any, ...]:
     where = ""
     if vectors is None:
-        if not hasattr(found, "vectors"):
+        if not hasattr(model, "vectors"):
             raise TypeError(
                 "Give eigenvalues (n,), vectors (n_states, n) and the states' names, or the result of "
                 "jaxkane.stability.eigenvalues(...) and `at`."
             )
-        values = np.asarray(found.values, dtype=float)
+        values = np.asarray(model.values, dtype=float)
         if at is None and len(values) > 1:
             raise ValueError(f"mode_shapes: say `at` which value, between {values.min():g} and {values.max():g}.")
         i = 0 if at is None else int(np.argmin(np.abs(values - at)))
         where = f"\nat {values[i]:.4g}" if len(values) > 1 else ""
-        states = found.states if states is None else states
-        modes = getattr(found, "modes", None) if modes is None else modes
-        found, vectors = found.eigenvalues[i], found.vectors[i]
-    lam, X = np.asarray(found, dtype=complex), np.asarray(vectors, dtype=complex)
+        states = model.states if states is None else states
+        modes = getattr(model, "modes", None) if modes is None else modes
+        model, vectors = model.eigenvalues[i], model.vectors[i]
+    lam, X = np.asarray(model, dtype=complex), np.asarray(vectors, dtype=complex)
     if X.ndim != 2 or lam.shape != X.shape[1:]:
         raise ValueError(f"mode_shapes: vectors (n_states, n) for eigenvalues (n,), got {X.shape} for {lam.shape}.")
     states = [f"state {i + 1}" for i in range(X.shape[0])] if states is None else list(as_names(states))
@@ -120,8 +120,8 @@ def eigenvalues(
 ) -> Any:
     """Real parts (lines) and imaginary parts (thin, dotted) against a parameter; where all modes decay is shaded.
 
-        found = jk.stability.eigenvalues(bicycle, jnp.linspace(0.0, 10.0, 401))
-        jk.plot.eigenvalues(found)
+        modes = jk.stability.eigenvalues(bicycle, jnp.linspace(0.0, 10.0, 401))
+        jk.plot.eigenvalues(modes)
 
     **Arguments:**
 
@@ -240,5 +240,5 @@ def _limits(lam: Any) -> tuple[float, float]:
 
 def _legend(ax: Any) -> None:
     handles, labels = ax.get_legend_handles_labels()
-    known = dict(zip(labels, handles, strict=True))
-    ax.legend(known.values(), known.keys(), frameon=False, fontsize="small")
+    by_label = dict(zip(labels, handles, strict=True))
+    ax.legend(by_label.values(), by_label.keys(), frameon=False, fontsize="small")

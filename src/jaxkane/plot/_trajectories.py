@@ -19,10 +19,10 @@ STABLE = "#2ca02c"
 def panels(axes: Any, rows: int, columns: int = 1, *, size: tuple[float, float], **options: Any) -> np.ndarray:
     """An array (rows, columns) of axes: those given, or of a new figure, `size` [inches] for each."""
     if axes is not None:
-        given = np.ravel(axes)
-        if given.size != rows * columns:
-            raise ValueError(f"{rows * columns} axes are needed ({rows} rows, {columns} columns), got {given.size}.")
-        return given.reshape(rows, columns)
+        array = np.ravel(axes)
+        if array.size != rows * columns:
+            raise ValueError(f"{rows * columns} axes are needed ({rows} rows, {columns} columns), got {array.size}.")
+        return array.reshape(rows, columns)
     import matplotlib.pyplot as plt
 
     figsize = (size[0] * columns, size[1] * rows)
@@ -79,40 +79,40 @@ def trajectories(
     """
     groups = [as_names(group) for group in ([names] if isinstance(names, str) else names or trajectory.names[0])]
     drawn = [name for group in groups for name in group]
-    known = {name: unit_of(name, dict(trajectory.units) | dict(units or {})) for name in drawn}
+    units_by_name = {name: unit_of(name, dict(trajectory.units) | dict(units or {})) for name in drawn}
     values = {name: np.asarray(trajectory[name], dtype=float) for name in drawn}
     if degrees:
-        refuse_no_angle(drawn, known.values())
+        refuse_no_angle(drawn, units_by_name.values())
     t = np.asarray(trajectory.t, dtype=float)
-    found = panels(axes, len(groups), size=(7.0, 1.6 if len(groups) > 1 else 3.0), sharex=True)[:, 0]
+    panel_axes = panels(axes, len(groups), size=(7.0, 1.6 if len(groups) > 1 else 3.0), sharex=True)[:, 0]
     n = int(np.prod(t.shape[:-1]))
     members: dict[str, Any] = {"alpha": max(0.08, min(1.0, 4.0 / n**0.5)), "linewidth": 0.8} if t.ndim > 1 else {}
     t = t.reshape(n, -1)
-    for ax, group in zip(found, groups, strict=True):
-        shown = []
+    for ax, group in zip(panel_axes, groups, strict=True):
+        labelled = []
         for name in group:
-            y, unit = _in_unit(values[name], known[name], degrees)
+            y, unit = _in_unit(values[name], units_by_name[name], degrees)
             parts = [part for part in (label_of(name) if len(group) > 1 else "", label) if part]
             y = y.reshape(n, -1)
             line = ax.plot(t[0], y[0], label=", ".join(parts) or None, **members | style)[0]
             ax.plot(t[1:].T, y[1:].T, **members | style | {"color": line.get_color()})
             _mark_ends(ax, trajectory, t, y, line.get_color())
-            shown.append((name, unit))
-        ax.set_ylabel(_axis_label(shown))
+            labelled.append((name, unit))
+        ax.set_ylabel(_axis_label(labelled))
         finish(ax)
     if np.ndim(trajectory.status) == 0 and int(trajectory.status) != Status.COMPLETED:
-        _tell_the_end(found, trajectory)
-    found[-1].set_xlabel("time [s]")
-    return found
+        _tell_the_end(panel_axes, trajectory)
+    panel_axes[-1].set_xlabel("time [s]")
+    return panel_axes
 
 
 def _in_unit(y: np.ndarray, unit: str, degrees: bool) -> tuple[np.ndarray, str]:
     return (np.degrees(y), unit.replace("rad", "deg")) if degrees and in_degrees(unit) else (y, unit)
 
 
-def _axis_label(shown: Sequence[tuple[str, str]]) -> str:
-    units = {unit for _, unit in shown}
-    name = label_of(shown[0][0]).replace("_", " ") if len(shown) == 1 else ""
+def _axis_label(labelled: Sequence[tuple[str, str]]) -> str:
+    units = {unit for _, unit in labelled}
+    name = label_of(labelled[0][0]).replace("_", " ") if len(labelled) == 1 else ""
     unit = f"[{label_of(units.pop())}]" if len(units) == 1 and units != {""} else ""
     return f"{name}\n{unit}".strip()
 
@@ -147,9 +147,9 @@ def audit(audit: Audit, *, axes: Any = None) -> np.ndarray:
     """
     if not isinstance(audit, Audit):
         raise TypeError(f"plot.audit draws an Audit, jk.audit(system, ride); got a {type(audit).__name__}.")
-    found = panels(axes, 2, 2, size=(4.75, 2.75), sharex=True)
-    audit.plot(found)
-    return found
+    panel_axes = panels(axes, 2, 2, size=(4.75, 2.75), sharex=True)
+    audit.plot(panel_axes)
+    return panel_axes
 
 
 _TRIALS = 3
@@ -192,9 +192,11 @@ def fits(
     refuse_unknown(channels, all_channels, "fits: there is no channel")
     if not channels:
         raise ValueError(f"fits: `channels` is empty; {hint([], all_channels)}")
-    known = {channel: unit_of(channel, units_of(fit.problem.system) | dict(units or {})) for channel in channels}
+    units_by_name = {
+        channel: unit_of(channel, units_of(fit.problem.system) | dict(units or {})) for channel in channels
+    }
     if degrees:
-        refuse_no_angle(channels, known.values())
+        refuse_no_angle(channels, units_by_name.values())
     each = 1 + residuals
     heights = {"height_ratios": [3, 1.2][:each] * len(channels)}
     axes = panels(axes, each * len(channels), len(chosen), size=(4.2, 1.5), sharex="col", sharey="row", **heights)
@@ -207,7 +209,7 @@ def fits(
             if channel not in trial.measured:
                 ax.text(0.5, 0.5, "not measured", ha="center", va="center", color=SOFT, transform=ax.transAxes)
                 continue
-            scale, unit = _scale(known[channel], degrees)
+            scale, unit = _scale(units_by_name[channel], degrees)
             ax.plot(
                 trial.t, scale * trial.measured[channel], ".", color="C0", markersize=3, alpha=0.6, label="measured"
             )

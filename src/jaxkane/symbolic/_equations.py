@@ -109,12 +109,12 @@ class Equations:
                 "after the other, and what is made of them. equations(system, whole=True) has them written out, which "
                 "for a few hundred operations may take minutes; jaxkane.symbolic.linearize stays smaller."
             )
-        known: dict[Any, Any] = {}
+        simplified: dict[Any, Any] = {}
 
         def simpler(x: Any) -> Any:
-            if x not in known:
-                known[x] = sp.simplify(x)
-            return known[x]
+            if x not in simplified:
+                simplified[x] = sp.simplify(x)
+            return simplified[x]
 
         matrix = lambda m: m.applyfunc(simpler)  # noqa: E731
         changed: dict[str, Any] = {
@@ -169,12 +169,12 @@ def equations(system: System, *, of_time: bool = False, whole: bool | None = Non
     symbols = symbols_of(formulas, of_time)
     # First, so that they stand first among the replacements: others read them by their names.
     u_dep = formulas.nodes("dependent_speeds")["u_dep"] if symbols["u_dep"] else np.zeros(0, np.int64)
-    found = _quantities(formulas)
-    outputs = list(found.values())
+    quantities = _quantities(formulas)
+    outputs = list(quantities.values())
     is_whole = _written_out(formulas, outputs, u_dep) <= WHOLE_UP_TO if whole is None else whole
     writer = _Writer(formulas, symbols, u_dep, outputs, is_whole)
-    matrices: dict[str, Any] = {name: writer.matrices(nodes) for name, nodes in found.items()}
-    operations = {name: count_operations(formulas.graph, [nodes]) for name, nodes in found.items()}
+    matrices: dict[str, Any] = {name: writer.matrices(nodes) for name, nodes in quantities.items()}
+    operations = {name: count_operations(formulas.graph, [nodes]) for name, nodes in quantities.items()}
     return Equations(
         formulas.name,
         **matrices,
@@ -189,11 +189,11 @@ def equations(system: System, *, of_time: bool = False, whole: bool | None = Non
 
 def by_name(symbols: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Symbols by the names that they were declared with; a parameter that shares its name has an underscore more."""
-    found: dict[str, Any] = {}
+    symbol_of: dict[str, Any] = {}
     for kind, of_kind in symbols.items():
         for name, symbol in of_kind.items():
-            found[symbol.name if kind == "parameters" else name] = symbol
-    return found
+            symbol_of[symbol.name if kind == "parameters" else name] = symbol
+    return symbol_of
 
 
 def _quantities(formulas: Formulas) -> dict[str, np.ndarray]:
@@ -228,14 +228,14 @@ class _Writer:
     ):
         sp = imported()
         graph = formulas.graph
-        given = given_nodes(formulas, symbols)
+        inputs = given_nodes(formulas, symbols)
         order = needed(graph.nodes, [*outputs, u_dep])
         count = uses(graph, order, [*outputs, u_dep])
-        names = fresh_names([*by_name(symbols), *(x.name for x in given.values() if x.is_Symbol)])
+        names = fresh_names([*by_name(symbols), *(x.name for x in inputs.values() if x.is_Symbol)])
         speeds = dict(zip((int(k) for k in u_dep), symbols["u_dep"].values(), strict=True))
         self.replacements: list[tuple[Any, Any]] = []
 
-        def kept(k: int, x: Any) -> Any:
+        def replaced(k: int, x: Any) -> Any:
             if k not in speeds and (is_whole or count[k] < 2 or x.is_Atom or isinstance(x, sp.logic.boolalg.Boolean)):
                 return x
             symbol = speeds[k] if k in speeds else sp.Symbol(next(names), real=True)
@@ -243,14 +243,14 @@ class _Writer:
             return symbol
 
         try:
-            self.found = as_objects(graph, order, given, table(), exact, "SymPy", kept)
+            self.expressions = as_objects(graph, order, inputs, table(), exact, "SymPy", replaced)
         except NotScalarError as error:
             raise ValueError(f"{formulas.name}: its equations hold {error}.") from None
         # A dependent speed that is a speed, or a number, itself.
         named = {symbol for symbol, _ in self.replacements}
         for k, symbol in zip(u_dep, symbols["u_dep"].values(), strict=True):
             if symbol not in named:
-                self.replacements.append((symbol, self.found[int(k)]))
+                self.replacements.append((symbol, self.expressions[int(k)]))
 
     def matrices(self, nodes: np.ndarray) -> Any:
         """An array of nodes as a matrix, a column where it has one axis; where it has three, one for each body."""
@@ -258,4 +258,4 @@ class _Writer:
         if nodes.ndim == 3:
             return tuple(self.matrices(x) for x in nodes)
         rows = nodes.reshape(-1, 1) if nodes.ndim == 1 else nodes
-        return sp.ImmutableMatrix(*rows.shape, [self.found[int(k)] for k in rows.flat])
+        return sp.ImmutableMatrix(*rows.shape, [self.expressions[int(k)] for k in rows.flat])

@@ -55,8 +55,8 @@ class AtMotion:
         kinds = symbols_of(formulas, of_time=False)
         self.symbols = by_name(kinds)
         moving = {"t": kinds["t"], **{kind: kinds[kind] for kind in ("q", "u", "inputs")}}
-        known = [*(name for of in moving.values() for name in of), *kinds["parameters"]]
-        refuse_unknown(at, known, f"{formulas.name} has no", "it has")
+        names = [*(name for of in moving.values() for name in of), *kinds["parameters"]]
+        refuse_unknown(at, names, f"{formulas.name} has no", "it has")
         values = {name: self._value(name, x) for name, x in at.items()}
         symbols = {symbol: name for of in moving.values() for name, symbol in of.items()}
         for name, x in values.items():
@@ -73,7 +73,7 @@ class AtMotion:
             name: values[name] if name in values and name not in variables else symbol
             for name, symbol in kinds["parameters"].items()
         }
-        self.given = given_nodes(formulas, put)
+        self.inputs = given_nodes(formulas, put)
         self.parameters = kinds["parameters"]
 
     def _value(self, name: str, x: Any) -> Any:
@@ -106,11 +106,11 @@ class AtMotion:
         sp = imported()
         graph = self.formulas.graph
         try:
-            found = as_objects(graph, needed(graph.nodes, [nodes]), self.given, table(), exact, "SymPy")
+            objects = as_objects(graph, needed(graph.nodes, [nodes]), self.inputs, table(), exact, "SymPy")
         except NotScalarError as error:
             raise ValueError(f"{self.formulas.name}: its equations hold {error}.") from None
         shape = nodes.shape if nodes.ndim == 2 else (nodes.size, 1)
-        return sp.Matrix(*shape, [found[int(k)] for k in nodes.flat])
+        return sp.Matrix(*shape, [objects[int(k)] for k in nodes.flat])
 
     def jacobian(self, kinds: tuple[str, ...]) -> Any:
         """The derivatives of (q_dot, u_dot)."""
@@ -139,13 +139,15 @@ class AtMotion:
         rates, system = self.formulas.nodes("rates"), self.formulas.system
         (h,) = self.formulas.nodes("configuration_residuals").values()
         still = [i for i, name in enumerate(system.coordinates) if name not in cyclic]
-        said = [f"{system.coordinates[i]} changes with" for i in still]
-        said += [f"{name} is accelerated by" for name in system.speeds]
-        said += [f"configuration constraint {i} is violated by" for i in range(len(h))]
-        found = self.expressions(np.concatenate([rates["q_dot"][still], rates["u_dot"], h]))
-        self.refuse_singular(found)
+        residuals = [f"{system.coordinates[i]} changes with" for i in still]
+        residuals += [f"{name} is accelerated by" for name in system.speeds]
+        residuals += [f"configuration constraint {i} is violated by" for i in range(len(h))]
+        values = self.expressions(np.concatenate([rates["q_dot"][still], rates["u_dot"], h]))
+        self.refuse_singular(values)
         wrong = [
-            f"{what} {x:.3g}" for what, x in zip(said, self._numbers(found), strict=True) if not abs(x) < _TOLERANCE
+            f"{residual} {x:.3g}"
+            for residual, x in zip(residuals, self._numbers(values), strict=True)
+            if not abs(x) < _TOLERANCE
         ]
         if wrong:
             raise ValueError(
@@ -160,8 +162,8 @@ class AtMotion:
             for a, array in self.formulas.values().items()
             for name, x in zip(self._elements(a), array.flat, strict=True)
         }
-        others = sorted((x for x in sizes_of(expressions) if x.is_Symbol and x not in values), key=str)
-        numbers = values | {s: 0.3 + 0.1 * i for i, s in enumerate(others)}
+        unset = sorted((x for x in sizes_of(expressions) if x.is_Symbol and x not in values), key=str)
+        numbers = values | {s: 0.3 + 0.1 * i for i, s in enumerate(unset)}
         f = imported().lambdify([*numbers], [*expressions], "numpy", cse=True)
         return [float(x) for x in f(*numbers.values())]
 
@@ -272,19 +274,19 @@ def linearize(
     refuse_unknown(dependent, system.coordinates, f"{formulas.name}: `dependent` names", "the coordinates are")
     free = [x for x in names if x not in dependent]
     cyclic = cyclic_coordinates(system) if states is None or steady else ()
-    kept = tuple(x for x in free if x not in cyclic) if states is None else as_names(states)
-    refuse_unknown(kept, free, f"{formulas.name}: no state can be", "independent coordinates and speeds are")
+    states = tuple(x for x in free if x not in cyclic) if states is None else as_names(states)
+    refuse_unknown(states, free, f"{formulas.name}: no state can be", "independent coordinates and speeds are")
     if steady:
         model.check(cyclic)
     T = model.tangents(names, dependent)
-    rows = [names.index(x) for x in kept]
-    columns = [free.index(x) for x in kept]
+    rows = [names.index(x) for x in states]
+    columns = [free.index(x) for x in states]
     A = (model.jacobian(("q", "u")) * T).extract(rows, columns)
     B = model.jacobian(("inputs",)).extract(rows, list(range(len(system.inputs))))
     for matrix in (A, B):
         model.refuse_singular(matrix)
     replacements, (A, B) = _shared(A, B)
-    return LinearEquations(formulas.name, A, B, replacements, kept, tuple(system.inputs), model.symbols)
+    return LinearEquations(formulas.name, A, B, replacements, states, tuple(system.inputs), model.symbols)
 
 
 def _shared(*matrices: Any) -> tuple[tuple[tuple[Any, Any], ...], list[Any]]:
@@ -294,5 +296,5 @@ def _shared(*matrices: Any) -> tuple[tuple[tuple[Any, Any], ...], list[Any]]:
     if sum(sizes[x] for m in matrices for x in m) <= WHOLE_UP_TO:
         return (), [sp.ImmutableMatrix(m) for m in matrices]
     names = (sp.Symbol(name, real=True) for name in fresh_names(x.name for x in sizes if x.is_Symbol))
-    pairs, found = sp.cse([sp.ImmutableMatrix(m) for m in matrices], names, order="none")
-    return tuple(pairs), [sp.ImmutableMatrix(m) for m in found]
+    pairs, reduced = sp.cse([sp.ImmutableMatrix(m) for m in matrices], names, order="none")
+    return tuple(pairs), [sp.ImmutableMatrix(m) for m in reduced]

@@ -29,23 +29,23 @@ def symbols_of(formulas: Formulas, of_time: bool) -> dict[str, dict[str, Any]]:
     """
     sp = imported()
     t = sp.Symbol("t", real=True)
-    found: dict[str, dict[str, Any]] = {"t": {"t": t}}
-    taken = {"t"}
+    symbols: dict[str, dict[str, Any]] = {"t": {"t": t}}
+    reserved = {"t"}
     for kind in ("q", "u", "u_dep", "inputs"):
         names = formulas.names(kind)
-        taken |= {*names}
+        reserved |= {*names}
         make = (lambda name: sp.Function(name, real=True)(t)) if of_time else (lambda name: sp.Symbol(name, real=True))
-        found[kind] = {name: make(name) for name in names}
-    found["parameters"] = {}
+        symbols[kind] = {name: make(name) for name in names}
+    symbols["parameters"] = {}
     for a in formulas.of_kind("parameters"):
         for name in a.elements:
             assumed = {"positive": True} if a.info.positive else {"real": True}
             word = name
-            while word in taken:
+            while word in reserved:
                 word += "_"
-            taken.add(word)
-            found["parameters"][name] = sp.Symbol(word, **assumed)
-    return found
+            reserved.add(word)
+            symbols["parameters"][name] = sp.Symbol(word, **assumed)
+    return symbols
 
 
 def given_nodes(formulas: Formulas, symbols: Mapping[str, Mapping[str, Any]]) -> dict[int, Any]:
@@ -57,12 +57,12 @@ def given_nodes(formulas: Formulas, symbols: Mapping[str, Mapping[str, Any]]) ->
     }
 
 
-def fresh_names(taken: Iterable[str]) -> Any:
-    """x0, x1, ... without those that are taken."""
-    taken = {*taken}
+def fresh_names(reserved: Iterable[str]) -> Any:
+    """x0, x1, ... without those that are reserved."""
+    reserved = {*reserved}
     number = 0
     while True:
-        if f"x{number}" not in taken:
+        if f"x{number}" not in reserved:
             yield f"x{number}"
         number += 1
 
