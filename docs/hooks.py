@@ -39,35 +39,36 @@ def notebooks():
 
 
 def on_config(config):
-    """Notebooks and modules in the navigation, where the configuration names their folders."""
-    found = {
+    """Notebooks and modules in the navigation, where a group names their folders."""
+    folders = {
         "notebooks/": [f"notebooks/{notebook.stem}.md" for notebook in notebooks()],
         "reference/": [{module: f"reference/{module}.md"} for module in modules()],
     }
-    for entry in config.nav:
-        for title, target in entry.items():
-            entry[title] = found.get(target, target) if isinstance(target, str) else target
+    for group in config.nav:
+        for pages in group.values():
+            for entry in pages:
+                entry |= {title: folders.get(target, target) for title, target in entry.items()}
     return config
 
 
-# What one wants to do, by the room in which it is done, and the page that explains it.
+# The heading for the names of each room, and the page that explains them.
 SUBJECTS = {
     "_system": ("Describe a mechanism", "describing"),
-    "_kane": ("Ask for its equations", "coming_from_sympy"),
-    "_integrate": ("Simulate, and look at a motion", "simulation"),
-    "_animate": ("Show it", "pictures"),
-    "_scalarjit": ("Set up the process", "speed"),
+    "_kane": ("Evaluate its equations", "kane"),
+    "_integrate": ("Simulate", "simulation"),
+    "_animate": ("Animate", "pictures"),
+    "_scalarjit": ("Configure the process", "speed"),
 }
 PAGES = {
-    "fit": "identification",
+    "fit": "fit",
     "sweep": "sweeps",
     "stability": "stability",
     "bicycles": "bicycles",
     "plot": "pictures",
     "catalog": "catalogue",
     "convert": "bringing_models",
-    "joints": "bringing_models",
-    "data": "identification",
+    "joints": "joints",
+    "data": "fit",
     "symbolic": "symbolic",
     "export": "export",
 }
@@ -87,9 +88,11 @@ def reference(module):
         names = [entry.format(module, name, 2) for name in public_names(module)]
         return "\n".join([f"{head}      members: false\n{more}", *names])
     parts = [f"{head}      members: false\n"]
+    names = public_names(module)
+    assert set(names.values()) == set(SUBJECTS), f"SUBJECTS and the rooms of {module} differ: {set(names.values())}"
     for room, (title, page) in SUBJECTS.items():
         parts.append(f"## {title}\n\nExplained in [{page}](../{page}.md).\n")
-        parts += [entry.format(module, name, 3) for name, home in public_names(module).items() if home == room]
+        parts += [entry.format(module, name, 3) for name, home in names.items() if home == room]
     return "\n".join(parts)
 
 

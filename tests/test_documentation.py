@@ -8,7 +8,7 @@ import numpy as np
 
 import jaxkane as jk
 
-PAGE = Path(__file__).parents[1] / "docs" / "describing.md"
+PAGE = Path(__file__).parents[1] / "docs" / "constraints.md"
 
 
 def assert_power_is_the_rate_of_energy(system, state):

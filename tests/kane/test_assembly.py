@@ -11,7 +11,7 @@ import pytest
 import jaxkane as jk
 from jaxkane.catalog import RigidBody
 
-PAGE = Path(__file__).parents[2] / "docs" / "describing.md"
+PAGE = Path(__file__).parents[2] / "docs" / "constraints.md"
 IDENTITY = [0.0, 0.0, 0.0, 1.0]
 
 
