@@ -59,6 +59,7 @@ SUBJECTS = {
     "_animate": ("Animate", "pictures"),
     "_scalarjit": ("Configure the process", "speed"),
 }
+# The page that explains a module.
 PAGES = {
     "fit": "fit",
     "sweep": "sweeps",
@@ -71,16 +72,24 @@ PAGES = {
     "data": "fit",
     "symbolic": "symbolic",
     "export": "export",
+    "loads": "elements",
+    "rotations": "describing",
+    "sensors": "sensors",
 }
-PAGES |= {"loads": "elements", "rotations": "describing", "sensors": "sensors"}
+
+
+def link(page):
+    """A link from the reference to a page, with the page's own title."""
+    title = (ROOT / "docs" / f"{page}.md").read_text(encoding="utf-8").split("\n")[0].removeprefix("# ")
+    return f"Explained in [{title}](../{page}.md).\n"
 
 
 def reference(module):
-    """The page of a module: its own words, then each of its names; the library's own by what one wants to do."""
+    """The page of a module: its docstring, then each of its names; those of the library itself by subject."""
     package = PACKAGE.joinpath(*module.split(".")[1:])
     head = f"# {module}\n\n::: {module}\n    options:\n      show_root_heading: false\n"
     page = PAGES.get(module.split(".")[-1])
-    more = f"\nExplained in [{page}](../{page}.md).\n" if page else ""
+    more = f"\n{link(page)}" if page else ""
     if not package.is_dir():
         return f"{head}{more}"
     entry = "::: {}.{}\n    options:\n      heading_level: {}\n"
@@ -91,7 +100,7 @@ def reference(module):
     names = public_names(module)
     assert set(names.values()) == set(SUBJECTS), f"SUBJECTS and the rooms of {module} differ: {set(names.values())}"
     for room, (title, page) in SUBJECTS.items():
-        parts.append(f"## {title}\n\nExplained in [{page}](../{page}.md).\n")
+        parts.append(f"## {title}\n\n{link(page)}")
         parts += [entry.format(module, name, 3) for name, home in names.items() if home == room]
     return "\n".join(parts)
 
