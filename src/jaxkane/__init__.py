@@ -42,18 +42,18 @@ from ._scalarjit.components import Scalar as Scalar
 from ._scalarjit.configure import Configuration as Configuration
 from ._scalarjit.configure import configure as configure
 from ._system.bodies import Body as Body
-from ._system.forces import Force as Force
-from ._system.forces import Torque as Torque
-from ._system.frames import Frame as Frame
+from ._system.bodies import Force as Force
+from ._system.bodies import Torque as Torque
+from ._system.kinematics import Frame as Frame
+from ._system.kinematics import Point as Point
+from ._system.kinematics import Vector as Vector
+from ._system.kinematics import inertial as inertial
 from ._system.motion import Motion as Motion
 from ._system.motion import weight as weight
 from ._system.parameters import learned as learned
 from ._system.parameters import parameter as parameter
-from ._system.points import Point as Point
-from ._system.points import inertial as inertial
 from ._system.system import State as State
 from ._system.system import System as System
-from ._system.vectors import Vector as Vector
 
 __version__ = "0.1.0"
 

@@ -23,9 +23,7 @@ import jax.numpy as jnp
 
 from ._scalarjit.components import Component, positive
 from ._system.bodies import Body, point_of
-from ._system.frames import Frame
-from ._system.points import Point
-from ._system.vectors import Vector
+from ._system.kinematics import Frame, Point, Vector
 
 Named = dict[str, Component]
 

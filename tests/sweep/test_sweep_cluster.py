@@ -14,7 +14,7 @@ import pytest
 import jaxkane as jk
 from jaxkane._common.files import digest
 from jaxkane._kane.checks import check_system
-from jaxkane._kane.consistency import configuration_residual
+from jaxkane._kane.constraints import configuration_residual
 
 distributed = pytest.importorskip("distributed")
 

@@ -18,13 +18,10 @@ from .._scalarjit.cache_key import version_of
 from .._scalarjit.captured_values import CapturedValues
 from .._scalarjit.function import fused
 from .._scalarjit.linear import stack
-from .._system.bodies import Body
-from .._system.forces import Force, flatten_loads
-from .._system.frames import Frame
+from .._system.bodies import Body, Force, flatten_loads
+from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Motion
-from .._system.points import Point
 from .._system.system import System
-from .._system.vectors import Vector
 from ..catalog import WhippleBicycle
 from ._scene import Builder
 

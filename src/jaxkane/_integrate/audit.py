@@ -10,8 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._kane.consistency import configuration_residual
-from .._kane.constraints import relative_condition
+from .._kane.constraints import configuration_residual, relative_condition
 from .._kane.kane import accelerations_and_mass_matrix
 from .._kane.reactions import Reactions
 from .._kane.rhs import rates
@@ -19,11 +18,10 @@ from .._scalarjit.cache_key import compiled
 from .._scalarjit.components import ZERO3, Triple, add3, cross, dot, matvec
 from .._scalarjit.function import fused
 from .._scalarjit.linear import as_vector, stack
-from .._system.forces import Force
+from .._system.bodies import Force
+from .._system.kinematics import Point, Vector
 from .._system.motion import Motion, kinetic_energy_of
-from .._system.points import Point
 from .._system.system import System
-from .._system.vectors import Vector
 from .trajectory import Trajectory, reached_times
 
 ORDERS = (8, 6)  # points under the polynomials whose integrals are the work, and its estimated error
@@ -94,13 +92,11 @@ class _Places:
         self._known: dict[Point, Triple] = {}
 
     def of(self, point: Point) -> Triple:
-        chain = []
-        while point is not None and point not in self._known:
-            chain.append(point)
-            point = point._base  # type: ignore[assignment]
-        place = ZERO3 if point is None else self._known[point]
-        for point in reversed(chain):
-            place = self._known[point] = add3(place, _in_N(point._offset))  # type: ignore[arg-type]
+        place = ZERO3
+        for each in reversed([*point.chain()]):
+            if each not in self._known:
+                self._known[each] = add3(place, _in_N(each._offset))  # type: ignore[arg-type]
+            place = self._known[each]
         return place
 
 

@@ -20,8 +20,7 @@ from .._scalarjit.cache_key import compiled
 from .._scalarjit.function import fused
 from .._scalarjit.linear import as_vector
 from .._scalarjit.nan import nan_where
-from .._system.frames import Frame
-from .._system.points import Point
+from .._system.kinematics import Frame, Point
 from .._system.system import System
 from .trajectory import Trajectory, refuse_other_system
 

@@ -20,7 +20,7 @@ from .._scalarjit.nan import nan_where
 from .._system.system import State, System
 from .arguments import as_array, check_is_system, check_time
 from .checks import check_system, configuration_tolerance, implied_residual, is_concrete
-from .consistency import configuration_residual
+from .constraints import configuration_residual
 from .equations import dependent_speeds
 from .evaluate import at_random_point, structure_of
 

@@ -17,13 +17,13 @@ from .._scalarjit.compat import concretely
 from .._scalarjit.function import fused
 from .._scalarjit.linear import as_vector, rounding_of_pivots, stack
 from .._scalarjit.nan import nan_where
-from .._system.forces import Force
+from .._system.bodies import Force
 from .._system.motion import flatten_residuals
 from .._system.parameters import in_batches
 from .._system.system import State, System
 from .arguments import Row
-from .consistency import check_description, configuration_residual
-from .constraints import constraint_rows, dependent_speeds_from
+from .consistency import check_description
+from .constraints import configuration_residual, constraint_rows, dependent_speeds_from
 from .evaluate import DescriptionEvaluator
 from .kane import KaneEquations, rates_and_equations
 

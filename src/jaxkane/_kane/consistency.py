@@ -15,11 +15,11 @@ from .._scalarjit.backends.numpy import derivative_in_numbers, in_numbers
 from .._scalarjit.components import Component, is_exact
 from .._scalarjit.function import fused
 from .._scalarjit.linear import as_vector, stack
-from .._system.forces import Force, Load
-from .._system.frames import Frame
+from .._system.bodies import Force, Load
+from .._system.kinematics import Frame, Point
 from .._system.motion import Motion
-from .._system.points import Point
 from .._system.system import System
+from .constraints import configuration_residual
 from .evaluate import DescriptionEvaluator, at_random_point, frames_of, structure_of, turning_bodies
 
 Found = dict[tuple[Any, ...], Any]  # (number, kind, names ...) -> numbers; the number keeps the order of the reading
@@ -73,7 +73,7 @@ def _of_bodies(motion: Motion) -> Iterator[Fact]:
             carried = body.center.velocity + body.frame.angular_velocity.cross(r)
             velocities = [x.components_in(body.frame) for x in (body.about.velocity, carried)]
             yield ("about", body.name, body.frame.name), velocities
-        if body.center.has_position and not all(_is_sure(point) for point in _chain(body.center)):
+        if body.center.has_position and not all(_is_sure(point) for point in body.center.chain()):
             place, velocity = (x.components_in(motion.N) for x in (body.center.position, body.center.velocity))
             yield ("center", f"the mass centre of {body.name!r}"), [place, velocity]
 
@@ -88,11 +88,11 @@ def _of_points(motion: Motion, loads: Iterable[Load]) -> Iterator[Fact]:
     for point in words:
         if point not in centers:
             yield ("velocity", f"the velocity of {words[point]}"), [point.velocity.components]
-        for link in _chain(point):
-            if link in seen or link._claim is None or (link._base is None and link in centers):
+        for link in point.chain():
+            if link in seen or link._relative_motion is None or (link._base is None and link in centers):
                 continue
             seen.add(link)
-            frame, velocity = link._claim
+            frame, velocity = link._relative_motion
             rows = [link._offset.components_in(frame), velocity.components_in(frame)]  # type: ignore[union-attr]
             if not all(is_exact(x) for x in rows[0]) or not all(is_exact(x) and x == 0.0 for x in rows[1]):
                 # A point that `loads` made from a motion without speeds is at rest too, and is no point of contact.
@@ -107,24 +107,12 @@ def _of_frames(motion: Motion, loads: Iterable[Load]) -> Iterator[Fact]:
             yield ("frame", frame.name, frame.parent.name), rows  # type: ignore[union-attr]
 
 
-def _chain(point: Point | None) -> Iterator[Point]:
-    while point is not None:
-        yield point
-        point = point._base
-
-
 def _is_sure(point: Point) -> bool:
     """Whether a point moves as its place does, if what it was made from does and its claim is right."""
     if point._base is not None:
-        return point._claim is not None
+        return point._relative_motion is not None
     known = (*point.velocity.components, *(point._offset.components if point._offset is not None else ()))
     return all(is_exact(x) and x == 0.0 for x in known)  # the origin
-
-
-@fused
-def configuration_residual(system: System, t: Any, q: Any):
-    """Residuals (h,) of the configuration constraints."""
-    return as_vector(DescriptionEvaluator(system).configuration(t, tuple(q[i] for i in range(len(q)))), q)
 
 
 _CHECKED = LRUCache()  # structures

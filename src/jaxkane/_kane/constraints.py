@@ -19,8 +19,14 @@ from .._scalarjit.function import fused
 from .._scalarjit.linear import as_vector, solve, stack
 from .._system.system import System
 from .arguments import as_array, check_is_system, check_time, refuse_incomplete
-from .consistency import configuration_residual
+from .evaluate import DescriptionEvaluator
 from .kane import KaneEquations
+
+
+@fused
+def configuration_residual(system: System, t: Any, q: Any):
+    """Residuals (h,) of the configuration constraints."""
+    return as_vector(DescriptionEvaluator(system).configuration(t, tuple(q[i] for i in range(len(q)))), q)
 
 
 def correction(system: System, t: Component, q: Array) -> Float[Array, " n_q"]:

@@ -18,9 +18,8 @@ from .._scalarjit.cache_key import version_of
 from .._scalarjit.components import Component, is_exact, is_zero, matvec, scale3
 from .._scalarjit.function import recorded
 from .._scalarjit.linear import Rows
-from .._system.bodies import Body
-from .._system.forces import Load, flatten_loads
-from .._system.frames import Frame
+from .._system.bodies import Body, Load, flatten_loads
+from .._system.kinematics import Frame
 from .._system.motion import Motion, flatten_residuals
 from .._system.parameters import in_batches
 from .._system.system import System

@@ -30,7 +30,7 @@ from jaxtyping import Array, Float
 from .._scalarjit.components import Component, add, add3, component, cross, dot, is_exact, matvec, mul, scale3, total
 from .._scalarjit.function import fused
 from .._scalarjit.linear import Rows, as_vector, is_written_out, solve, solve_positive, solve_positive_array, stack
-from .._system.forces import Load
+from .._system.bodies import Load
 from .._system.motion import Motion
 from .._system.system import System
 from .arguments import Row, as_row

@@ -20,9 +20,8 @@ from .._scalarjit.cache_key import compiled
 from .._scalarjit.components import Component, Triple, add, dot, mul
 from .._scalarjit.function import fused
 from .._scalarjit.linear import as_vector, solve
-from .._system.frames import Frame, virtual
+from .._system.kinematics import Frame, Point, auxiliary_speed
 from .._system.motion import Motion
-from .._system.points import Point
 from .._system.system import System
 from .arguments import Row, as_row
 from .equations import InputValues
@@ -81,7 +80,7 @@ class Reactions(KaneEquations):
         self.multipliers: Row = solve(tuple(zip(*self.C_dep, strict=True)), R)[0] if self.k else ()
 
     def read(self, part: str, t: Component, q: Row, u: Row) -> Any:
-        # The description itself: a record knows neither virtual velocities nor auxiliary speeds.
+        # The description itself: a record knows neither auxiliary velocities nor auxiliary speeds.
         return getattr(EvaluatedDescription(self, t, q, u), part)()
 
     def unbalanced(self, partial: Any) -> Component:
@@ -128,30 +127,30 @@ class Reactions(KaneEquations):
         of_residuals, transmitted = [], []
         still = (0.0,) * (self.n + self.k)
         for axis in range(3):
-            Q = dot(self._virtual_residuals(part, axis), self.multipliers)
-            partial = self._along_virtual(part, axis, lambda: self.velocities(still))
+            Q = dot(self._auxiliary_residuals(part, axis), self.multipliers)
+            partial = self._along_auxiliary(part, axis, lambda: self.velocities(still))
             of_residuals.append(Q)
             transmitted.append(mul(-1.0, add(self.unbalanced(partial), Q)))
         return _Forces(tuple(transmitted), tuple(of_residuals))
 
-    def _virtual_residuals(self, part: Point | Frame, axis: int) -> Row:
-        """C_aux: how the residuals change with a virtual velocity; constraints of the configuration, with a
+    def _auxiliary_residuals(self, part: Point | Frame, axis: int) -> Row:
+        """C_aux: how the residuals change with a auxiliary velocity; constraints of the configuration, with a
         displacement."""
         if not self.k:
             return ()
         still = (0.0,) * (self.n + self.k)
-        rows = self._along_virtual(part, axis, lambda: self.read("rolling", self.t, self.q, still))
+        rows = self._along_auxiliary(part, axis, lambda: self.read("rolling", self.t, self.q, still))
         if len(rows) < self.k:
             configuration = lambda: self.configuration(self.t, self.q)  # noqa: E731
-            rows = (*rows, *self._along_virtual(part, axis, configuration, displace=True))
+            rows = (*rows, *self._along_auxiliary(part, axis, configuration, displace=True))
         return rows
 
-    def _along_virtual(self, part: Point | Frame, axis: int, read: Callable[[], Any], displace: bool = False) -> Any:
-        """The derivative of what `read` reads, along a virtual velocity (or displacement) of a point or a frame."""
+    def _along_auxiliary(self, part: Point | Frame, axis: int, read: Callable[[], Any], displace: bool = False) -> Any:
+        """The derivative of what `read` reads, along a auxiliary velocity (or displacement) of a point or a frame."""
 
         def reading(row: Row) -> Any:
             moving: Triple = tuple(row[0] if i == axis else 0.0 for i in range(3))  # type: ignore[assignment]
-            with virtual(part, displacement=moving) if displace else virtual(part, velocity=moving):
+            with auxiliary_speed(part, **{"displacement" if displace else "velocity": moving}):
                 return read()
 
         return self.along_speeds(reading, (1.0,))
@@ -160,13 +159,4 @@ class Reactions(KaneEquations):
         """Whether bodies are built from a point, which is not itself held by a residual."""
         if any(point.velocity is residual for residual in self.description.vanishing):
             return False
-        chains = [_chain(body.center) for body in self.description.bodies]
-        return any(point in chain for chain in chains)
-
-
-def _chain(point: Point | None) -> list[Point]:
-    chain = []
-    while point is not None:
-        chain.append(point)
-        point = point._base
-    return chain
+        return any(point in body.center.chain() for body in self.description.bodies)

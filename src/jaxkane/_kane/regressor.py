@@ -17,12 +17,10 @@ from .._scalarjit.compat import Literal, concretely
 from .._scalarjit.components import ZERO3, Component, add, add3, dot, is_zero, mul, sub, total
 from .._scalarjit.function import fused, recorded
 from .._scalarjit.linear import as_vector, stack
-from .._system.bodies import UNNAMED, Body
-from .._system.forces import Force
+from .._system.bodies import UNNAMED, Body, Force
+from .._system.kinematics import Point, Vector
 from .._system.motion import Motion
-from .._system.points import Point
 from .._system.system import System
-from .._system.vectors import Vector
 from .arguments import Row
 from .evaluate import DescriptionEvaluator, EvaluatedDescription, at_random_point, dtype_of, jvp, structure_of
 from .kane import KaneEquations
@@ -82,8 +80,8 @@ def origin_of(body: Body) -> tuple[Point, list[Vector]]:
 
 
 def _is_fixed_in(point: Point, body: Body) -> bool:
-    claim = point._claim
-    still = claim is not None and claim.frame is body.frame and all(is_zero(x) for x in claim.velocity.components)
+    relative = point._relative_motion
+    still = relative is not None and relative.frame is body.frame and all(map(is_zero, relative.velocity.components))
     turns = not body.is_particle and body.angular_velocity is body.frame.angular_velocity
     return still and turns  # where a body spins in its frame, only points of the axis are fixed in both
 

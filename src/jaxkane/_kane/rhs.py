@@ -18,11 +18,9 @@ from .._common.lookup import not_there, refuse_unknown
 from .._scalarjit.components import Component, add3, component, cross, is_exact
 from .._scalarjit.function import fused, is_native
 from .._scalarjit.linear import as_vector, is_written_out
-from .._system.frames import Frame
+from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Motion
-from .._system.points import Point
 from .._system.system import NamedVector, State, System, packed, unpacked
-from .._system.vectors import Vector
 from .arguments import Inputs, Row, as_row, inputs_of
 from .evaluate import jvp
 from .kane import KaneEquations, motion_rates

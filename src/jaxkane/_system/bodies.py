@@ -1,16 +1,14 @@
-"""Rigid bodies: mass, inertia, mass centre and frame. Describes; never differentiates or solves."""
+"""Rigid bodies, and the forces and torques that act on them. Describes; never differentiates or solves."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from .._scalarjit.components import Component, Triple, add, component, is_zero, mul, sub
-from .frames import Frame
-from .points import Point
-from .vectors import Vector
+from .kinematics import Frame, Point, Vector
 
 UNNAMED = "body"  # the name of bodies that were not given one
 
@@ -47,18 +45,15 @@ class Body:
         name: str = UNNAMED,
         about: Point | None = None,
     ):
-        if not isinstance(center, Point):
-            raise TypeError(
-                f"Body(mass, inertia, center, ...): the mass centre of {name!r} is a Point, got {center!r}."
-            )
-        if not isinstance(frame, (Frame, type(None))):
-            raise TypeError(f"Body(mass, inertia, center, frame): the frame of {name!r} is a Frame, got {frame!r}.")
-        if not isinstance(angular_velocity, (Vector, type(None))):
-            raise TypeError(f"Body: the angular velocity of {name!r} is a Vector, got {angular_velocity!r}.")
-        if not isinstance(about, (Point, type(None))):
-            raise TypeError(f"Body(..., about=P): the inertia of {name!r} is about a Point, got {about!r}.")
-        if not isinstance(name, str):
-            raise TypeError(f"Body(..., name=...): the name is a text, got {name!r}.")
+        for label, value, kind in (
+            (f"the mass centre of {name!r} is a Point", center, Point),
+            (f"the frame of {name!r} is a Frame", frame, Frame | None),
+            (f"the angular velocity of {name!r} is a Vector", angular_velocity, Vector | None),
+            (f"the inertia of {name!r} is about a Point", about, Point | None),
+            ("the name is a text", name, str),
+        ):
+            if not isinstance(value, kind):
+                raise TypeError(f"Body(mass, inertia, center, frame): {label}, got {value!r}.")
         self.mass = component(mass)
         self.inertia = _inertia(inertia, name)
         self.is_particle = frame is None and angular_velocity is None
@@ -88,17 +83,19 @@ def point_of(part: Point | Body) -> Point:
     return point
 
 
-def _inertia(given: Any, name: str) -> tuple[Triple, Triple, Triple]:
-    if isinstance(given, str) or given is None:
-        raise TypeError(f"{name}: the inertia is three principal moments or a (3, 3) matrix, got {given!r}.")
-    inertia: Any = (0.0, 0.0, 0.0) if isinstance(given, (int, float)) and given == 0 else given
-    has_length = not hasattr(inertia, "shape") and isinstance(inertia, Sequence)
-    shape = (len(inertia), *_inner(inertia)) if has_length else np.shape(inertia)
+def _inertia(value: Any, name: str) -> tuple[Triple, Triple, Triple]:
+    if isinstance(value, str) or value is None:
+        raise TypeError(f"{name}: the inertia is three principal moments or a (3, 3) matrix, got {value!r}.")
+    rows: Any = (0.0, 0.0, 0.0) if isinstance(value, (int, float)) and value == 0 else value
+    if not hasattr(rows, "shape") and isinstance(rows, Sequence):  # of traced numbers, perhaps
+        shape = (len(rows), *{len(row) for row in rows if isinstance(row, (tuple, list)) or np.ndim(row) == 1})
+    else:
+        shape = np.shape(rows)
     if shape == (3,):
-        a, b, c = (component(x) for x in inertia)
+        a, b, c = (component(x) for x in rows)
         return ((a, 0.0, 0.0), (0.0, b, 0.0), (0.0, 0.0, c))
     if shape == (3, 3):
-        return tuple(tuple(component(x) for x in row) for row in inertia)  # type: ignore[return-value]
+        return tuple(tuple(component(x) for x in row) for row in rows)  # type: ignore[return-value]
     raise ValueError(
         f"{name}: the inertia is three principal moments or a (3, 3) matrix about the mass centre, got shape {shape}."
     )
@@ -115,6 +112,62 @@ def _central(I: tuple[Triple, Triple, Triple], m: Component, r: Triple) -> tuple
     return tuple(rows)  # type: ignore[return-value]
 
 
-def _inner(rows: Sequence[Any]) -> tuple[int, ...]:
-    inner = {len(row) for row in rows if isinstance(row, (tuple, list)) or np.ndim(row) == 1}
-    return tuple(inner)
+class Force:
+    """A force [N] that acts at a point: a Point, or the mass centre of a Body."""
+
+    __slots__ = ("point", "vector")
+
+    def __init__(self, vector: Vector, point: Point | Body):
+        self.vector = _checked(vector, "Force")
+        if not isinstance(point, (Point, Body)):
+            raise TypeError(f"Force(vector, point): the second argument is a Point or a Body, got {point!r}.")
+        self.point = point_of(point)
+
+    @property
+    def velocity(self) -> Vector:
+        """The velocity whose partial velocities the force is multiplied by."""
+        return self.point.velocity
+
+
+class Torque:
+    """A torque [N m] that acts on a body or on a frame; its reaction, if one is meant, on another.
+
+    Torque(T * C.z, fork, reaction_on=frame)
+
+    **Raises:** `ValueError` for a particle, which has no frame that could turn.
+    """
+
+    __slots__ = ("vector", "velocity")
+
+    def __init__(self, vector: Vector, on: Frame | Body, reaction_on: Frame | Body | None = None):
+        self.vector = _checked(vector, "Torque")
+        for part in (on, reaction_on):
+            if not isinstance(part, (Frame, Body, type(None))):
+                raise TypeError(f"Torque(vector, on): acts on a Body or a Frame, got {part!r}.")
+            if isinstance(part, Body) and part.is_particle:
+                raise ValueError(
+                    f"Torque(vector, on): {part.name!r} is a particle, which a torque does not move. Let it act on the "
+                    "frame that turns, or give the body that frame: Body(mass, inertia, center, frame)."
+                )
+        self.velocity = on.angular_velocity
+        if reaction_on is not None:
+            self.velocity = on.angular_velocity - reaction_on.angular_velocity
+
+
+def _checked(vector: Any, what: str) -> Vector:
+    if not isinstance(vector, Vector):
+        raise TypeError(f"{what}(vector, ...): the first argument is a Vector such as 3.0 * N.x, got {vector!r}.")
+    return vector
+
+
+Load = Force | Torque
+
+
+def flatten_loads(loads: Any, method: str = "`loads`") -> tuple[Load, ...]:
+    """Loads out of nested tuples and lists."""
+    if isinstance(loads, (Force, Torque)):
+        return (loads,)
+    if isinstance(loads, Iterable) and not isinstance(loads, (str, Mapping)):
+        return tuple(load for item in loads for load in flatten_loads(item, method))
+    hint = " Does it end without a `return`?" if loads is None else ""
+    raise TypeError(f"{method} returns Forces and Torques, got {loads!r}.{hint}")

@@ -12,11 +12,8 @@ import numpy as np
 
 from .._common.lookup import not_there
 from .._scalarjit.components import Component, component, dot
-from .bodies import UNNAMED, Body
-from .forces import Force
-from .frames import Frame
-from .points import Point
-from .vectors import Vector
+from .bodies import UNNAMED, Body, Force
+from .kinematics import Frame, Point, Vector
 
 
 def flatten_residuals(given: Any, what: str) -> tuple[Component, ...]:

@@ -7,16 +7,13 @@ import functools
 import math
 import operator
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-
-if TYPE_CHECKING:
-    from .system import System
 
 
 def parameter(
@@ -134,7 +131,7 @@ ANY = ParameterInfo(False, ())
 """Of a number about which nothing was declared."""
 
 
-def parameter_info(system: System | type[System]) -> dict[str, ParameterInfo]:
+def parameter_info(system: eqx.Module | type[eqx.Module]) -> dict[str, ParameterInfo]:
     """Name and `ParameterInfo` of every parameter of a system, in the order of their declaration."""
     fields = dataclasses.fields(system)  # type: ignore[arg-type]
     return {f.name: f.metadata["jaxkane"] for f in fields if "jaxkane" in f.metadata}
@@ -204,7 +201,7 @@ def to_float(value: Any) -> Any:
     return value
 
 
-def check_fields(system: System) -> None:
+def check_fields(system: eqx.Module) -> None:
     """Refuse numbers that a description counts with, names and switches as fields that JAX would trace."""
     for path, value in jax.tree_util.tree_leaves_with_path(system):
         name = path[0].name

@@ -12,11 +12,9 @@ from jaxtyping import Array, Float
 
 from .._kane.checks import is_concrete
 from .._scalarjit.components import Component, Scalar, add
-from .._system.bodies import Body
-from .._system.forces import Torque
-from .._system.frames import Frame
+from .._system.bodies import Body, Torque
+from .._system.kinematics import Frame, Point
 from .._system.parameters import in_batches, parameter
-from .._system.points import Point
 from ..catalog.bicycle import FAR
 from ._parts import Part
 from ._rider import Rider

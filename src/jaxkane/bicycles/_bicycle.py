@@ -19,11 +19,9 @@ from .._common.lookup import refuse_unknown
 from .._kane.arguments import as_row
 from .._kane.rhs import named_row
 from .._scalarjit.components import Component, add
-from .._system.frames import Frame
+from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Motion
 from .._system.parameters import parameters_in, with_parameters
-from .._system.points import Point
-from .._system.vectors import Vector
 from ..catalog.bicycle import WhippleBicycle
 from ._files import as_meijaard, read_yaml
 from ._ground import Ground

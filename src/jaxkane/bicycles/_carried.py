@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from .._scalarjit.components import Scalar
-from .._system.bodies import Body
-from .._system.forces import Force
+from .._system.bodies import Body, Force
 from .._system.parameters import parameter
 from ..catalog.bicycle import ABOVE_GROUND, FAR
 from ..loads import smooth_abs

@@ -16,10 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._scalarjit.components import Component, Scalar, add, dot, mul, sub
-from .._system.frames import Frame
+from .._system.kinematics import Frame, Point, Vector
 from .._system.parameters import learned, parameter
-from .._system.points import Point
-from .._system.vectors import Vector
 from ..catalog.bicycle import TILT
 from ._parts import check_parameters
 

@@ -9,10 +9,8 @@ import jax.numpy as jnp
 
 from .._scalarjit.components import Component, add
 from .._system.bodies import Body
-from .._system.frames import Frame
+from .._system.kinematics import Frame, Point, Vector, inertial
 from .._system.motion import Motion
-from .._system.points import Point, inertial
-from .._system.vectors import Vector
 from ._part_methods import FRONT, REAR, moved
 from ._tyre import Contact, Tyre, rolling_speed
 

@@ -13,11 +13,9 @@ from jaxtyping import Array, Float
 
 from .._kane.checks import is_concrete, why_no_body
 from .._scalarjit.components import Scalar
-from .._system.bodies import Body
-from .._system.forces import Torque
-from .._system.frames import Frame
+from .._system.bodies import Body, Torque
+from .._system.kinematics import Frame, Point
 from .._system.parameters import in_batches, parameter
-from .._system.points import Point
 from ..catalog import read_bicycle_file
 from ..catalog.bicycle import ABOVE_GROUND, FAR, TILT
 from ._parts import Part

@@ -8,11 +8,9 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._scalarjit.components import Component, Scalar, mul
-from .._system.bodies import Body
-from .._system.forces import Torque
-from .._system.frames import Frame
+from .._system.bodies import Body, Torque
+from .._system.kinematics import Frame, Point
 from .._system.parameters import parameter
-from .._system.points import Point
 from ..catalog.bicycle import ABOVE_GROUND, FAR
 from ..loads import coulomb, rotor
 from ._parts import Part

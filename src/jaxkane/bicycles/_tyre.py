@@ -9,11 +9,9 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._scalarjit.components import Component, Scalar, is_zero, mul, sub
-from .._system.bodies import Body
-from .._system.forces import Force, Torque
+from .._system.bodies import Body, Force, Torque
+from .._system.kinematics import Point, Vector
 from .._system.parameters import parameter
-from .._system.points import Point
-from .._system.vectors import Vector
 from ._parts import called, check_parameters
 from ._tyre_laws import LongitudinalSlip, Slip
 

@@ -8,12 +8,10 @@ import jax.numpy as jnp
 
 from .. import rotations
 from .._scalarjit.components import Component, Scalar
-from .._system.bodies import Body
-from .._system.forces import Force, Torque
-from .._system.frames import Frame
+from .._system.bodies import Body, Force, Torque
+from .._system.kinematics import Frame, Point, inertial
 from .._system.motion import Motion
 from .._system.parameters import parameter
-from .._system.points import Point, inertial
 from .._system.system import System
 from ._entry import entry
 

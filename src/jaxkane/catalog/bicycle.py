@@ -10,14 +10,11 @@ from typing import Any, ClassVar, Self
 import jax.numpy as jnp
 
 from .._scalarjit.components import Scalar
-from .._system.bodies import Body
-from .._system.forces import Torque
-from .._system.frames import Frame
+from .._system.bodies import Body, Torque
+from .._system.kinematics import Frame, Point, Vector, inertial
 from .._system.motion import Motion, weight
 from .._system.parameters import parameter, parameter_info
-from .._system.points import Point, inertial
 from .._system.system import System
-from .._system.vectors import Vector
 from ._entry import entry, read_bicycle_file
 
 # Meijaard et al. (2007), Table 1: the benchmark bicycle.

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from .. import rotations
 from .._scalarjit.components import Scalar
-from .._system.bodies import Body
-from .._system.forces import Force, Torque
+from .._system.bodies import Body, Force, Torque
+from .._system.kinematics import Point, inertial
 from .._system.motion import Motion
 from .._system.parameters import parameter
-from .._system.points import Point, inertial
 from .._system.system import System
 from ._entry import entry
 

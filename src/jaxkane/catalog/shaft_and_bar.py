@@ -5,11 +5,10 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from .._scalarjit.components import Scalar
-from .._system.bodies import Body
-from .._system.forces import Torque
+from .._system.bodies import Body, Torque
+from .._system.kinematics import inertial
 from .._system.motion import Motion
 from .._system.parameters import parameter
-from .._system.points import inertial
 from .._system.system import System
 from ._entry import entry
 

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 from .. import rotations
 from .._scalarjit.components import Scalar
 from .._system.bodies import Body
+from .._system.kinematics import inertial
 from .._system.motion import Motion, weight
 from .._system.parameters import parameter
-from .._system.points import inertial
 from .._system.system import System
 from ._entry import entry
 

@@ -12,14 +12,11 @@ import jax
 
 from .._common.lookup import as_names, hint
 from .._scalarjit.components import ZERO3, Component, Scalar, dot, sub
-from .._system.bodies import Body
-from .._system.forces import Force, Torque
-from .._system.frames import Frame
+from .._system.bodies import Body, Force, Torque
+from .._system.kinematics import Frame, Point, Vector, inertial
 from .._system.motion import Motion
 from .._system.parameters import parameter
-from .._system.points import Point, inertial
 from .._system.system import System
-from .._system.vectors import Vector
 from ._lagrangian import factor, factor_rate
 from ._sympy_model import function, imported, words_of
 from ._sympy_plan import Plan, Taker, VectorPlan, name_of

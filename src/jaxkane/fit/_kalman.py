@@ -15,8 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._integrate.inputs import with_one_times
 from .._integrate.integrate import solve
-from .._kane.consistency import configuration_residual
-from .._kane.constraints import has_configuration_constraints, projected
+from .._kane.constraints import configuration_residual, has_configuration_constraints, projected
 from .._system.system import System, packed, unpacked
 from ._process_noise import MODES, Disturbance, Noise
 from ._windows import Windows, state_names

@@ -13,10 +13,8 @@ from jax.core import Tracer
 
 from .. import rotations
 from .._scalarjit.components import Component, Triple, is_zero, mul, sub
-from .._system.bodies import Body
-from .._system.forces import Force, Load, Torque
-from .._system.frames import Frame
-from .._system.points import Point
+from .._system.bodies import Body, Force, Load, Torque
+from .._system.kinematics import Frame, Point
 
 
 def unit_vector(axis: Any, name: str) -> Triple:

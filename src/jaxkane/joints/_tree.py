@@ -24,11 +24,9 @@ from .._scalarjit.components import (
     sub,
     total,
 )
-from .._system.bodies import Body
-from .._system.forces import Force
-from .._system.frames import Frame
+from .._system.bodies import Body, Force
+from .._system.kinematics import Frame, Point, inertial
 from .._system.motion import Motion
-from .._system.points import Point, inertial
 from .._system.system import System
 from ..rotations import Matrix
 from ._joints import Placed, Shape

@@ -5,11 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from .._scalarjit.components import Component, component, is_zero, mul, positive
-from .._system.bodies import Body, point_of
-from .._system.forces import Force, Torque
-from .._system.frames import Frame
-from .._system.points import Point
-from .._system.vectors import Vector, check_vector
+from .._system.bodies import Body, Force, Torque, point_of
+from .._system.kinematics import Frame, Point, Vector, check_vector
 from ._laws import coulomb, smooth_abs
 
 Law = Component | Callable[[Component], Component]

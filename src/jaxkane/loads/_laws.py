@@ -16,7 +16,7 @@ from typing import Any
 import jax.numpy as jnp
 
 from .._scalarjit.components import Component, positive
-from .._system.vectors import Vector
+from .._system.kinematics import Vector
 
 
 def smooth_abs(x: Component | Vector, width: Component) -> Component:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from .._common.lookup import as_names, by_name, hint, refuse_unknown
 from .._kane.arguments import as_array, check_is_system, check_time, checked_values, is_one_number
 from .._kane.checks import check_system, diagnosis, is_concrete
-from .._kane.consistency import configuration_residual
+from .._kane.constraints import configuration_residual
 from .._kane.equations import dependent_speeds
 from .._kane.rhs import rates, values_of
 from .._kane.rhs import rates as rates_of
