@@ -248,7 +248,7 @@ N, O = jk.inertial()
     [
         (lambda: N.x.dot(3.0), "dot takes a Vector"),
         (lambda: N.x.cross([1, 2, 3]), "cross takes a Vector"),
-        (lambda: N.x.to(O), "asked for in a Frame"),
+        (lambda: N.x.to(O), "has components in a Frame"),
         (lambda: O.fixed(3.0), "Point.fixed takes a Vector"),
         (lambda: O.moving(N.x, 2.0), "Point.moving, as the velocity, takes a Vector"),
         (lambda: jk.Body(1.0, (1, 1, 1), O, N, angular_velocity=3.0, name="wheel"), "'wheel' is a Vector"),
