@@ -30,7 +30,7 @@ from scipy import signal
 
 import jaxkane as jk
 from jaxkane.catalog import WhippleBicycle
-from jaxkane.fit import Delay, Free, Gain, LeastSquares, fit_bicycle, suspects
+from jaxkane.fit import Delay, Free, Gain, LeastSquares, fit_bicycle, forward_selection
 
 GOLD, BLUE, INK = "#e8a33d", "#3d8fd1", "#2b2f36"
 CHANNELS = ("roll", "steer", "roll_rate", "steer_rate")
@@ -111,9 +111,9 @@ def main(folder):
     options = {"input_bias": ("roll_torque", "steer_torque"), "optimizer": LeastSquares()}
     first = fit_bicycle(windows, bicycle, ("steer_damping", "rope_height"), **options)
     together = [list(range(i, min(i + 8, len(windows)))) for i in range(0, len(windows), 8)]  # a pull in each
-    found = suspects(first, CANDIDATES, depth=1, refits=1, plausible=PLAUSIBLE, folds=together)
+    found = forward_selection(first, CANDIDATES, depth=1, refits=1, plausible=PLAUSIBLE, folds=together)
     print(f"{found}\n\n{found.fit}\n")
-    fits = {"damping, rope": first, found.taken[0] if found.taken else "nothing taken": found.fit}
+    fits = {"damping, rope": first, found.selected[0] if found.selected else "nothing taken": found.fit}
     slope = np.gradient(ride.measured["steer"], ride.t)
     late = 1e3 * lag(ride.t, slope, ride.measured["steer_rate"])
     print(f"\nWithout a model: the gyroscopes' steer rate goes {late:.0f} ms behind the slope of the steer angle.")

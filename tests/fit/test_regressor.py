@@ -11,7 +11,16 @@ import pytest
 
 import jaxkane as jk
 from jaxkane.catalog import CATALOG
-from jaxkane.fit import Inertia, Instants, Trial, base_parameters, first_estimate, inertia_of, instants_of, regressor
+from jaxkane.fit import (
+    Inertia,
+    KinematicSamples,
+    Trial,
+    base_parameters,
+    first_estimate,
+    inertia_of,
+    kinematic_samples,
+    regressor,
+)
 from jaxkane.fit._base_parameters import random_states
 from jaxkane.fit._kinematics import max_spacing
 from jaxkane.fit._parameters import parameters_of
@@ -131,12 +140,12 @@ class Sledge(jk.System):
 
 
 def random_instants(system, n=60, seed=0):
-    """Instants at which a system moves as its own equations say, with any inputs."""
+    """KinematicSamples at which a system moves as its own equations say, with any inputs."""
     rng = np.random.default_rng(seed)
     q, u = (jnp.asarray(rng.uniform(-2.0, 2.0, (n, len(names)))) for names in (system.coordinates, system.speeds))
     inputs = {name: jnp.asarray(rng.normal(0.0, 0.3, n)) for name in (*system.inputs, *system.states)}
     at = jax.jit(jax.vmap(lambda q, u, now: jk.accelerations(system, 0.0, q, u, now)))
-    return Instants(np.zeros(n), q, u, at(q, u, inputs), inputs)
+    return KinematicSamples(np.zeros(n), q, u, at(q, u, inputs), inputs)
 
 
 @functools.cache
@@ -413,7 +422,7 @@ def test_what_data_do_not_tell_is_named_and_stays():
     u[:, 0], u_dot[:, 0] = u[:, 0], u_dot[:, 0]
     u[:, 1] = u_dot[:, 1] = 0.0
     torque = {"torque1": rng.normal(0.0, 0.3, len(at))}
-    still = Instants(at.t, q, u, u_dot, torque)
+    still = KinematicSamples(at.t, q, u, u_dot, torque)
     found = base_parameters(truth, still, bodies=ARMS, parameters=FRICTION, sigma={"rate1": 0.01, "rate2": 0.01})
     assert "not determined by these data" in str(found)
     assert any("link2.Izz" in text for text in found.undetermined)
@@ -423,35 +432,35 @@ def test_what_data_do_not_tell_is_named_and_stays():
 
 def test_bad_data_are_refused_by_name():
     truth, at = swings()
-    first = lambda n: Instants(at.t[:n], at.q[:n], at.u[:n], at.u_dot[:n])  # noqa: E731
+    first = lambda n: KinematicSamples(at.t[:n], at.q[:n], at.u[:n], at.u_dot[:n])  # noqa: E731
     with pytest.raises(ValueError, match="not how large their errors are"):
         base_parameters(truth, first(1), bodies=ARMS, parameters=FRICTION)
     gaps = np.array(at.u_dot)
     gaps[5:] = np.nan
-    assert len(Instants(at.t, at.q, at.u, gaps)) == 5
+    assert len(KinematicSamples(at.t, at.q, at.u, gaps)) == 5
     with pytest.raises(ValueError, match="no instant at which all numbers are finite"):
-        Instants(at.t, at.q, at.u, np.nan * at.u_dot)
+        KinematicSamples(at.t, at.q, at.u, np.nan * at.u_dot)
     with pytest.raises(ValueError, match=r"`u` \(60,\)"):
-        Instants(at.t, at.q, at.u[:, 0], at.u_dot)
+        KinematicSamples(at.t, at.q, at.u[:, 0], at.u_dot)
     with pytest.raises(ValueError, match="has 2 coordinates and 2 independent speeds; the instants have 1"):
-        base_parameters(truth, Instants(at.t, at.q[:, :1], at.u, at.u_dot))
+        base_parameters(truth, KinematicSamples(at.t, at.q[:, :1], at.u, at.u_dot))
     with pytest.raises(ValueError, match="no input or state named torque3"):
-        base_parameters(truth, Instants(at.t, at.q, at.u, at.u_dot, {"torque3": 0.0}))
+        base_parameters(truth, KinematicSamples(at.t, at.q, at.u, at.u_dot, {"torque3": 0.0}))
     with pytest.raises(ValueError, match="look at rate2"):
         base_parameters(truth, at, sigma={"rate1": 0.1})
     nothing = np.zeros((60, 2))
     with pytest.raises(ValueError, match="Nothing moves and nothing acts"):
-        base_parameters(truth, Instants(at.t, nothing, nothing, nothing), bodies=ARMS)
+        base_parameters(truth, KinematicSamples(at.t, nothing, nothing, nothing), bodies=ARMS)
     t = np.linspace(0.0, 1.0, 101)
     with pytest.raises(ValueError, match="angle2 was not measured"):
-        instants_of(truth, Trial(t, {"angle1": t}, sigma=0.1))
+        kinematic_samples(truth, Trial(t, {"angle1": t}, sigma=0.1))
     turns = Trial(t, {"angle1": (30 * t + 1) % (2 * np.pi), "angle2": t}, sigma=0.1)
     with pytest.raises(ValueError, match=r"angle1 jumps by a whole turn at t = 0\.\d+ s: make it one curve"):
-        instants_of(truth, turns)
+        kinematic_samples(truth, turns)
     with pytest.raises(ValueError, match="has 10 samples"):
-        instants_of(truth, Trial(t[:10], {"angle1": t[:10], "angle2": t[:10]}, sigma=0.1))
+        kinematic_samples(truth, Trial(t[:10], {"angle1": t[:10], "angle2": t[:10]}, sigma=0.1))
     with pytest.raises(ValueError, match="There is no motion"):
-        instants_of(truth, [])
+        kinematic_samples(truth, [])
 
 
 # ---- accelerations from measurements
@@ -464,14 +473,14 @@ def test_accelerations_of_noisy_samples():
     y[100:140] = np.nan
     trial = Trial(t, {"angle1": y, "angle2": np.cos(t)}, {"torque1": t}, sigma=1e-3)
     assert 0.2 < float(max_spacing(trial, trial.measured)) < 0.6
-    found = instants_of(Swing(), trial, spacing=0.3)
+    found = kinematic_samples(Swing(), trial, spacing=0.3)
     inside = (found.t > 0.5) & (found.t < 3.5)
     assert np.max(np.abs(found.u_dot[inside, 0] + 9 * np.sin(3 * found.t[inside]))) < 0.6  # of 9
     assert np.max(np.abs(found.u[inside, 0] - 3 * np.cos(3 * found.t[inside]))) < 0.02
     assert not np.any((found.t > 0.70) & (found.t < 1.69))
     assert len(found) > 150
     np.testing.assert_allclose(found.inputs["torque1"], found.t, atol=1e-9)
-    two = instants_of(Swing(), [trial, trial], spacing=0.2)
+    two = kinematic_samples(Swing(), [trial, trial], spacing=0.2)
     assert set(two.trial) == {0, 1}
 
 
@@ -494,7 +503,7 @@ def test_first_guess_of_a_measured_double_pendulum():
     assert guess.system.k1 > 0
     assert guess.system.k2 > 0
     assert guess.values["I2"] == guess.system.I2
-    np.testing.assert_allclose(guess.possible, guess.base.estimates, rtol=1e-3)
+    np.testing.assert_allclose(guess.feasible, guess.base.estimates, rtol=1e-3)
     assert "standard deviations from these" in str(guess)
 
 
@@ -525,8 +534,8 @@ def test_bodies_that_can_be():
     moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     assert 0 < moments[0] < moments[2] < moments[0] + moments[1]
     assert not guess.ok
-    assert guess.strain > 3
-    assert not guess.impossible
+    assert guess.distance > 3
+    assert not guess.infeasibility
     assert "kg, centre at (" in guess.bodies[0]
     assert f"principal moments {moments[0]:.5g}, {moments[1]:.5g}, {moments[2]:.5g} kg m^2, along (" in str(guess)
     jk.accelerations(guess.system, 0.0, exact.q[0], exact.u[0])  # which refuses bodies that cannot be
@@ -583,7 +592,7 @@ def test_states_of_the_first_order_act_from_the_right_side():
     expected = found.of(regressor(system, 0.0, at.q[0], at.u[0], at.u_dot[0], bodies=ARMS).values)
     np.testing.assert_allclose(found.estimates, expected, rtol=1e-9)
     with pytest.raises(ValueError, match="loads may follow motor"):
-        base_parameters(Lagging(), Instants(at.t, at.q, at.u, at.u_dot))
+        base_parameters(Lagging(), KinematicSamples(at.t, at.q, at.u, at.u_dot))
 
 
 @pytest.mark.slow
@@ -596,7 +605,7 @@ def test_a_simulated_motion_tells_of_the_system_that_made_it():
     expected = found.of(regressor(truth, *i, bodies=ARMS, parameters=FRICTION).values)
     np.testing.assert_allclose(found.estimates, expected, rtol=1e-3)
     with pytest.raises(ValueError, match="A trajectory of 11 times"):
-        instants_of(truth, jax.tree.map(lambda x: x[::40] if x.shape[:1] == (401,) else x, ride))
+        kinematic_samples(truth, jax.tree.map(lambda x: x[::40] if x.shape[:1] == (401,) else x, ride))
 
 
 def test_what_was_freed_as_an_inertia_is_told_as_a_whole():
@@ -692,7 +701,7 @@ def test_first_guess_of_a_driven_double_pendulum():
     trials = [trial for trial in jk.data.driven_double_pendulum().trials if not trial.name.endswith("sysid_00")]
     guess = first_estimate(Driven(), trials, free)
     assert guess.base.count == 9
-    assert guess.strain < 3
+    assert guess.distance < 3
     assert guess.base.unexplained < 0.1
     # m1r1 0.134, I1 0.0244, m2r2 0.193, m2 0.475, I2 0.0577 about the joints: a fit of ten parameters by others
     expected = [0.0244 + 0.475 * 0.04, -(0.134 + 0.475 * 0.2), 0.0577, -0.193]

@@ -19,7 +19,7 @@ from jaxkane.fit import (
     Simulation,
     Trial,
     applied_to,
-    contrary_signs,
+    check_signs,
     cross_validate,
     identifiability,
     laplace,
@@ -239,9 +239,9 @@ def test_a_wrong_sign_of_an_input(problem, trials, monkeypatch):
     found, fits = again(problem, wrong), []
     monkeypatch.setattr(signs, "solve_nuisance", lambda *a, **k: fits.append(1) or solve_nuisance(*a, **k))
     # To print a fit starts no other one.
-    assert "`jaxkane.fit.contrary_signs(fit)` tries whether a sign is wrong" in str(found)
+    assert "`jaxkane.fit.check_signs(fit)` tries whether a sign is wrong" in str(found)
     assert not fits
-    (note,) = [note for note in contrary_signs(found) if "input" in note]
+    (note,) = [note for note in check_signs(found) if "input" in note]
     assert "the input push seems to have the wrong sign" in note
     assert fits
     assert note in report(found)

@@ -168,7 +168,7 @@ OF_A_TRAJECTORY = {
     **{f"jaxkane.{name}": lambda system, ride, name=name: getattr(jk, name)(system, ride) for name in ALONG},
     "jaxkane.audit": jk.audit,
     "jaxkane.animate": jk.animate,
-    "jaxkane.fit.instants_of": fit.instants_of,
+    "jaxkane.fit.kinematic_samples": fit.kinematic_samples,
     "jaxkane.fit.base_parameters": fit.base_parameters,
     "jaxkane.fit.first_estimate": lambda system, ride: fit.first_estimate(system, ride, "push"),
 }

@@ -19,7 +19,7 @@ from .._scalarjit.cache_key import compiled
 from .._system.parameters import leaf_name
 from .._system.system import System
 from ._identifiability import combination
-from ._kinematics import Instants, Motions, instants_of
+from ._kinematics import KinematicSamples, Motions, kinematic_samples
 from ._regressor import Chosen, Names, Regressor, check_linear, chosen_of, values_by_name
 
 
@@ -114,7 +114,7 @@ _ORDER = ("Ixx", "Ixy", "Ixz", "Iyz", "Izz", "mx", "my", "mz", "Iacross", "Iyy",
 """Of a body's parameters: what comes late is counted among what comes early, where it can be."""
 
 
-def equations_at(chosen: Chosen, at: Instants) -> tuple[tuple[str, ...], np.ndarray, np.ndarray, np.ndarray]:
+def equations_at(chosen: Chosen, at: KinematicSamples) -> tuple[tuple[str, ...], np.ndarray, np.ndarray, np.ndarray]:
     """The names of the speeds, and Y (N, n, p), tau (N, n) and the trials (N,) of all instants at which they exist."""
     dtype = jnp.result_type(float)
     # Padded to a power of two with the last instant, so that few different sizes are compiled.
@@ -138,7 +138,7 @@ def _at_all(chosen, t, q, u, inputs, u_dot):
     return found.matrix, found.forces
 
 
-def random_states(system: System, n: int) -> Instants:
+def random_states(system: System, n: int) -> KinematicSamples:
     """States that the constraints admit, near and far."""
     rng, dtype = np.random.default_rng(0), jnp.result_type(float)
     n_q, n_u = len(system.coordinates), len(system.speeds)
@@ -159,7 +159,7 @@ def random_states(system: System, n: int) -> Instants:
         fine = fine[np.linspace(0, len(fine) - 1, n).astype(int)]
         t, q = t[fine], q[fine]
     inputs = {name: rng.normal(0.0, 3.0, n) for name in values_by_name(system)}
-    return Instants(t, q, rng.normal(0.0, 3.0, (n, n_u)), rng.normal(0.0, 10.0, (n, n_u)), inputs)
+    return KinematicSamples(t, q, rng.normal(0.0, 3.0, (n, n_u)), rng.normal(0.0, 10.0, (n, n_u)), inputs)
 
 
 @compiled
@@ -226,7 +226,7 @@ def _independent(W: np.ndarray, order: Sequence[int], tolerance: float) -> list[
     return places
 
 
-def with_lengths(found: BaseParameters, chosen: Chosen, states: Instants) -> tuple[str, ...]:
+def with_lengths(found: BaseParameters, chosen: Chosen, states: KinematicSamples) -> tuple[str, ...]:
     """The texts, with factors that are products of powers of the system's parameters written as these: `length^2`."""
     others = [i for i in range(len(found.names)) if i not in found.places and np.any(found.matrix[:, i])]
     if not others:
@@ -433,15 +433,15 @@ def base_parameters(
     **Arguments:**
 
     - `system`; `bodies`, `parameters`: as of `regressor`. Or a `Regressor` of many instants (by `jax.vmap`) alone.
-    - `motions`: none, for what any motion determines; or measured or simulated ones, as of `instants_of`.
+    - `motions`: none, for what any motion determines; or measured or simulated ones, as of `kinematic_samples`.
     - `sigma`: by speed, the standard deviation of what remains in its equation [N m, N]; by default estimated.
-    - `spacing` [s]: of knots, as of `instants_of`.
+    - `spacing` [s]: of knots, as of `kinematic_samples`.
     - `flat`: a combination whose standard deviation exceeds this part of its size is called undetermined.
 
     **Returns:** `BaseParameters`. Estimates come from measured accelerations, second derivatives of noisy measurements:
     they are biased towards zero where the noise is not small, a guess to begin a fit from.
 
-    **Raises:** `ValueError` as `regressor` and `instants_of`.
+    **Raises:** `ValueError` as `regressor` and `kinematic_samples`.
     """
     if isinstance(system, Regressor):
         return _of_regressor(system, sigma, flat)
@@ -451,7 +451,7 @@ def base_parameters(
     structure = structure_of_states(chosen)
     if motions is None:
         return structure
-    return estimated(structure, *equations_at(chosen, instants_of(system, motions, spacing=spacing)), sigma, flat)
+    return estimated(structure, *equations_at(chosen, kinematic_samples(system, motions, spacing=spacing)), sigma, flat)
 
 
 def _of_regressor(given: Regressor, sigma: Mapping[str, float] | None, flat: float) -> BaseParameters:
@@ -479,6 +479,6 @@ def structure_of_states(chosen: Chosen) -> BaseParameters:
     return dataclasses.replace(found, texts=with_lengths(found, chosen, states))
 
 
-def states_for(chosen: Chosen) -> Instants:
+def states_for(chosen: Chosen) -> KinematicSamples:
     """Random states, some three times as many as the numbers that they could determine."""
     return random_states(chosen.system, 10 + 3 * -(-len(chosen.names) // len(chosen.system.speeds)))

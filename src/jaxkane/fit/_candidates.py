@@ -27,7 +27,7 @@ OF_TRIALS = ("sensor_bias", "sensor_gain", "input_bias", "input_gain", "input_de
 
 @dataclasses.dataclass(frozen=True)
 class Candidate:
-    """Something that a model may lack, to be tried by `suspects`.
+    """Something that a model may lack, to be tried by `forward_selection`.
 
         Candidate("motor lag", system=Lagging.from_parameters(values), free="lag", unknown="motor_torque")
         Candidate("the roll sensor", free=[Offset("roll"), Gain("roll_rate")])

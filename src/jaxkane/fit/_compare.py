@@ -184,7 +184,7 @@ def compare(
     - `fits`: by name; of a sequence, the free parameters are the names.
     - `held_out`: trials that none of them has seen: their starts and biases are found, the parameters are not
         (`applied_to`). Those of bicycles by `bicycle_rides`.
-    - `plausible`: as in `suspects`; names that none of the fits frees are passed over.
+    - `plausible`: as in `forward_selection`; names that none of the fits frees are passed over.
 
     **Returns:** a `Comparison`: print it for tables of parameters with errors (clustered by trial where the residuals
     are correlated), sums of squares on both sides, as a whole, by channel and by trial, and what is not plausible.

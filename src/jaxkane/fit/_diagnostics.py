@@ -229,7 +229,7 @@ def bad_channels(fit: Fit) -> list[str]:
         return []
     return [
         f"{', '.join(bad)}: less than half of the variance is accounted for, in one trial at least. "
-        "`jaxkane.fit.contrary_signs(fit)` tries whether a sign is wrong."
+        "`jaxkane.fit.check_signs(fit)` tries whether a sign is wrong."
     ]
 
 
@@ -288,7 +288,9 @@ def wrong_sigma(fit: Fit) -> list[str]:
         return [f"{size}large as `sigma` says, which is too large."]
     noisy = noisy_starts(fit.problem)
     if not noisy:
-        return [f"{size}large as `sigma` says: `sigma` is too small, or the model lacks something (`suspects`)."]
+        return [
+            f"{size}large as `sigma` says: `sigma` is too small, or the model lacks something (`forward_selection`)."
+        ]
     return [
         f"{size}large as `sigma` says. The motions start at measured samples of {', '.join(noisy)}, with the errors of "
         f"these: have the starts found, `unknown={noisy!r}`. Else `sigma` is too small, or the model lacks something."

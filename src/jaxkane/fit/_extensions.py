@@ -65,7 +65,7 @@ class Standing:
         values = np.asarray(values_of(self.problem.parameters, self.point.x))
         return {name: float(values[i]) for name, i in zip(self.names, self.places, strict=True)}
 
-    def left_out(self, folds: Folds) -> float:
+    def held_out_cost(self, folds: Folds) -> float:
         """The sum of squares of trials left out in turn, with the parameters that the others say; NaN without folds."""
         return self.rows.left_out(self.places, folds) if folds is not None else float("nan")
 
@@ -91,41 +91,41 @@ def rows_of(problem: Problem, at: Linearization, point: Unknowns, b: Sequence[in
     return Rows(np.asarray(eliminate(reduced, 0.0).R, float), np.column_stack([slopes / deviation, off]), norms)
 
 
-HEAD = ("candidate", "estimate", "std. error", "promised", "fitted", "p", "criterion", "left out", "verdict")
+HEAD = ("candidate", "estimate", "std. error", "predicted cost", "cost", "p", "criterion", "held-out cost", "decision")
 
 
 @dataclasses.dataclass(frozen=True)
-class Suspect:
+class Extension:
     """One candidate.
 
     - `parameters`: what it frees; `values`: by name, of these and of all that was free; `errors`: of these. Fitted
         where `cost` is a number, else as the linearization has them.
-    - `promised`, `cost`: the sum of squares by the linearization, and fitted (NaN where it was not). `p`: the
-        probability that chance promises as much, of what is nested. `criterion`: what decides beside the trials left
+    - `predicted_cost`, `cost`: the sum of squares by the linearization, and fitted (NaN where it was not). `p`: of the
+        test, of what is nested. `criterion`: what decides beside the trials left
         out: "score test" before it is fitted, "F test" or "t test" after; of what is not nested "trials left out"
         alone, or "BIC" where none can be left out.
-    - `predicted`: the sum of squares of trials that are left out in turn; unknowns of the trials' own, which those that
-        are left out find too, count twice the variance of a residual each.
-    - `objections`: what is not plausible, in words. `verdict`: why it does not stand, or "stands"; `stands`.
+    - `held_out_cost`: the sum of squares of trials that are left out in turn; unknowns of the trials' own, which are
+        estimated for those too, count twice the variance of a residual each.
+    - `objections`: what is not plausible, in words. `accepted`, or the `reason` why not.
     """
 
     name: str
     parameters: tuple[str, ...] = ()
     values: Mapping[str, float] = dataclasses.field(default_factory=dict, hash=False)
     errors: Mapping[str, float] = dataclasses.field(default_factory=dict, hash=False)
-    promised: float = math.nan
+    predicted_cost: float = math.nan
     cost: float = math.nan
     p: float = math.nan
     criterion: str = ""
-    predicted: float = math.nan
+    held_out_cost: float = math.nan
     objections: tuple[str, ...] = ()
-    verdict: str = ""
-    stands: bool = False
+    reason: str = ""
+    accepted: bool = False
 
     @property
     def least(self) -> float:
         """What is known of the sum of squares with it; infinite where nothing is."""
-        known = [x for x in (self.cost, self.promised) if not math.isnan(x)]
+        known = [x for x in (self.cost, self.predicted_cost) if not math.isnan(x)]
         return known[0] if known else math.inf
 
     @property
@@ -134,55 +134,60 @@ class Suspect:
         known = [name for name in self.parameters if not math.isnan(self.errors[name])]
         estimates = ", ".join(f"{self.values[name]:.4g}" for name in known)
         errors = ", ".join(f"{self.errors[name]:.2g}" for name in known)
-        tested = (number(self.promised), number(self.cost), number(self.p, ".2g"), self.criterion)
-        return (self.name, estimates, errors, *tested, number(self.predicted), self.verdict)
+        tested = (number(self.predicted_cost), number(self.cost), number(self.p, ".2g"), self.criterion)
+        return (
+            self.name,
+            estimates,
+            errors,
+            *tested,
+            number(self.held_out_cost),
+            "accepted" if self.accepted else self.reason,
+        )
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Suspects:
-    """What `suspects` found; print it for the tables.
+class ForwardSelection:
+    """What `forward_selection` found; print it for the tables.
 
-    - `rows`: of the first round, those that stand first; `best`: the one that was taken there, or None. `rounds`: the
-        rows of all rounds; `costs`, `left_out`: the sums of squares with which each began, fitted and of trials left
-        out in turn.
-    - `taken`: names of what was taken, in that order. `fit`: with all of it free; where nothing was, the one `before`.
+    - `rounds`: the candidates of each round, the accepted ones first. `costs`, `held_out_costs`: the sums of squares
+        with which each began, fitted and of trials held out in turn.
+    - `selected`: names of what was selected, in that order; `best`: the first one, or None. `fit`: with all of it
+        free; where nothing was selected, the one `before`.
     - `level`: of the test.
     """
 
     before: Fit
-    rounds: tuple[tuple[Suspect, ...], ...]
+    rounds: tuple[tuple[Extension, ...], ...]
     costs: tuple[float, ...]
-    left_out: tuple[float, ...]
-    taken: tuple[str, ...]
+    held_out_costs: tuple[float, ...]
+    selected: tuple[str, ...]
     level: float
     fit: Fit
 
     @property
-    def rows(self) -> tuple[Suspect, ...]:
-        return self.rounds[0]
-
-    @property
-    def best(self) -> Suspect | None:
-        return self.rows[0] if self.taken else None
+    def best(self) -> Extension | None:
+        return self.rounds[0][0] if self.selected else None
 
     @property
     def headings(self) -> tuple[str, ...]:
         """Of every round, in words."""
         found = []
-        for i, (cost, out) in enumerate(zip(self.costs, self.left_out, strict=True)):
-            beside = f" with {', '.join(self.taken[:i])}" if i else ""
+        for i, (cost, out) in enumerate(zip(self.costs, self.held_out_costs, strict=True)):
+            beside = f" with {', '.join(self.selected[:i])}" if i else ""
             left = "one trial, nothing is left out" if math.isnan(out) else f"{out:.5g} of trials left out in turn"
             found.append(f"Sum of squares{beside} {cost:.6g}; {left}.")
         return tuple(found)
 
     @property
     def conclusion(self) -> str:
-        if not self.taken:
-            return f"Nothing is taken: no candidate stands at a level of {self.level:g}."
-        left = "" if math.isnan(self.left_out[0]) else f" (of trials left out: {self.left_out[0]:.5g} before)"
-        best = zip(self.taken, self.rounds, strict=False)
+        if not self.selected:
+            return f"Nothing is selected: no candidate is accepted at a level of {self.level:g}."
+        left = (
+            "" if math.isnan(self.held_out_costs[0]) else f" (of trials left out: {self.held_out_costs[0]:.5g} before)"
+        )
+        best = zip(self.selected, self.rounds, strict=False)
         taken = [f"{name} (not nested: by {r[0].criterion})" if math.isnan(r[0].p) else name for name, r in best]
-        return f"Taken: {', '.join(taken)}. Sum of squares {self.before.cost:.6g} -> {self.fit.cost:.6g}{left}."
+        return f"Selected: {', '.join(taken)}. Sum of squares {self.before.cost:.6g} -> {self.fit.cost:.6g}{left}."
 
     def __str__(self) -> str:
         parts = [
@@ -201,7 +206,7 @@ class Suspects:
         return "".join([*parts, f"<p>{html.escape(self.conclusion)}</p>"])
 
 
-def _lines(rows: Sequence[Suspect]) -> list[tuple[str, ...]]:
+def _lines(rows: Sequence[Extension]) -> list[tuple[str, ...]]:
     return [HEAD, *(row.cells for row in rows)]
 
 
@@ -215,7 +220,7 @@ class Trying:
 
     fit: Fit
     standing: Standing
-    taken: tuple[Candidate, ...]
+    selected: tuple[Candidate, ...]
     order: tuple[str, ...]  # of all candidates
     share: float  # of the level, for each
     said: Mapping[str, Any]
@@ -223,36 +228,36 @@ class Trying:
 
     def all_of(
         self, left: Sequence[Candidate], refits: int | None, bar: Any
-    ) -> tuple[tuple[Suspect, ...], dict[str, Standing]]:
+    ) -> tuple[tuple[Extension, ...], dict[str, Standing]]:
         """What every candidate promises, and of the promising ones what they keep; with where the search stands then.
         Those that stand come first, the best at the top."""
         promises = [promise for group in groups_of(self.fit, left) for promise in self._linearized(group, bar)]
         rows, found = {promise.row.name: promise.row for promise in promises}, {}
-        able = [h for h in promises if h.extended is not None and not h.row.verdict]
+        able = [h for h in promises if h.extended is not None and not h.row.reason]
         nested, others = ([h for h in able if h.nested is nested] for nested in (True, False))
         if refits is not None:
             nested = [h for h in nested if h.row.p < self.share]
-            nested = sorted(nested, key=lambda h: (bool(h.objections), h.row.promised))[:refits]
+            nested = sorted(nested, key=lambda h: (bool(h.objections), h.row.predicted_cost))[:refits]
         for promise in nested + (others if refits != 0 else []):  # what is not nested promises nothing before its fit
             bar.set_postfix_str(promise.row.name)
             rows[promise.row.name], after = self._fitted(promise)
             found |= {} if after is None else {promise.row.name: after}
             bar.update()
         done = [self._judged(row) for row in rows.values()]
-        best = lambda row: (not row.stands, row.predicted if row.stands and self.folds else row.least)  # noqa: E731
+        best = lambda row: (not row.accepted, row.held_out_cost if row.accepted and self.folds else row.least)  # noqa: E731
         return tuple(sorted(done, key=best)), found
 
     def _linearized(self, group: Sequence[Candidate], bar: Any) -> list[Promise]:
         """The candidates of one system, by one linearization."""
         bar.set_postfix_str(f"{len(group)} linearized")
         try:
-            more = extended(self.fit, (self.standing.problem, self.standing.point), group, self.taken, self.order)
+            more = extended(self.fit, (self.standing.problem, self.standing.point), group, self.selected, self.order)
             at, why = linearize(without_priors(more.problem), more.point), "cannot be simulated where it starts"
         except ValueError as error:
             more, at, why = None, None, str(error)
         bar.update()
         if more is None or at is None or not usable(at):
-            return [Promise(c, Suspect(c.name, verdict=why)) for c in group]
+            return [Promise(c, Extension(c.name, reason=why)) for c in group]
         said = {name: value for c in group for name, value in c.plausible.items()}
         said |= {name: value for name, value in self.said.items() if name in more.names}
         # What was free has started where the fit did, whatever another system begins with.
@@ -287,21 +292,21 @@ class Trying:
             freedom = was.freedom - len(new) - count
             left_out = rows.left_out(x, self.folds) + _own_share(count, found.least, freedom, was.correlation)
         row_names = tuple(more.names[i] for i in new)
-        row = Suspect(
+        row = Extension(
             name=candidate.name,
             parameters=row_names,
             values={more.names[i]: float(values[i]) for i in x},
             errors=_errors(row_names, slopes[np.ix_(new, new)], found.covariance),
-            promised=was.cost - found.drop if nested else float("nan"),
+            predicted_cost=was.cost - found.drop if nested else float("nan"),
             p=found.p if nested else float("nan"),
             criterion="score test" if nested else "",
-            predicted=left_out,
-            verdict=_undetermined(more, new, found) if nested else "",
+            held_out_cost=left_out,
+            reason=_undetermined(more, new, found) if nested else "",
         )
         objections = common.plausible.objections(row.values)
         return Promise(candidate, row, more, common, nested, tuple(objections))
 
-    def _fitted(self, promise: Promise) -> tuple[Suspect, Standing | None]:
+    def _fitted(self, promise: Promise) -> tuple[Extension, Standing | None]:
         """After a fit of all that is free and this."""
         more, was, row, common = promise.extended, self.standing, promise.row, promise.common
         assert more is not None
@@ -311,9 +316,9 @@ class Trying:
             found = uninterrupted(minimize(problem, LeastSquares(), start=start))
             at = linearize(without_priors(problem), found.point)
         except ValueError as error:
-            return dataclasses.replace(row, verdict=str(error)), None
+            return dataclasses.replace(row, reason=str(error)), None
         if at is None or not usable(at) or found.status != "converged":
-            return dataclasses.replace(row, verdict=f"its fit has not converged ({found.status})"), None
+            return dataclasses.replace(row, reason=f"its fit has not converged ({found.status})"), None
         n, count = len(more.base_x), self._unknowns(promise.candidate, more)
         k = len(found.names) - n + count
         rows = rows_of(problem, at, found.point, more.owned([promise.candidate])[1])
@@ -322,7 +327,7 @@ class Trying:
             rows, range(n), range(n, len(found.names)), freedom=was.freedom, more=count, correlation=after.correlation
         )
         slopes = np.asarray(slopes_of(problem.parameters, found.point.x))
-        p, criterion, verdict = float("nan"), "trials left out", ""
+        p, criterion, reason = float("nan"), "trials left out", ""
         if promise.nested:
             p, criterion = chance(was.cost - after.cost, k, after.cost, after.freedom, after.correlation), "F test"
             if not count and is_clustered(rows, len(found.names), after.correlation):
@@ -330,7 +335,7 @@ class Trying:
                 criterion = "t test"
         elif self.folds is None:
             change, criterion = bic_change(was.cost, after.cost, k, self.fit.problem.size[0], after.correlation), "BIC"
-            verdict = "" if change < 0 else f"its BIC is higher by {change:.3g}"
+            reason = "" if change < 0 else f"its BIC is higher by {change:.3g}"
         before = set(common.plausible.objections(was.values))
         row = dataclasses.replace(
             row,
@@ -339,8 +344,9 @@ class Trying:
             cost=after.cost,
             p=p,
             criterion=criterion,
-            verdict=verdict,
-            predicted=after.left_out(self.folds) + _own_share(count, after.cost, after.freedom, after.correlation),
+            reason=reason,
+            held_out_cost=after.held_out_cost(self.folds)
+            + _own_share(count, after.cost, after.freedom, after.correlation),
             objections=tuple(o for o in common.plausible.objections(after.values) if o not in before),
         )
         return row, after
@@ -350,20 +356,20 @@ class Trying:
         n_b = len(set(more.own_b[candidate.name]) - set(more.base_b)) * more.problem.clusters
         return n_b + more.point.z.size - self.standing.point.z.size
 
-    def _judged(self, row: Suspect) -> Suspect:
-        """With the verdict, in the order in which doubts are raised."""
+    def _judged(self, row: Extension) -> Extension:
+        """With the reason, in the order in which doubts are raised."""
         was, fitted = self.standing, np.isfinite(row.cost)
         doubts = (
-            (bool(row.verdict), row.verdict),
+            (bool(row.reason), row.reason),
             (not np.isnan(row.p) and row.p >= self.share, "no more than chance"),
             (not fitted and np.isnan(row.p), "not nested, not fitted"),
             (not fitted, "promising, not fitted"),
             (fitted and not row.cost < was.cost, "its fit lowers nothing"),
             (bool(row.objections), f"not plausible: {', '.join(row.objections)}"),
-            (row.predicted >= was.left_out(self.folds), "does not predict trials left out"),
+            (row.held_out_cost >= was.held_out_cost(self.folds), "does not predict trials left out"),
         )
-        verdict = next((words for doubted, words in doubts if doubted), "")
-        return dataclasses.replace(row, verdict=verdict or "stands", stands=not verdict)
+        reason = next((words for doubted, words in doubts if doubted), "")
+        return dataclasses.replace(row, reason=reason, accepted=not reason)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -381,7 +387,7 @@ class Promise:
     """A candidate and what it promises; `nested`: whether it changes nothing where it starts."""
 
     candidate: Candidate
-    row: Suspect
+    row: Extension
     extended: Extended | None = None
     common: Common | None = None
     nested: bool = True
@@ -415,7 +421,7 @@ def _undetermined(more: Extended, new: Sequence[int], found: Any) -> str:
     return f"{', '.join(lost)} cannot be distinguished from what is free" if lost else ""
 
 
-def suspects(
+def forward_selection(
     fit: Fit,
     candidates: Any,
     *,
@@ -425,13 +431,14 @@ def suspects(
     plausible: Mapping[str, Any] | None = None,
     folds: int | Sequence[Sequence[int]] | None = None,
     progress: bool = False,
-) -> Suspects:
+) -> ForwardSelection:
     """Which of these extensions a model lacks: what each would lower the sum of squares by, whether it can be believed,
     and whether it predicts trials that were left out.
 
-        found = suspects(fit, ["dry_friction", Gain("torque"), Offset("angle"), Candidate("lag", system=Lagging())])
-        print(found)
-        found.fit                                           # with what was taken
+        candidates = ["dry_friction", Gain("torque"), Offset("angle"), Candidate("lag", system=Lagging())]
+        selection = forward_selection(fit, candidates)
+        print(selection)
+        selection.fit                                       # with what was selected
 
     All candidates of a system are linearized together, once, where the fit ended; what is free and unknown already is
     eliminated. That says how much each promises, its estimate with its error, and by a score test (Rao 1948) whether
@@ -460,12 +467,12 @@ def suspects(
         or declared, as friction at zero, is searched for on both sides and believed on one.
     - `folds`: trials that are left out together, as in `cross_validate`. `progress`: a bar.
 
-    **Returns:** `Suspects`: print it for the table.
+    **Returns:** `ForwardSelection`: print it for the table.
 
     **Raises:** `ValueError` for a fit that has not converged, no candidate, two of the same name, one that is free
     already, and names that do not exist.
     """
-    refuse_other(fit, Fit, "suspects", "suspects(fit(...), candidates)")
+    refuse_other(fit, Fit, "forward_selection", "forward_selection(fit(...), candidates)")
     _check(fit, depth, refits, level)
     left = list(candidates_of(fit, candidates))
     order = tuple(candidate.name for candidate in left)
@@ -476,12 +483,12 @@ def suspects(
     elif folds is not None:
         raise ValueError("`folds`: one trial alone cannot be left out: cut it with `Trial.between`.")
     standing, taken, rounds = Standing.of(fit), [], []
-    with tqdm(disable=not progress, desc="suspects", unit=" step") as bar:
+    with tqdm(disable=not progress, desc="forward_selection", unit=" step") as bar:
         for _ in range(depth):
             round = Trying(fit, standing, tuple(taken), order, level / len(left), said, groups)
             rows, ways = round.all_of(left, refits, bar)
-            best = next((row for row in rows if row.stands), None)
-            rounds.append((standing.cost, standing.left_out(groups), rows))
+            best = next((row for row in rows if row.accepted), None)
+            rounds.append((standing.cost, standing.held_out_cost(groups), rows))
             if best is None:
                 break
             taken.append(next(c for c in left if c.name == best.name))
@@ -491,12 +498,12 @@ def suspects(
                 break
     names = {name for _, _, rows in rounds for row in rows for name in row.values}
     refuse_unknown(said, (*fit.names, *names), "`plausible` names")
-    return Suspects(
+    return ForwardSelection(
         before=fit,
         rounds=tuple(rows for *_, rows in rounds),
         costs=tuple(cost for cost, *_ in rounds),
-        left_out=tuple(out for _, out, _ in rounds),
-        taken=tuple(c.name for c in taken),
+        held_out_costs=tuple(out for _, out, _ in rounds),
+        selected=tuple(c.name for c in taken),
         level=level,
         fit=_fitted(fit, taken, standing) if taken else fit,
     )
@@ -505,8 +512,8 @@ def suspects(
 def _check(fit: Fit, depth: Any, refits: Any, level: float) -> None:
     if fit.problem.specification.noise is not None:
         raise ValueError(
-            "suspects asks fits of least squares, whose sum of squares candidates lower; this one has process noise, "
-            "which stands in for what is missing. Ask without `noise`, or compare `marginal_likelihood` of two fits."
+            "forward_selection compares sums of squares of fits without process noise; this fit has process noise, "
+            "which makes up for what the model lacks. Fit without `noise`, or compare `marginal_likelihood` of two"
         )
     if fit.status != "converged":
         raise ValueError(

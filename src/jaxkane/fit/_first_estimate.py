@@ -16,7 +16,7 @@ from .._kane.regressor import described
 from .._scalarjit.cache_key import compiled
 from .._system.system import System
 from ._base_parameters import BaseParameters, equations_at, estimated, states_for, structure_of_states
-from ._kinematics import Motions, instants_of, max_spacing
+from ._kinematics import Motions, kinematic_samples, max_spacing
 from ._parameters import Parameters, parameters_of
 from ._regressor import Chosen, check_linear
 from ._tables import bodies_in_words
@@ -90,28 +90,28 @@ class FirstEstimate:
 
     - `system`: with what was found in it; a fit may begin from it.
     - `values` (p) by name, `starts` (p) from which they came.
-    - `base`: the `BaseParameters` that linear least squares found, with their deviations, and `possible` (b): those of
+    - `base`: the `BaseParameters` that linear least squares found, with their deviations, and `feasible` (b): those of
         `system`, whose bodies can be.
-    - `strain`: how far the second are from the first, in standard deviations; where it is above 3 (`ok`), no body has
+    - `distance`: how far the second are from the first, in standard deviations; where it is above 3 (`ok`), no body has
         what the equations ask for: the model lacks something, or the accelerations are too noisy.
     - `spacing` [s]: of the knots from which accelerations were taken; NaN where nothing had to be smoothed.
     - `bodies`: those that were freed as `Inertia(...)`, each as a whole, in words.
-    - `impossible`: why bodies are refused that were not freed as `Inertia(...)`; empty where all can be.
+    - `infeasibility`: why bodies are refused that were not freed as `Inertia(...)`; empty where all can be.
     """
 
     system: System
     values: Mapping[str, float]
     starts: Mapping[str, float]
     base: BaseParameters
-    possible: np.ndarray
-    strain: float
+    feasible: np.ndarray
+    distance: float
     spacing: float
-    impossible: str
+    infeasibility: str
     bodies: tuple[str, ...]
 
     @property
     def ok(self) -> bool:
-        return self.strain <= 3.0 and not self.impossible
+        return self.distance <= 3.0 and not self.infeasibility
 
     def __str__(self) -> str:
         width = max(map(len, self.values))
@@ -121,9 +121,9 @@ class FirstEstimate:
             *self.bodies,
             "",
             str(self.base),
-            f"bodies that can be are {self.strain:.2g} standard deviations from these",
+            f"the nearest feasible bodies are {self.distance:.2g} standard deviations from these",
         ]
-        return "\n".join([*lines, *[self.impossible] * bool(self.impossible)])
+        return "\n".join([*lines, *[self.infeasibility] * bool(self.infeasibility)])
 
     __repr__ = __str__
 
@@ -150,7 +150,7 @@ def first_estimate(
 
     **Arguments:**
 
-    - `system`: with initial guesses. `motions`: trials, trajectories or `Instants`, as of `instants_of`.
+    - `system`: with initial guesses. `motions`: trials, trajectories or `KinematicSamples`, as of `kinematic_samples`.
     - `free`: as of `fit`: names, `Free`, `Inertia(...)`. In what does not belong to a body, as dampers, springs and dry
         friction, the equations must be linear.
     - `sigma`: by speed, the standard deviation of what remains in its equation; by default estimated.
@@ -159,8 +159,8 @@ def first_estimate(
 
     **Returns:** a `FirstEstimate`; print it.
 
-    **Raises:** `ValueError` as `fit`, `regressor` and `instants_of`; for gains and delays, and parameters that change
-    lengths or places, in which the equations are not linear.
+    **Raises:** `ValueError` as `fit`, `regressor` and `kinematic_samples`; for gains and delays, and parameters that
+    change lengths or places, in which the equations are not linear.
     """
     parameters = parameters_of(system, free)
     _refuse_roles(parameters)
@@ -169,7 +169,7 @@ def first_estimate(
     check_linear(chosen, np.zeros((), jnp.result_type(float)), None)
     structure = structure_of_states(chosen)
     base, spacing = _best(system, chosen, structure, motions, sigma, spacing)
-    x, strain = nearest(chosen, parameters, base)
+    x, distance = nearest(chosen, parameters, base)
     at = jnp.asarray(x, parameters.start.dtype)
     found, values = parameters.apply(system, at)[0], np.asarray(parameters.values(at))
     return FirstEstimate(
@@ -178,9 +178,9 @@ def first_estimate(
         dict(zip(parameters.names, np.asarray(parameters.start).tolist(), strict=True)),
         base,
         base.of(column_values(chosen, found)),
-        strain,
+        distance,
         spacing,
-        _why_impossible(found),
+        _infeasibility(found),
         tuple(bodies_in_words(parameters, at)),
     )
 
@@ -258,7 +258,7 @@ def _best(
         tried = [float(np.median(widest)) / 1.5**i for i in range(_TRIED)]
     best, chosen_spacing = None, float("nan")
     for one in tried:
-        found = estimated(structure, *equations_at(chosen, instants_of(system, motions, spacing=one)), sigma, 0.5)
+        found = estimated(structure, *equations_at(chosen, kinematic_samples(system, motions, spacing=one)), sigma, 0.5)
         if best is None or found.unexplained < best.unexplained:
             best, chosen_spacing = found, float("nan") if one is None else one
         elif found.unexplained > 1.5 * best.unexplained:
@@ -267,7 +267,7 @@ def _best(
     return best, chosen_spacing
 
 
-def _why_impossible(system: System) -> str:
+def _infeasibility(system: System) -> str:
     try:
         check_bodies(system, jnp.zeros(()), jnp.full(len(system.coordinates), 0.3))
     except ValueError as error:

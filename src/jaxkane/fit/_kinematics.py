@@ -91,10 +91,10 @@ def covered(t: np.ndarray, channels: Mapping[str, np.ndarray], spacing: float) -
 
 
 @dataclasses.dataclass(frozen=True)
-class Instants:
-    """Instants of one or several motions, for `base_parameters` and `first_estimate`.
+class KinematicSamples:
+    """KinematicSamples of one or several motions, for `base_parameters` and `first_estimate`.
 
-        Instants(t, q, u, u_dot, {"torque": torque})
+        KinematicSamples(t, q, u, u_dot, {"torque": torque})
 
     **Arguments:** `t` (n,) [s]; `q` (n, n_q); `u`, `u_dot` (n, n_u) of the independent speeds; `inputs`: by name, and
     states of the first order with them, numbers or (n,); inputs left out are zero; `trial` (n,): which motion each is
@@ -113,7 +113,7 @@ class Instants:
     def __post_init__(self) -> None:
         t = np.asarray(self.t, float)
         if t.ndim != 1:
-            raise ValueError(f"Instants: `t` has the shape {t.shape} instead of (n,).")
+            raise ValueError(f"KinematicSamples: `t` has the shape {t.shape} instead of (n,).")
         rows = {name: np.asarray(getattr(self, name), float) for name in ("q", "u", "u_dot")}
         inputs = {name: np.asarray(x, float) for name, x in self.inputs.items()}
         inputs = {name: np.full(t.shape, x) if x.ndim == 0 else x for name, x in inputs.items()}
@@ -122,13 +122,13 @@ class Instants:
         wrong += [f"`{k}` {x.shape}" for k, x in {"trial": trial, **inputs}.items() if x.shape != t.shape]
         if wrong or rows["u"].shape != rows["u_dot"].shape:
             raise ValueError(
-                f"Instants: for `t` ({len(t)},), `q`, `u` and `u_dot` have a row for each time, and inputs a number: "
-                f"{', '.join(wrong) or 'u ' + str(rows['u'].shape) + ', u_dot ' + str(rows['u_dot'].shape)}."
+                f"KinematicSamples: for `t` ({len(t)},), `q`, `u` and `u_dot` have a row for each time, and inputs a "
+                f"number: {', '.join(wrong) or 'u ' + str(rows['u'].shape) + ', u_dot ' + str(rows['u_dot'].shape)}."
             )
         columns = np.column_stack([t, *rows.values(), *inputs.values()])
         finite = np.all(np.isfinite(columns), axis=1)
         if not finite.any():
-            raise ValueError("Instants: there is no instant at which all numbers are finite.")
+            raise ValueError("KinematicSamples: there is no instant at which all numbers are finite.")
         keep = {"t": t, **rows, "trial": trial}
         for name, x in keep.items():
             object.__setattr__(self, name, x[finite])
@@ -138,33 +138,33 @@ class Instants:
         return len(self.t)
 
     def __repr__(self) -> str:
-        return f"Instants({len(self)} of {len(np.unique(self.trial))} motions)"
+        return f"KinematicSamples({len(self)} of {len(np.unique(self.trial))} motions)"
 
 
-Motions = Instants | Trial | Trajectory | Sequence[Trial | Trajectory | Instants]
+Motions = KinematicSamples | Trial | Trajectory | Sequence[Trial | Trajectory | KinematicSamples]
 
 
-def instants_of(system: System, motions: Motions, *, spacing: float | None = None) -> Instants:
+def kinematic_samples(system: System, motions: Motions, *, spacing: float | None = None) -> KinematicSamples:
     """Coordinates, speeds and accelerations of measured or simulated motions.
 
     **Arguments:**
 
-    - `motions`: a `Trial`, a `Trajectory`, `Instants`, or several of these. A trajectory's accelerations are those of
-        splines through its speeds: save enough times. A trial's channels are approximated by splines: coordinates,
-        which give speeds and accelerations by their derivatives; a speed that was measured gives its own.
+    - `motions`: a `Trial`, a `Trajectory`, `KinematicSamples`, or several of these. A trajectory's accelerations
+        are those of splines through its speeds: save enough times. A trial's channels are approximated by splines:
+        coordinates, which give speeds and accelerations by their derivatives; a measured speed gives its own.
     - `spacing` [s]: of the splines' knots, which hold what is slower than a period of two of them; by default the
         largest at which every channel is met within its `sigma`, in root mean square.
 
-    **Returns:** `Instants`. A spacing at the ends of a trial, and around gaps in a channel, is left out.
+    **Returns:** `KinematicSamples`. A spacing at the ends of a trial, and around gaps in a channel, is left out.
 
     **Raises:** `ValueError` that names a coordinate, or a state of the first order, that a trial has not measured, and
     for a trial or a trajectory that is too short.
     """
-    if isinstance(motions, (Instants, Trial, Trajectory)):
+    if isinstance(motions, (KinematicSamples, Trial, Trajectory)):
         motions = [motions]
     found = [_of_one(system, motion, spacing) for motion in motions]
     if not found:
-        raise ValueError("There is no motion: give a Trial, a Trajectory, or Instants.")
+        raise ValueError("There is no motion: give a Trial, a Trajectory, or KinematicSamples.")
     n_q, n_u = len(system.coordinates), len(system.speeds)
     for one in found:
         if (one.q.shape[1], one.u.shape[1]) != (n_q, n_u):
@@ -178,12 +178,12 @@ def instants_of(system: System, motions: Motions, *, spacing: float | None = Non
         if lacking:
             raise ValueError(
                 f"{type(system).__name__}: loads may follow {', '.join(lacking)}, of which the instants say nothing: "
-                "give its values among the `inputs` of Instants, or measure it."
+                "give its values among the `inputs` of KinematicSamples, or measure it."
             )
     if len(found) == 1:
         return found[0]
     joined = lambda of: np.concatenate([of(one) for one in found])  # noqa: E731
-    return Instants(
+    return KinematicSamples(
         joined(lambda one: one.t),
         joined(lambda one: one.q),
         joined(lambda one: one.u),
@@ -196,21 +196,21 @@ def instants_of(system: System, motions: Motions, *, spacing: float | None = Non
     )
 
 
-def _of_one(system: System, motion: Any, spacing: float | None) -> Instants:
-    if isinstance(motion, Instants):
+def _of_one(system: System, motion: Any, spacing: float | None) -> KinematicSamples:
+    if isinstance(motion, KinematicSamples):
         return motion
     if isinstance(motion, Trajectory):
         return _of_trajectory(system, motion)
     if isinstance(motion, Trial):
         return _of_trial(system, motion, spacing)
-    raise TypeError(f"A motion is a Trial, a Trajectory or Instants, got {type(motion).__name__}.")
+    raise TypeError(f"A motion is a Trial, a Trajectory or KinematicSamples, got {type(motion).__name__}.")
 
 
-def _of_trajectory(system: System, ride: Trajectory) -> Instants:
+def _of_trajectory(system: System, ride: Trajectory) -> KinematicSamples:
     """Accelerations by a spline through the speeds: those of the system would be what is to be found."""
-    refuse_other_system("Instants", system, ride)
+    refuse_other_system("KinematicSamples", system, ride)
     if np.ndim(ride.status) > 0:
-        raise ValueError("A batch of trajectories: give them one by one, or as Instants.")
+        raise ValueError("A batch of trajectories: give them one by one, or as KinematicSamples.")
     t, q, u = (np.asarray(x) for x in (ride.t, ride.q, ride.u))
     there = np.all(np.isfinite(np.column_stack([t, q, u])), axis=1)
     if there.sum() < 3 * (DEGREE + 1):
@@ -221,17 +221,17 @@ def _of_trajectory(system: System, ride: Trajectory) -> Instants:
     u_dot = np.full(u.shape, np.nan)
     u_dot[there] = make_interp_spline(t[there], u[there], DEGREE)(t[there], 1)
     u_dot[np.flatnonzero(there)[[*range(3), *range(-3, 0)]]] = np.nan  # at its ends a spline is worst
-    return Instants(t, q, u, u_dot, {name: np.asarray(ride[name]) for name in (*system.inputs, *system.states)})
+    return KinematicSamples(t, q, u, u_dot, {name: np.asarray(ride[name]) for name in (*system.inputs, *system.states)})
 
 
-def _of_trial(system: System, trial: Trial, spacing: float | None) -> Instants:
+def _of_trial(system: System, trial: Trial, spacing: float | None) -> KinematicSamples:
     names = [*system.coordinates, *system.speeds, *system.states]
     channels = {name: y for name, y in trial.measured.items() if name in names}
     missing = [name for name in system.coordinates if name not in channels]
     if missing:
         raise ValueError(
             f"{trial.name}: {', '.join(missing)} was not measured, which the equations of motion ask for: give "
-            "Instants(t, q, u, u_dot, inputs) with what is known otherwise."
+            "KinematicSamples(t, q, u, u_dot, inputs) with what is known otherwise."
         )
     refuse_unknown(trial.inputs, system.inputs, f"{trial.name}: {type(system).__name__} has no input named", "it has")
     if spacing is None:
@@ -246,4 +246,4 @@ def _of_trial(system: System, trial: Trial, spacing: float | None) -> Instants:
         if name in splines:
             u[:, i], u_dot[:, i] = splines[name](trial.t), splines[name](trial.t, 1)
     u_dot[~covered(trial.t, channels, spacing)] = np.nan
-    return Instants(trial.t, q, u, u_dot, inputs)
+    return KinematicSamples(trial.t, q, u, u_dot, inputs)

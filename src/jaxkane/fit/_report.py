@@ -15,12 +15,12 @@ import numpy as np
 
 from .._common.lookup import label_of
 from .._system.system import System
-from ._extensions import Suspects
+from ._extensions import ForwardSelection
 from ._identifiability import combination
 from ._problem import refuse_other
 from ._result import Fit
 from ._statistics import autocorrelations
-from ._studies import Profile, contrary_signs
+from ._studies import Profile, check_signs
 from ._tables import STATUS, html_table, known_values, plain
 from ._validate import CrossValidation, cross_validate
 
@@ -280,7 +280,7 @@ def settings_of(fit: Fit) -> Iterable[tuple[str, str]]:
 def report(fit: Fit, truth: Mapping[str, float] | System | None = None) -> str:
     """All that is known about a fit, as a text: estimates, intervals, directions, residuals, notes.
 
-    `truth`: parameters by name, or a system, where they are known. Where a channel fits badly, `contrary_signs` is
+    `truth`: parameters by name, or a system, where they are known. Where a channel fits badly, `check_signs` is
     asked, which makes a few steps of a fit with each sign turned round.
     """
     parts = [
@@ -304,7 +304,7 @@ def save_report(
     truth: Mapping[str, float] | Any = None,
     cross_validation: CrossValidation | bool = False,
     profiles: Sequence[Profile] = (),
-    suspects: Suspects | None = None,
+    forward_selection: ForwardSelection | None = None,
     trials: int | None = 6,
     title: str | None = None,
 ) -> Path:
@@ -315,14 +315,14 @@ def save_report(
     - `path`: of the page. `title`: its heading, by default the system's name.
     - `truth`: parameters by name, or a system, where they are known.
     - `cross_validation`: what `cross_validate` gave, or True to do it now. `profiles`: what `profile` gave.
-    - `suspects`: what `suspects` gave, of this fit or of the one before it.
+    - `forward_selection`: what `forward_selection` gave, of this fit or of the one before it.
     - `trials`: how many are drawn, from the first to the last; None for all.
 
     **Returns:** the path.
     """
     refuse_other(fit, Fit, "save_report", 'save_report(fit(...), "fit.html")')
     title = title or f"Identification of {type(fit.problem.system).__name__}"
-    sections = _sections(fit, truth, cross_validation, profiles, suspects, trials)
+    sections = _sections(fit, truth, cross_validation, profiles, forward_selection, trials)
     body = "\n".join(f"<h2>{html.escape(head)}</h2>\n{part}" if head else part for head, part in sections)
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -335,7 +335,7 @@ def _sections(
     truth: Mapping[str, float] | Any,
     cross_validation: CrossValidation | bool,
     profiles: Sequence[Profile],
-    suspects: Suspects | None,
+    forward_selection: ForwardSelection | None,
     trials: int | None,
 ) -> list[tuple[str, str]]:
     """Headings and what stands under them."""
@@ -367,15 +367,20 @@ def _sections(
         head = ("trial left out", "residuals", "spread", "start", "fitted", "held out")
         verdict = cross_validation.verdict[0].upper() + cross_validation.verdict[1:]
         sections.append(("Trials left out", paragraph(verdict) + details("Every trial", wide_table([head, *rows]))))
-    if suspects:
-        refuse_other(suspects, Suspects, "`suspects=`", "save_report(fit, path, suspects=suspects(fit, candidates))")
-        sections.append(("What may be missing", f'<div class="wide">{suspects._repr_html_()}</div>'))
+    if forward_selection:
+        refuse_other(
+            forward_selection,
+            ForwardSelection,
+            "`forward_selection=`",
+            "save_report(fit, path, forward_selection=forward_selection(fit, candidates))",
+        )
+        sections.append(("What may be missing", f'<div class="wide">{forward_selection._repr_html_()}</div>'))
     sections.append(("Settings", wide_table([("", ""), *settings_of(fit)])))
     return sections
 
 
 def _all_notes(fit: Fit) -> tuple[str, ...]:
-    return (*fit.notes, *contrary_signs(fit))
+    return (*fit.notes, *check_signs(fit))
 
 
 def _notes(fit: Fit) -> str:

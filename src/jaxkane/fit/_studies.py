@@ -220,7 +220,7 @@ def _crossings(values: np.ndarray, costs: np.ndarray, limit: float) -> tuple[flo
     return ends[0], ends[1]
 
 
-def contrary_signs(fit: Fit) -> tuple[str, ...]:
+def check_signs(fit: Fit) -> tuple[str, ...]:
     """Inputs and channels with which the opposite sign would fit much better, in words.
 
     Where a channel fits badly (`Fit.notes` says so), each sign is turned round in turn and a few steps of a fit are

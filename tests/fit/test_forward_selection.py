@@ -22,8 +22,8 @@ from jaxkane.fit import (
     compare,
     cross_validate,
     fit,
+    forward_selection,
     save_report,
-    suspects,
 )
 from jaxkane.fit._candidates import groups_of
 from jaxkane.fit._score_test import bic_change
@@ -88,18 +88,18 @@ def rubbing():
 
 @pytest.fixture(scope="module")
 def found(rubbing):
-    return suspects(rubbing, FIVE, depth=1, refits=1)
+    return forward_selection(rubbing, FIVE, depth=1, refits=1)
 
 
 def test_dry_friction_is_found_among_five(rubbing, found):
-    assert found.taken == ("dry",)
-    assert found.best is found.rows[0]
-    assert len(found.rows) == 5
+    assert found.selected == ("dry",)
+    assert found.best is found.rounds[0][0]
+    assert len(found.rounds[0]) == 5
     best = found.best
     assert best.p < 1e-4
     assert abs(best.values["dry"] - 0.4) < 3.5 * best.errors["dry"] < 0.1
     assert best.cost == pytest.approx(found.fit.cost, rel=1e-6)
-    assert best.promised == pytest.approx(best.cost, rel=0.05)
+    assert best.predicted_cost == pytest.approx(best.cost, rel=0.05)
     assert found.fit.names == (*FREE, "dry")
     assert found.fit.variance < 1.3 < rubbing.variance
     assert best.errors["dry"] == pytest.approx(found.fit.standard_errors["dry"], rel=0.05)
@@ -108,18 +108,18 @@ def test_dry_friction_is_found_among_five(rubbing, found):
 @pytest.mark.slow
 def test_the_promise_is_that_of_a_fit(rubbing):
     """Beside fits that are posed anew, each with one more parameter, and trials left out of them by refits."""
-    found = suspects(rubbing, FIVE, depth=3, refits=4)
+    found = forward_selection(rubbing, FIVE, depth=3, refits=4)
     # Beside dry friction nothing stands: the search ends by itself.
-    assert found.taken == ("dry",)
+    assert found.selected == ("dry",)
     assert len(found.rounds) == 2
-    assert not any(row.stands for row in found.rounds[1])
+    assert not any(row.accepted for row in found.rounds[1])
     for item in FIVE[:2]:
         anew = fit(Pendulum(), rubbing.problem.trials, (*FREE, item), **POSED)
-        row = next(row for row in found.rows if row.name == item)
+        row = next(row for row in found.rounds[0] if row.name == item)
         assert row.cost == pytest.approx(anew.cost, rel=1e-6)
-        assert row.promised == pytest.approx(anew.cost, rel=0.1)
+        assert row.predicted_cost == pytest.approx(anew.cost, rel=0.1)
         assert dict(row.values) == pytest.approx(anew.estimates, rel=1e-3)
-        assert row.predicted == pytest.approx(cross_validate(anew).held_out.sum(), rel=0.05)
+        assert row.held_out_cost == pytest.approx(cross_validate(anew).held_out.sum(), rel=0.05)
 
 
 @pytest.mark.slow
@@ -127,22 +127,22 @@ def test_what_is_not_there_is_not_taken():
     taken = 0
     for seed in range(20):
         without = fitted(record(seed))
-        taken += bool(suspects(without, ("dry", "spring", Offset("angle", scale=0.1)), refits=1).taken)
+        taken += bool(forward_selection(without, ("dry", "spring", Offset("angle", scale=0.1)), refits=1).selected)
     assert taken <= 3  # at a level of 0.05 one is expected, and more than three come once in sixty
 
 
 @pytest.mark.slow
 def test_negative_friction_is_not_believed(rubbing):
     asked = ("quadratic", Free("spring", bounds=(0.0, None)))
-    found = suspects(
+    found = forward_selection(
         rubbing, asked, refits=None, level=0.9, plausible={"damping": (0.0, 0.6), "quadratic": (0.0, None)}
     )
-    assert not found.taken
-    quadratic, spring = (next(row for row in found.rows if row.name == name) for name in ("quadratic", "spring"))
+    assert not found.selected
+    quadratic, spring = (next(row for row in found.rounds[0] if row.name == name) for name in ("quadratic", "spring"))
     assert quadratic.objections == ("damping = 0.9051 is above 0.6", "quadratic = -0.1769 is below 0") or (
         len(quadratic.objections) == 2 and "quadratic" in quadratic.objections[1]
     )
-    assert quadratic.verdict.startswith("not plausible: damping = 0.9")
+    assert quadratic.reason.startswith("not plausible: damping = 0.9")
     # Its bound is where it starts: it is searched for on both sides, and believed on one.
     assert spring.values["spring"] < 0
     assert spring.objections[0].startswith("spring = -")
@@ -153,23 +153,23 @@ def test_one_sensor_is_off_in_all_trials():
     trials = record(3, angle=0.05)
     kinds = (Offset("angle", scale=0.1), Offset("rate"), Gain("rate"), Delay("torque"), Delay("rate"), "dry")
     first = fitted(trials)
-    found = suspects(first, kinds, refits=1)
-    assert found.taken == ("offset of angle",)
+    found = forward_selection(first, kinds, refits=1)
+    assert found.selected == ("offset of angle",)
     assert found.fit.estimates["offset of angle"] == pytest.approx(0.05, abs=4 * found.best.errors["offset of angle"])
     # The same, as every trial's own: more unknowns for what is one number.
-    own = suspects(first, [Candidate("zeros", sensor_bias="angle"), kinds[0]], refits=2)
-    assert own.taken == ("offset of angle",)
-    zeros = next(row for row in own.rows if row.name == "zeros")
+    own = forward_selection(first, [Candidate("zeros", sensor_bias="angle"), kinds[0]], refits=2)
+    assert own.selected == ("offset of angle",)
+    zeros = next(row for row in own.rounds[0] if row.name == "zeros")
     anew = fitted(trials, sensor_bias="angle")
     assert zeros.cost == pytest.approx(anew.cost, rel=1e-5)
-    assert zeros.promised == pytest.approx(anew.cost, rel=0.05)
+    assert zeros.predicted_cost == pytest.approx(anew.cost, rel=0.05)
 
 
 @pytest.mark.slow
 def test_a_known_start_is_off_in_all_trials():
     trials = [trial.begun({"rate": 0.5 * (i % 3) + 0.1}) for i, trial in enumerate(record(4))]
-    found = suspects(fitted(trials, unknown="angle"), [Offset("rate", of="start"), "dry", "quadratic"])
-    assert found.taken == ("offset of start of rate",)
+    found = forward_selection(fitted(trials, unknown="angle"), [Offset("rate", of="start"), "dry", "quadratic"])
+    assert found.selected == ("offset of start of rate",)
     assert found.fit.estimates["offset of start of rate"] == pytest.approx(-0.1, abs=0.01)
 
 
@@ -179,8 +179,8 @@ def test_a_torque_that_acts_late(hold):
     """By two samples of 0.05 s; of a held one the delay is found to where its mean is taken for it."""
     trials = record(5, late=2)
     asked = (Delay("torque"), Gain("torque"), "dry")
-    found = suspects(fitted(trials, hold=hold), asked, plausible={"delay of torque": (0.0, 0.3)})
-    assert found.taken == ("delay of torque",)
+    found = forward_selection(fitted(trials, hold=hold), asked, plausible={"delay of torque": (0.0, 0.3)})
+    assert found.selected == ("delay of torque",)
     expected = 0.1 if not hold else 0.075  # what is linear between samples acts like what is held half a sample longer
     assert found.fit.estimates["delay of torque"] == pytest.approx(expected, abs=0.003)
 
@@ -203,9 +203,9 @@ def test_another_system_with_a_state():
     """What is not neutral anywhere is fitted; what its system begins with is not what is plausible."""
     trials = record(6, system=Lagging(lag=0.08))
     lag = Candidate("motor lag", system=Lagging(stiffness=3.0), free="lag", unknown="acting")
-    found = suspects(fitted(trials), ["dry", Delay("torque"), lag], refits=3)
-    assert found.taken == ("motor lag",)
-    assert np.isnan(found.best.promised)
+    found = forward_selection(fitted(trials), ["dry", Delay("torque"), lag], refits=3)
+    assert found.selected == ("motor lag",)
+    assert np.isnan(found.best.predicted_cost)
     assert found.fit.names == (*FREE, "lag")
     assert found.fit.estimates["lag"] == pytest.approx(0.08, abs=0.004)
 
@@ -213,25 +213,25 @@ def test_another_system_with_a_state():
 @pytest.mark.slow
 def test_what_data_cannot_tell_is_said(rubbing):
     posed = {"input_bias": "torque"}
-    found = suspects(
+    found = forward_selection(
         fitted(rubbing.problem.trials, **posed), ["unused", Offset("torque"), Candidate("own", input_gain="torque")]
     )
-    verdicts = {row.name: row.verdict for row in found.rows}
-    assert verdicts["unused"] == "unused is not seen by these data"
-    assert verdicts["offset of torque"] == "offset of torque cannot be distinguished from what is free"
+    reasons = {row.name: row.reason for row in found.rounds[0]}
+    assert reasons["unused"] == "unused is not seen by these data"
+    assert reasons["offset of torque"] == "offset of torque cannot be distinguished from what is free"
     assert "unused" in str(found)
-    assert np.isnan(next(row for row in found.rows if row.name == "unused").errors["unused"])
+    assert np.isnan(next(row for row in found.rounds[0] if row.name == "unused").errors["unused"])
 
 
 @pytest.mark.slow
 def test_one_trial_alone(rubbing):
     alone = fitted(rubbing.problem.trials[:1])
-    found = suspects(alone, ["dry", "spring"])
+    found = forward_selection(alone, ["dry", "spring"])
     assert "nothing is left out" in found.headings[0]
-    assert np.isnan(found.rows[0].predicted)
-    assert found.taken == ("dry",)
+    assert np.isnan(found.rounds[0][0].held_out_cost)
+    assert found.selected == ("dry",)
     with pytest.raises(ValueError, match="one trial alone cannot be left out"):
-        suspects(alone, "dry", folds=2)
+        forward_selection(alone, "dry", folds=2)
 
 
 @pytest.mark.parametrize(
@@ -258,14 +258,14 @@ def test_one_trial_alone(rubbing):
 )
 def test_what_cannot_be_asked_is_named(rubbing, asked, options, message):
     with pytest.raises(ValueError, match=message):
-        suspects(rubbing, asked, **options)
+        forward_selection(rubbing, asked, **options)
 
 
 def test_what_is_asked_of_a_fit_at_a_minimum(rubbing):
-    with pytest.raises(TypeError, match="suspects takes a Fit"):
-        suspects(rubbing.problem, "dry")
+    with pytest.raises(TypeError, match="forward_selection takes a Fit"):
+        forward_selection(rubbing.problem, "dry")
     with pytest.raises(ValueError, match="has not converged"):
-        suspects(dataclasses.replace(rubbing, status="steps"), "dry")
+        forward_selection(dataclasses.replace(rubbing, status="steps"), "dry")
 
 
 def test_fits_beside_each_other(rubbing, found):
@@ -300,10 +300,10 @@ def test_fits_beside_each_other(rubbing, found):
 
 
 def test_a_page_of_the_report(found, tmp_path):
-    page = save_report(found.fit, tmp_path / "fit.html", suspects=found).read_text(encoding="utf-8")
+    page = save_report(found.fit, tmp_path / "fit.html", forward_selection=found).read_text(encoding="utf-8")
     assert "What may be missing" in page
     assert "no more than chance" in page
-    assert "Taken: dry" in found._repr_html_()
+    assert "Selected: dry" in found._repr_html_()
 
 
 @pytest.mark.parametrize("held", [("push",), ()])
@@ -344,15 +344,15 @@ def test_what_is_not_nested_is_no_matter_of_an_f_test(n, criterion):
     posed = {"optimizer": LeastSquares(), "simulation": Simulation(step=0.1)}
     right, wrong = (fit(system, trials, ["gain", "drift"], **posed) for system in (Squared(), Track()))
     asked = [Candidate("squared", system=Squared()), Offset("x"), Offset("push")]
-    found = suspects(wrong, asked, refits=1)
-    row = next(row for row in found.rows if row.name == "squared")
+    found = forward_selection(wrong, asked, refits=1)
+    row = next(row for row in found.rounds[0] if row.name == "squared")
     assert row.cost == pytest.approx(right.cost, rel=1e-4)
     assert row.cost < 0.1 * wrong.cost
-    assert (row.criterion, row.verdict, np.isnan(row.p)) == (criterion, "stands", True)
-    assert found.taken == ("squared",)
+    assert (row.criterion, row.accepted, np.isnan(row.p)) == (criterion, True, True)
+    assert found.selected == ("squared",)
     assert f"squared (not nested: by {criterion})" in found.conclusion
     assert criterion in str(found)
-    back = suspects(right, Candidate("not squared", system=Track()))
-    assert not back.taken
-    assert back.rows[0].criterion == criterion
-    assert suspects(wrong, asked, refits=0).rows[-1].verdict == "not nested, not fitted"
+    back = forward_selection(right, Candidate("not squared", system=Track()))
+    assert not back.selected
+    assert back.rounds[0][0].criterion == criterion
+    assert forward_selection(wrong, asked, refits=0).rounds[0][-1].reason == "not nested, not fitted"
