@@ -513,7 +513,7 @@ def _check(fit: Fit, depth: Any, refits: Any, level: float) -> None:
     if fit.problem.specification.noise is not None:
         raise ValueError(
             "forward_selection compares sums of squares of fits without process noise; this fit has process noise, "
-            "which makes up for what the model lacks. Fit without `noise`, or compare `marginal_likelihood` of two"
+            "which makes up for what the model lacks. Fit without `noise`, or compare `marginal_likelihood`."
         )
     if fit.status != "converged":
         raise ValueError(
