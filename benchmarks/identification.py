@@ -61,11 +61,11 @@ def noisy(t, channels, torque, rng, name, speed, offset=OFFSET):
 def unstable():
     truth, names = WhippleBicycle.benchmark(), ("IBxx", "zB", "c")
     trial = noisy(*ride(truth, 3.0, 10.0, 1), np.random.default_rng(0), "3 m/s", 3.0)
-    options = {"unknown": UNKNOWN, "sensor_bias": tuple(NOISE), "hold": ("steer_torque",)}
+    options = {"unknown": UNKNOWN, "sensor_bias": tuple(NOISE), "zero_order_hold": ("steer_torque",)}
     tight = {"roll": 1e-4, "steer": 1e-4, "roll_rate": 1e-3, "steer_rate": 1e-3, "rear_wheel_rate": 1e-4}
     for what, more in {
         "windows of 1 s with free starts": {"window": 1.0},
-        "windows of 1 s, chained": {"window": 1.0, "continuity": tight},
+        "windows of 1 s, chained": {"window": 1.0, "defect_std": tight},
         "a single shoot": {},
     }.items():
         problem = Problem.of(truth, trial, names, **more, **options)
@@ -90,7 +90,7 @@ def coverage(repetitions):
     for i, name in enumerate(EIGHT):
         value = getattr(truth, name) * (1.05 if i % 2 else 0.95)
         guess = eqx.tree_at(lambda b, name=name: getattr(b, name), guess, value)
-    options = {"unknown": UNKNOWN, "sensor_bias": tuple(NOISE), "hold": ("steer_torque",)}
+    options = {"unknown": UNKNOWN, "sensor_bias": tuple(NOISE), "zero_order_hold": ("steer_torque",)}
     first = None
     hits, scores, began = np.zeros(len(EIGHT), int), [], time.perf_counter()
     for k in range(repetitions):
@@ -118,7 +118,11 @@ def coverage(repetitions):
 def measured():
     recording = jk.data.steer_by_wire()
     rides, bicycle = recording.trials, WhippleBicycle.from_parameters(recording.parameters)
-    options = {"input_bias": ("roll_torque", "steer_torque"), "hold": ("steer_torque",), "optimizer": LeastSquares()}
+    options = {
+        "input_bias": ("roll_torque", "steer_torque"),
+        "zero_order_hold": ("steer_torque",),
+        "optimizer": LeastSquares(),
+    }
     four = (Gain("steer_torque"), "steer_damping", "IHzz", "c")
     for free in (("steer_damping",), four, four, (*four, "IBxx")):
         began = time.perf_counter()

@@ -108,7 +108,7 @@ def imu_on_the_frame(recording):
     bicycle = RobotBicycle.from_parameters(recording.parameters)
     # The recording's columns were turned into the frame's axes already, by hand: within three degrees.
     free = ("steer_damping", Free("place", scale=0.1), Free("mounting", prior=(0.0, 0.05)), LEAN)
-    options = {"window": 1.0, "unknown": STARTS, "hold": ("steer_torque",), **OFFSETS}
+    options = {"window": 1.0, "unknown": STARTS, "zero_order_hold": ("steer_torque",), **OFFSETS}
     return fit_bicycle(rides, bicycle, free, optimizer=LeastSquares(rtol=1e-4), **options)
 
 
@@ -121,7 +121,7 @@ def motor_and_fork(recording):
         bicycle,
         ("steer_damping", Gain("steer_torque"), "IHzz"),
         input_bias=("roll_torque", "steer_torque"),
-        hold=("steer_torque",),
+        zero_order_hold=("steer_torque",),
         optimizer=LeastSquares(rtol=1e-3),
         steps=20,
     )

@@ -59,10 +59,11 @@ def main():
     jk.configure()
     recording = jk.data.steer_by_wire()
     rides, bicycle = recording.trials, WhippleBicycle.from_parameters(recording.parameters)
-    biases, hold = ("roll_torque", "steer_torque"), ("steer_torque",)  # a command, kept until the next
+    # The steering torque is a command, kept until the next.
+    options = {"input_bias": ("roll_torque", "steer_torque"), "zero_order_hold": ("steer_torque",)}
     fits = {}
     for what, free in FREE.items():
-        fits[what] = fit_bicycle(rides, bicycle, free, input_bias=biases, hold=hold, optimizer=LeastSquares())
+        fits[what] = fit_bicycle(rides, bicycle, free, optimizer=LeastSquares(), **options)
         print(f"\n{what[0].upper()}{what[1:]}\n{fits[what]}")
     first = fits["the damping alone"]
     left_out = cross_validate(first)

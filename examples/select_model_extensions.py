@@ -79,7 +79,11 @@ def main():
     jk.configure()
     recording = jk.data.steer_by_wire()
     rides = recording.trials
-    options = {"input_bias": ("roll_torque", "steer_torque"), "hold": ("steer_torque",), "optimizer": LeastSquares()}
+    options = {
+        "input_bias": ("roll_torque", "steer_torque"),
+        "zero_order_hold": ("steer_torque",),
+        "optimizer": LeastSquares(),
+    }
     first = fit_bicycle(rides, Bicycle.from_parameters(recording.parameters), "steer_damping", **options)
     speeds = np.array([ride.initial["speed"][0] for ride in rides])
     by_speed = [np.flatnonzero(speeds == v).tolist() for v in np.unique(speeds)]

@@ -11,7 +11,7 @@ from jaxkane.fit._design import covariance_of, goal_of
 
 t = np.arange(0.0, 4.0, 0.1)
 SIGMA = {"x": 0.01}
-CHAIN = {"unknown": ("x", "x_dot"), "window": 1.0, "continuity": {"x": 0.002, "x_dot": 0.01}}
+CHAIN = {"unknown": ("x", "x_dot"), "window": 1.0, "defect_std": {"x": 0.002, "x_dot": 0.01}}
 C = jnp.array([1.0, 0.5])
 
 

@@ -94,7 +94,7 @@ def test_elimination_is_the_dense_solution():
     blocks = Blocks(jnp.linalg.qr(jnp.asarray(A), mode="r"), windows, n_z, 0, n_b)
     eliminated = eliminate(blocks, 0.0)
     x, least = eliminated.step(1e-14)
-    z, b = eliminated.others(x)
+    z, b = eliminated.back_substitute(x)
     dense = np.zeros((W * 20, W * n_z + 2 * n_b + n_x))
     for w in range(W):
         rows = slice(20 * w, 20 * w + 20)

@@ -11,11 +11,11 @@ import jaxkane as jk
 from jaxkane.catalog import WhippleBicycle
 from jaxkane.fit import (
     GradientDescent,
-    Intensity,
     LeastSquares,
+    NoiseScale,
     Problem,
-    Sigma,
     Simulation,
+    SpectralDensity,
     Trial,
     bicycle_priors,
     bicycle_problem,
@@ -59,7 +59,7 @@ def test_an_unstable_bicycle_from_ten_first_guesses(unstable):
     truth, trial, options = unstable
     names = ("IBxx", "zB", "c")
     tight = {"roll": 1e-4, "steer": 1e-4, "roll_rate": 1e-3, "steer_rate": 1e-3, "rear_wheel_rate": 1e-4}
-    problem = Problem.of(truth, trial, names, window=1.0, continuity=tight, **options)
+    problem = Problem.of(truth, trial, names, window=1.0, defect_std=tight, **options)
     found = multi_start(problem, 10, spread=0.3, seed=2)
     assert found.agreeing == 10
     for one in found.fits:
@@ -99,7 +99,7 @@ def measured():
     return recording.trials, WhippleBicycle.from_parameters(recording.parameters)
 
 
-OPTIONS = {"input_bias": ("roll_torque", "steer_torque"), "hold": ("steer_torque",)}
+OPTIONS = {"input_bias": ("roll_torque", "steer_torque"), "zero_order_hold": ("steer_torque",)}
 
 
 @pytest.mark.slow
@@ -119,10 +119,10 @@ def test_steer_damping_of_a_measured_bicycle_by_descent(measured):
 def test_what_noise_asks_for_is_taken_of_bicycles_too():
     t = np.linspace(0.0, 1.0, 11)
     ride = Trial(t, {"roll": 0.1 * t, "steer": 0.1 * t}, sigma=1.0, initial={"speed": 5.0})
-    free = ("c", Intensity("roll_rate"), Sigma("steer", start=0.02))
+    free = ("c", SpectralDensity("roll_rate"), NoiseScale("steer", start=0.02))
     options = {"noise": {"roll_rate": 0.1}, "simulation": Simulation(step=0.1)}
     problem = bicycle_problem(ride, WhippleBicycle.benchmark(), free, **options)
-    assert problem.parameters.names == ("c", "intensity of roll_rate", "sigma of steer")
+    assert problem.parameters.names == ("c", "spectral density of roll_rate", "noise scale of steer")
     with pytest.raises(ValueError, match="is estimated by its likelihood"):
         bicycle_problem(ride, WhippleBicycle.benchmark(), free)
 

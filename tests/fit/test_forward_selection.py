@@ -167,7 +167,7 @@ def test_one_sensor_is_off_in_all_trials():
 
 @pytest.mark.slow
 def test_a_known_start_is_off_in_all_trials():
-    trials = [trial.begun({"rate": 0.5 * (i % 3) + 0.1}) for i, trial in enumerate(record(4))]
+    trials = [trial.with_initial_state({"rate": 0.5 * (i % 3) + 0.1}) for i, trial in enumerate(record(4))]
     found = forward_selection(fitted(trials, unknown="angle"), [Offset("rate", of="start"), "dry", "quadratic"])
     assert found.selected == ("offset of start of rate",)
     assert found.fit.estimates["offset of start of rate"] == pytest.approx(-0.1, abs=0.01)
@@ -179,7 +179,7 @@ def test_a_torque_that_acts_late(hold):
     """By two samples of 0.05 s; of a held one the delay is found to where its mean is taken for it."""
     trials = record(5, late=2)
     asked = (Delay("torque"), Gain("torque"), "dry")
-    found = forward_selection(fitted(trials, hold=hold), asked, plausible={"delay of torque": (0.0, 0.3)})
+    found = forward_selection(fitted(trials, zero_order_hold=hold), asked, plausible={"delay of torque": (0.0, 0.3)})
     assert found.selected == ("delay of torque",)
     expected = 0.1 if not hold else 0.075  # what is linear between samples acts like what is held half a sample longer
     assert found.fit.estimates["delay of torque"] == pytest.approx(expected, abs=0.003)
@@ -309,7 +309,7 @@ def test_a_page_of_the_report(found, tmp_path):
 @pytest.mark.parametrize("held", [("push",), ()])
 def test_a_delay_of_what_is_held_is_asked_by_itself(held):
     """Its jumps are ramps: beside it no other candidate would be compared with the fit as it stands."""
-    problem = types.SimpleNamespace(system=None, model=types.SimpleNamespace(held=held))
+    problem = types.SimpleNamespace(system=None, model=types.SimpleNamespace(zero_order_hold=held))
     asked = [Candidate("a", "mass"), Candidate("late", Delay("push")), Candidate("b", "stiffness")]
     groups = [[c.name for c in group] for group in groups_of(types.SimpleNamespace(problem=problem), asked)]
     assert groups == ([["a", "b"], ["late"]] if held else [["a", "late", "b"]])

@@ -91,7 +91,7 @@ def test_the_score_is_relative_to_the_data_and_not_to_the_first_guess():
 
 def test_reported_starts_are_those_of_the_motion():
     """With a gain and an offset of what is known of the starts."""
-    trial = TRIAL.begun({"x": 0.5, "x_dot": 0.2})
+    trial = TRIAL.with_initial_state({"x": 0.5, "x_dot": 0.2})
     free = (Gain("x_dot", of="start"), Offset("x", of="start", prior=(0.3, 0.05)))
     found = fit(Track(), trial, free, unknown={"x": 0.1}, simulation=STEP, optimizer=LeastSquares())
     (start,) = (values["start of x"] for values in found.nuisance.values())

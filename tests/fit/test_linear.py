@@ -198,7 +198,7 @@ def test_errors_by_window():
     np.testing.assert_allclose(list(found.estimates.values()), best[:2], rtol=TIGHT)
     np.testing.assert_allclose(found.clustered_covariance, C[:2, :2], rtol=1e-4)
     # With links between them windows are no longer apart.
-    chained = fitted(records, *FREE, window=1.0, continuity={"x": 0.1, "x_dot": 0.1})
+    chained = fitted(records, *FREE, window=1.0, defect_std={"x": 0.1, "x_dot": 0.1})
     assert chained.clusters == ("", 0)
     assert np.all(np.isnan(chained.clustered_covariance))
 

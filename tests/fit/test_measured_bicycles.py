@@ -43,7 +43,11 @@ def steered():
 @pytest.mark.slow
 def test_the_damping_of_the_robot_bicycle(steered):
     bicycle = WhippleBicycle.from_parameters(jk.data.robot_bicycle().parameters)
-    options = {"unknown": STARTS, "input_bias": {"roll_torque": 10.0, "steer_torque": 0.5}, "hold": ("steer_torque",)}
+    options = {
+        "unknown": STARTS,
+        "input_bias": {"roll_torque": 10.0, "steer_torque": 0.5},
+        "zero_order_hold": ("steer_torque",),
+    }
     found = fit_bicycle(steered, bicycle, "steer_damping", optimizer=LeastSquares(), **options)
     assert found.status == "converged"
     # The linear model's 465 are of twice as many samples.

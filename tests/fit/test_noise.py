@@ -21,14 +21,13 @@ from jaxkane.fit import (
     Fit,
     Free,
     GradientDescent,
-    Intensity,
     LeastSquares,
+    NoiseScale,
     Problem,
-    Sigma,
     Simulation,
+    SpectralDensity,
     Trial,
     compare,
-    find_continuity,
     fit,
     load,
     log_density,
@@ -46,7 +45,7 @@ SIGMA = {"x": 0.02, "x_dot": 0.1}
 START, DEVIATION = np.array([0.4, 0.1]), np.array([0.1, 0.2])
 T = np.sort(np.append(np.arange(0.0, 2.0, 0.1), [0.734, 1.61]))  # irregular
 N = T.size
-FREE = ("stiffness", "damping", Intensity("x_dot"), Sigma("x"))
+FREE = ("stiffness", "damping", SpectralDensity("x_dot"), NoiseScale("x"))
 OPTIONS = {"unknown": {"x": DEVIATION[0], "x_dot": DEVIATION[1]}, "noise": {"x_dot": Q}}
 TIGHT = Simulation(rtol=1e-10)
 
@@ -171,11 +170,11 @@ def test_the_fit_is_the_maximum(case, found):
     assert -2 * marginal_likelihood(found) == pytest.approx(found.cost, rel=1e-12)
     errors = np.array(list(found.standard_errors.values()))
     assert np.all(np.abs(np.array(list(found.estimates.values())) - values(best.x)) < 0.02 * errors)
-    assert list(found.estimates) == ["stiffness", "damping", "intensity of x_dot", "sigma of x"]
+    assert list(found.estimates) == ["stiffness", "damping", "spectral density of x_dot", "noise scale of x"]
     # What is printed and drawn is of innovations.
     assert "-2 log likelihood" in str(found)
     assert "normalized innovations" in report(found)
-    assert found.innovation == pytest.approx(1.0, abs=0.3)
+    assert found.mean_normalized_innovation_squared == pytest.approx(1.0, abs=0.3)
     assert found.variance == 1.0
     # How large noise is nobody knows beforehand: nothing is implausible.
     assert compare({"one": found}).objections["one"] == ()
@@ -199,7 +198,7 @@ def test_a_fit_is_saved(case, found, tmp_path):
     again = load(found.save(tmp_path / "fit.npz"), case[2])
     assert again.estimates == found.estimates
     assert again.cost == found.cost
-    assert again.innovation == found.innovation
+    assert again.mean_normalized_innovation_squared == found.mean_normalized_innovation_squared
     quiet = dataclasses.replace(case[2], model=dataclasses.replace(case[2].model, noise=None))
     with pytest.raises(ValueError, match="process noise"):
         load(tmp_path / "fit.npz", quiet)
@@ -276,29 +275,29 @@ def test_what_cannot_be_noise():
         return Problem.of(Cart(), trial, free, **({"noise": {"x_dot": 0.1}} | options))
 
     for noise, said in (
-        ({"x_dot": -0.1}, "not negative and finite; got -0.1"),
+        ({"x_dot": -0.1}, "not negative, and finite; got -0.1"),
         ({"x_dot": np.nan}, "not negative"),
-        ({"x_dot": [0.1, 0.2]}, "the intensity of x_dot must be a real number"),
+        ({"x_dot": [0.1, 0.2]}, "the spectral density of x_dot must be a real number"),
         ({"x": 0.1}, "A coordinate follows"),
         ({"xdot": 0.1}, "x_dot"),
     ):
         with pytest.raises(ValueError, match=said):
             posed(noise=noise)
-    with pytest.raises(TypeError, match="dict of intensities"):
+    with pytest.raises(TypeError, match="dict of spectral densities"):
         posed(noise=0.1)
     for free, said in (
-        (Intensity("push"), "`noise` has"),
-        (Sigma("roll"), "measured channels"),
-        (Intensity("x_dot", start=0.0), "positive"),
-        (Sigma("x", start=-1.0), "positive"),
-        (Sigma("x", bounds=(-1.0, 2.0)), "below zero"),
-        ((Intensity("x_dot"), Intensity("x_dot")), "twice"),
+        (SpectralDensity("push"), "`noise` has"),
+        (NoiseScale("roll"), "measured channels"),
+        (SpectralDensity("x_dot", start=0.0), "positive"),
+        (NoiseScale("x", start=-1.0), "positive"),
+        (NoiseScale("x", bounds=(-1.0, 2.0)), "below zero"),
+        ((SpectralDensity("x_dot"), SpectralDensity("x_dot")), "twice"),
     ):
         with pytest.raises(ValueError, match=said):
             posed(free)
     with pytest.raises(ValueError, match="least squares: give `noise`"):
-        posed(Sigma("x"), noise=None)
-    for more in ({"window": 0.5}, {"window": 0.5, "continuity": {}}):
+        posed(NoiseScale("x"), noise=None)
+    for more in ({"window": 0.5}, {"window": 0.5, "defect_std": {}}):
         with pytest.raises(ValueError, match="two ways"):
             posed(**more)
 
@@ -324,7 +323,7 @@ def test_biases_inputs_and_several_trials():
         exact += e @ np.linalg.solve(C, e) + np.linalg.slogdet(2 * np.pi * C)[1]
         estimates.append(bias * (of_bias[seen] @ np.linalg.solve(C, e)))
     options = OPTIONS | {"noise": {"push": of_push, "x_dot": Q}, "sensor_bias": {"x": bias}}
-    problem = Problem.of(cart, trials, ("stiffness", Intensity("push")), simulation=TIGHT, **options)
+    problem = Problem.of(cart, trials, ("stiffness", SpectralDensity("push")), simulation=TIGHT, **options)
     assert cost(problem, problem.start) == pytest.approx(exact, rel=EXACT)
     held = applied(problem, problem.start)
     assert held.parameters.units[1] == ""  # of a push without a declared unit
@@ -353,7 +352,7 @@ def linked(y, t, values, jump, factor=1.0):
 
 @pytest.mark.slow
 def test_windows_with_their_log_determinant_are_a_filter():
-    """As short as the samples, linked by what disturbs them; their deviations are found with that of the sensor."""
+    """As short as the samples, linked by what disturbs them."""
     t, jump = np.arange(0.0, 3.0, 0.1), np.array([0.01, 0.15])
     rng, state, rows = np.random.default_rng(8), START + DEVIATION * np.random.default_rng(7).normal(size=2), []
     Phi, _ = transition(0.1, STIFFNESS, DAMPING, 0.0)
@@ -364,25 +363,15 @@ def test_windows_with_their_log_determinant_are_a_filter():
     y = dict(zip(SIGMA, (np.array(rows) + noise).T, strict=True))
     options = {"unknown": OPTIONS["unknown"], "window": 0.05, "simulation": TIGHT}
     begun = {"x": 0.02, "x_dot": 0.1}
-    # The parameters are held by their priors, so that both are functions of the deviations alone.
+    # The parameters are held by their priors, so that both are known.
     free = [Free(name, prior=(x, 1e-7)) for name, x in (("stiffness", STIFFNESS), ("damping", DAMPING))]
-    first = fit(Cart(), trial_of(y, t), free, continuity=begun, optimizer=LeastSquares(rtol=1e-12), **options)
+    first = fit(Cart(), trial_of(y, t), free, defect_std=begun, optimizer=LeastSquares(rtol=1e-12), **options)
     values = (STIFFNESS, DAMPING)
     exact = linked(y, t, values, list(begun.values()))
     assert -2 * marginal_likelihood(first) == pytest.approx(exact, rel=1e-7)
     # So they are of a filter.
     quiet = fit(Cart(), trial_of(y, t), free, noise={"x_dot": 0.1}, simulation=TIGHT, unknown=OPTIONS["unknown"])
     assert -2 * marginal_likelihood(quiet) == pytest.approx(minus_twice_log_likelihood(y, q=0.1, t=t), rel=1e-7)
-    found = find_continuity(first, sigma=("x",))
-    by_logarithms = lambda p: linked(y, t, values, np.exp(p[:2]), np.exp(p[2]))  # noqa: E731
-    least = scipy.optimize.minimize(by_logarithms, np.log([*begun.values(), 1.0]), method="Nelder-Mead")
-    assert -2 * marginal_likelihood(found) == pytest.approx(least.fun, abs=1e-3)
-    assert found.problem.specification.continuity["x_dot"] == pytest.approx(np.exp(least.x[1]), rel=0.05)
-    assert found.problem.trials[0].sigma["x"][0] == pytest.approx(SIGMA["x"] * np.exp(least.x[2]), rel=0.05)
-    with pytest.raises(ValueError, match="no windows are linked"):
-        find_continuity(quiet)
-    with pytest.raises(ValueError, match="roll"):
-        find_continuity(first, sigma=("roll",))
 
 
 class Dragged(Cart):

@@ -7,7 +7,19 @@ import pytest
 from systems import POSED, TRIAL, Track
 
 import jaxkane as jk
-from jaxkane.fit import Delay, Free, Gain, Intensity, LeastSquares, Offset, Problem, Sigma, Trial, fit, profile
+from jaxkane.fit import (
+    Delay,
+    Free,
+    Gain,
+    LeastSquares,
+    NoiseScale,
+    Offset,
+    Problem,
+    SpectralDensity,
+    Trial,
+    fit,
+    profile,
+)
 from jaxkane.fit._bijections import Interval, log_gaussian_mass
 from jaxkane.fit._compare import plausible_of
 from jaxkane.fit._parameters import parameters_of
@@ -113,10 +125,18 @@ def test_a_start_on_a_given_bound_is_searched_from_inside(bounds, begins):
 
 
 def test_what_is_plausible_does_not_follow_from_where_a_search_starts():
-    free = ("gain", Intensity("x_dot"), Sigma("x", bounds=(0.1, 10.0)), Intensity("push", prior=(1.0, 0.1)))
+    free = (
+        "gain",
+        SpectralDensity("x_dot"),
+        NoiseScale("x", bounds=(0.1, 10.0)),
+        SpectralDensity("push", prior=(1.0, 0.1)),
+    )
     parameters = parameters_of(Track(), free, {"x_dot": 0.2, "push": 1.0}, ("x",))
-    assert {*plausible_of(parameters, {}).ranges} == {"sigma of x", "intensity of push"}
-    assert plausible_of(parameters, {"intensity of x_dot": (0.1, 0.3)}).ranges["intensity of x_dot"] == (0.1, 0.3)
+    assert {*plausible_of(parameters, {}).ranges} == {"noise scale of x", "spectral density of push"}
+    assert plausible_of(parameters, {"spectral density of x_dot": (0.1, 0.3)}).ranges["spectral density of x_dot"] == (
+        0.1,
+        0.3,
+    )
 
 
 def test_friction_that_starts_at_its_bound_is_found():

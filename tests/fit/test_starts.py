@@ -171,7 +171,7 @@ def test_four_unknown_euler_parameters_are_three_degrees_of_freedom(system, wind
     begun = np.array([found.nuisance["trial"][f"start of {name}"] for name in E])
     np.testing.assert_allclose(np.sum(begun**2, axis=0), 1.0, atol=1e-5)
     # Of the unknowns of a window the norm alone is not measured, and is counted among what is given.
-    windows = len(problem.places)
+    windows = len(problem.slices)
     assert problem.size == (4 * 41 + windows, 1 + 7 * windows)
 
 

@@ -51,7 +51,7 @@ def test_a_chain_is_the_dense_solution():
     blocks = Blocks(jnp.linalg.qr(jnp.asarray(A), mode="r"), windows, n_z, n_z, n_b)
     eliminated = eliminate(blocks, 0.0)
     x, least = eliminated.step(1e-14)
-    z, b = eliminated.others(x)
+    z, b = eliminated.back_substitute(x)
     dense = np.zeros((W * 20, W * n_z + 2 * n_b + n_x))
     for w in range(W):
         rows = slice(20 * w, 20 * w + 20)
@@ -83,7 +83,7 @@ def test_short_chained_windows_are_a_kalman_filter():
         "mass",
         unknown=start,
         window=0.05,
-        continuity=jump,
+        defect_std=jump,
         simulation=Simulation(rtol=1e-10, atol=1e-10, solver=None),
     )
     least = solve_nuisance(problem, problem.start, rtol=1e-12)[1].cost  # over all starts, the mass held
@@ -214,7 +214,7 @@ def test_process_noise_is_taken_for_what_it_is():
     options = {"unknown": ("x", "x_dot"), "window": 0.25}
     jump = {"x": 0.005, "x_dot": 0.05}
     names = ("mass", "stiffness", "damping")
-    chained = minimize(Problem.of(GUESS, trials, names, continuity=jump, **options), LeastSquares())
+    chained = minimize(Problem.of(GUESS, trials, names, defect_std=jump, **options), LeastSquares())
     near(chained)
     assert 0.5 < chained.variance < 2.0
 
@@ -227,7 +227,7 @@ def test_the_delay_of_what_is_held():
     ride = jk.simulate(TRUTH, jk.assemble(TRUTH, {"x": 0.2}), t, held)
     noise = np.random.default_rng(3).normal(0.0, 1e-3, t.size)
     trial = Trial(t, {"x": ride["x"] + noise}, push, sigma=1e-3, initial={"x": 0.2})
-    problem = Problem.of(TRUTH, trial, Delay("push"), hold=("push",))
+    problem = Problem.of(TRUTH, trial, Delay("push"), zero_order_hold=("push",))
     found = minimize(problem, LeastSquares())
     error = found.standard_errors["delay of push"]
     assert abs(found.estimates["delay of push"] - 0.033) < 3 * error < 0.01
@@ -252,14 +252,14 @@ def test_windows_receive_what_acted_long_before(options, delay):
     point = (
         jax.tree.map(lambda x: x + more, point) if "input_delay" in options else problem.at({"delay of push": delay})
     )
-    for (_, i, n), window in zip(problem.places, _windows(problem), strict=True):
+    for (_, i, n), window in zip(problem.slices, _windows(problem), strict=True):
         roles = problem.parameters.apply(TRUTH, point.x)[1]
         push = problem.model.signals(window, point.b[0], roles)["push"]
         np.testing.assert_allclose(jax.vmap(push)(trial.t[i : i + n]), acted[i : i + n], atol=tolerance)
 
 
 def _windows(problem):
-    return [jax.tree.map(lambda x, i=i: x[i], problem.windows) for i in range(len(problem.places))]
+    return [jax.tree.map(lambda x, i=i: x[i], problem.windows) for i in range(len(problem.slices))]
 
 
 def test_windows_keep_what_the_bounds_of_a_delay_ask_for():

@@ -11,12 +11,12 @@ from jaxkane.fit import (
     Free,
     Gain,
     Inertia,
-    Intensity,
     LeastSquares,
+    NoiseScale,
     Offset,
     Problem,
-    Sigma,
     Simulation,
+    SpectralDensity,
     Trial,
     bicycle_problem,
     cross_validate,
@@ -157,7 +157,7 @@ GAP = np.concatenate([np.arange(0.0, 1.0, 0.1), [3.1], np.arange(5.0, 6.0, 0.1)]
 @pytest.mark.parametrize("times", [t, np.append(-1.0, t), GAP, t**2], ids=["even", "first alone", "gap", "uneven"])
 @pytest.mark.parametrize("window", [0.1, 0.12, 0.25, 0.95, 3.0])
 def test_no_window_loses_a_sample(times, window):
-    places = Problem.of(pendulum, trial(t=times, measured={"theta1": np.sin(times)}), "mass", window=window).places
+    places = Problem.of(pendulum, trial(t=times, measured={"theta1": np.sin(times)}), "mass", window=window).slices
     assert [i for _, first, n in places for i in range(first, first + n)] == [*range(len(times))]
     assert all(n > 1 for *_, n in places)
 
@@ -168,12 +168,12 @@ def test_a_window_shorter_than_the_samples_is_refused(window):
         ValueError, match=r"swing 3: its times are 0\.1 s apart, so a `window` of 0\.0.* holds one sample"
     ):
         Problem.of(pendulum, trial(), "mass", window=window)
-    assert len(Problem.of(pendulum, trial(), "mass", unknown="theta1", window=window, continuity={}).places) == 10
+    assert len(Problem.of(pendulum, trial(), "mass", unknown="theta1", window=window, defect_std={}).slices) == 10
 
 
 def test_windows_cover_every_sample_once():
     problem = Problem.of(pendulum, [trial(), trial(t=2 * t)], "mass", window=0.4)
-    assert problem.places == ((0, 0, 4), (0, 4, 7), (1, 0, 2), (1, 2, 2), (1, 4, 2), (1, 6, 2), (1, 8, 3))
+    assert problem.slices == ((0, 0, 4), (0, 4, 7), (1, 0, 2), (1, 2, 2), (1, 4, 2), (1, 6, 2), (1, 8, 3))
     assert int(jnp.sum(problem.windows.weight > 0)) == 22
     assert bool(jnp.all(jnp.diff(problem.windows.t_input, axis=1) > 0))
 
@@ -183,8 +183,8 @@ ENTRIES = {
     "Gain": lambda **more: Gain("shoulder_torque", **more),
     "Offset": lambda **more: Offset("theta1", **more),
     "Delay": lambda **more: Delay("shoulder_torque", **more),
-    "Intensity": lambda **more: Intensity("theta1_dot", **more),
-    "Sigma": lambda **more: Sigma("theta1", **more),
+    "SpectralDensity": lambda **more: SpectralDensity("theta1_dot", **more),
+    "NoiseScale": lambda **more: NoiseScale("theta1", **more),
 }
 NAN, INF = float("nan"), float("inf")
 NO_NUMBERS = ["text", "1.0", True, 1j, [1.0, 2.0], {}]
@@ -196,7 +196,7 @@ def pose(free="mass", trials=None, **options):
 
 
 def entry(kind, **more):
-    noise = {"theta1_dot": 1.0} if kind in ("Intensity", "Sigma") else None
+    noise = {"theta1_dot": 1.0} if kind in ("SpectralDensity", "NoiseScale") else None
     return pose(ENTRIES[kind](**more), noise=noise)
 
 
@@ -246,11 +246,11 @@ def test_what_is_no_number_is_refused_where_something_is_freed(kind):
         (lambda x: LeastSquares(horizons=(x,)), "LeastSquares: .*`horizons`"),
         (lambda x: BFGS(rtol=x), "BFGS: `rtol`"),
         (lambda x: check_level(x), "`level`"),
-        (lambda x: pose(noise={"theta1_dot": x}), "`noise`: the intensity of theta1_dot"),
+        (lambda x: pose(noise={"theta1_dot": x}), "`noise`: the spectral density of theta1_dot"),
         (lambda x: pose(unknown={"theta1": x}), "`unknown`: the standard deviation of theta1"),
         (
-            lambda x: pose(unknown="theta1", window=0.5, continuity={"theta1": x}),
-            "`continuity`: the standard deviation",
+            lambda x: pose(unknown="theta1", window=0.5, defect_std={"theta1": x}),
+            "`defect_std`: the standard deviation",
         ),
         (lambda x: pose(sensor_gain={"theta1": x}), "`sensor_gain`: the standard deviation"),
         (lambda x: pose(priors={"mass": (1.0, x)}), "mass: a prior is"),
@@ -282,9 +282,9 @@ def test_known_values_of_a_trial_are_real_numbers(group, bad):
         (lambda x: pose(simulation=x), "`simulation=`"),
         (lambda x: pose(noise=x), "`noise`"),
         (lambda x: pose(priors=x), "`priors`"),
-        (lambda x: pose(window=0.5, continuity=x), "`continuity`"),
+        (lambda x: pose(window=0.5, defect_std=x), "`defect_std`"),
         (lambda x: pose(unknown=x), "Names are strings"),
-        (lambda x: pose(hold=x), "Names are strings"),
+        (lambda x: pose(zero_order_hold=x), "Names are strings"),
         (lambda x: Problem.of(x, trial(), "mass"), "`system`"),
         (lambda x: fit_bicycle(x, BICYCLE, "c"), "`trials`"),
         (lambda x: fit_bicycle(bicycle_ride(), x, "c"), "`bicycle`"),

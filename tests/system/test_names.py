@@ -175,7 +175,15 @@ ONE_NAME = {
     ),
 } | {
     f"fit, {argument}": lambda one, ride, argument=argument: _posed(**{argument: one})
-    for argument in ("hold", "unknown", "sensor_bias", "sensor_gain", "input_bias", "input_gain", "input_delay")
+    for argument in (
+        "zero_order_hold",
+        "unknown",
+        "sensor_bias",
+        "sensor_gain",
+        "input_bias",
+        "input_gain",
+        "input_delay",
+    )
 }
 TRIAL_OF_A_BODY = jk.fit.Trial(T, {"omega1": 0.1 * T}, sigma=0.1)
 
@@ -188,7 +196,9 @@ def test_one_name_alone_is_a_name_and_not_its_letters(ask, ride):
 
 def test_one_name_alone_says_the_same_as_a_list_of_it():
     assert (
-        _posed(hold="shoulder_torque").model.held == _posed(hold=["shoulder_torque"]).model.held == ("shoulder_torque",)
+        _posed(zero_order_hold="shoulder_torque").model.zero_order_hold
+        == _posed(zero_order_hold=["shoulder_torque"]).model.zero_order_hold
+        == ("shoulder_torque",)
     )
     models = [
         jk.stability.linearize(PENDULUM, jk.State(np.zeros(2), np.zeros(2)), outputs=o) for o in ("theta2", ["theta2"])

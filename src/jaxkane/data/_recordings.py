@@ -99,7 +99,8 @@ def steer_by_wire(*, seconds: float = 1.0, file: File = None) -> Recording:
     """A riderless steer-by-wire bicycle on a treadmill, pushed and left to its controller (TU Delft); 31 rides.
 
     Channels `roll`, `steer` [rad], `roll_rate`, `steer_rate` [rad/s], 100 Hz; roll is the estimate of a filter on the
-    bicycle. Input `steer_torque` [N m]: the motor's command, kept until the next (`fit(..., hold=("steer_torque",))`).
+    bicycle. Input `steer_torque` [N m]: the motor's command, kept until the next: a
+    zero-order hold, `fit(..., zero_order_hold=("steer_torque",))`.
     `initial["speed"]`: the treadmill's [m/s]. The first `seconds` of each ride are taken; its authors use one.
 
     `parameters`: in Meijaard's names, for `WhippleBicycle.from_parameters`. Masses, lengths and the wheels' inertias
@@ -229,8 +230,8 @@ def _with_rates(trial: Trial, step: float = 0.002, window: int = 25) -> Trial:
     for name, y in trial.measured.items():
         slopes = np.asarray(savgol_filter(np.interp(even, trial.t, y), window, 3, deriv=1, delta=step))
         rates[name.replace("angle", "rate")] = np.interp(trial.t, even, slopes)
-    return trial.begun(rates)
+    return trial.with_initial_state(rates)
 
 
 def _with_median_speed(trial: Trial) -> Trial:
-    return trial.begun({"speed": float(np.median(trial.initial["speed"]))})
+    return trial.with_initial_state({"speed": float(np.median(trial.initial["speed"]))})

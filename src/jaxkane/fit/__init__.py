@@ -11,9 +11,9 @@ from ._declarations import Delay as Delay
 from ._declarations import Free as Free
 from ._declarations import Gain as Gain
 from ._declarations import Inertia as Inertia
-from ._declarations import Intensity as Intensity
+from ._declarations import NoiseScale as NoiseScale
 from ._declarations import Offset as Offset
-from ._declarations import Sigma as Sigma
+from ._declarations import SpectralDensity as SpectralDensity
 from ._declarations import inertia_of as inertia_of
 from ._density import log_density as log_density
 from ._design import Design as Design
@@ -39,7 +39,6 @@ from ._optimizers import BFGS as BFGS
 from ._optimizers import GradientDescent as GradientDescent
 from ._optimizers import LeastSquares as LeastSquares
 from ._posterior import Laplace as Laplace
-from ._posterior import find_continuity as find_continuity
 from ._posterior import laplace as laplace
 from ._posterior import marginal_likelihood as marginal_likelihood
 from ._problem import Problem as Problem

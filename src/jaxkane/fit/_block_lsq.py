@@ -110,7 +110,7 @@ class Eliminated(eqx.Module):
         return solve_triangular(R[:n, :n], -R[:n, n]), R[n, n] ** 2
 
     @jax.jit
-    def others(self, x: Array) -> tuple[Array, Array]:
+    def back_substitute(self, x: Array) -> tuple[Array, Array]:
         """z (W, n_z) and b (T, n_b) that go with a step x."""
         n_z = self.z_rows.shape[2]
 

@@ -16,7 +16,7 @@ from ._bijections import Interval
 from ._declarations import Delay, Free, Shared
 from ._model import Simulation, Unknowns
 from ._parameters import Part, as_items, parameters_of
-from ._problem import Names, Problem, Specification, deviations_by_name
+from ._problem import Names, Problem, ProblemSpec, deviations_by_name
 from ._result import Fit
 from ._statistics import values_of
 
@@ -170,10 +170,10 @@ def _held_and_late(fit: Fit, candidate: Candidate) -> set[str]:
     late = {item.what for item in candidate.items if isinstance(item, Delay)} | {
         *deviations_by_name(candidate.input_delay)
     }
-    return late & {*fit.problem.model.held}
+    return late & {*fit.problem.model.zero_order_hold}
 
 
-def posed_with(fit: Fit, candidates: Sequence[Candidate]) -> Specification:
+def posed_with(fit: Fit, candidates: Sequence[Candidate]) -> ProblemSpec:
     """What the fit was asked, with these candidates in it.
 
     **Raises:** `ValueError` where two of them free the same differently, or are of systems that exclude each other.

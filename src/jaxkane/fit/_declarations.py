@@ -115,8 +115,8 @@ class Delay(Shared):
 
 
 @dataclasses.dataclass(frozen=True)
-class Intensity:
-    """The intensity of the process noise of a speed, a state or an input, common to all trials: see `noise` in `fit`.
+class SpectralDensity:
+    """The spectral density of the process noise of a speed, a state or an input: see `noise` in `fit`.
 
     `of`: the name of an independent speed or a state, [unit^2/s], or of an input, [unit^2 s], that stands in `noise`.
     `start`: by default what stands there. It stays positive; the rest as in `Free`.
@@ -132,7 +132,7 @@ class Intensity:
 
 
 @dataclasses.dataclass(frozen=True)
-class Sigma:
+class NoiseScale:
     """The factor by which `Trial.sigma` of a channel is to be multiplied, common to all trials, in a fit with `noise`.
 
     `channel`: its name. Where `sigma` was given as 1, the factor is the standard deviation in the channel's unit. It

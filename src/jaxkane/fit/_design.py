@@ -39,7 +39,7 @@ def goal_of(
     limits: Mapping[str, float],
 ) -> Goal:
     """The criterion of optimal design, as a function that JAX can differentiate."""
-    point, chained = problem.start, problem.model.nuisance.chained
+    point, chained = problem.start, problem.model.nuisance.has_defects
     fixed = None if chained else starts_of(problem.model, problem.windows, point)
     bounds = jnp.asarray([limits.get(c, np.inf) for c in problem.channels], t.dtype)
     # Windows take their samples from the trial's; where a sample stands in it does not change.
@@ -81,7 +81,7 @@ def _information(
     By normal equations, whose derivatives, unlike a QR decomposition's, always exist.
     """
     n_z, n_b, p = point.z.shape[1], point.b.shape[1], point.x.shape[0]
-    n_next = n_z if model.nuisance.chained else 0
+    n_next = n_z if model.nuisance.has_defects else 0
 
     def of_window(arguments):
         window, z, b, start, start_dot = arguments
@@ -206,7 +206,7 @@ def design(
     - `free`: the parameters, as in `fit`; `about`: the names of those that matter, by default all.
     - `sigma`: the channels that will be measured, and the standard deviation of their noise.
     - `initial`: of the trial. `options`: as in `fit`: `unknown`, `window`, `input_bias`, ... With `window` alone every
-        window begins as `initial` says; with `continuity` the plan is one motion, cut into windows.
+        window begins as `initial` says; with `defect_std` the plan is one motion, cut into windows.
     - `rms`: root mean squares that inputs are scaled to, by name. `limits`: magnitudes that channels should not exceed.
     - `steps`, `rate`: of Adam on the coefficients.
 
@@ -262,13 +262,13 @@ class _Plan:
         """The trial with what the system would do as its measurements."""
         rows = _joined(problem, [np.asarray(x) for x in found.simulated])
         trial = self.trial(found.coefficients, dict(zip(problem.channels, rows, strict=True)))
-        if not problem.model.nuisance.chained:
+        if not problem.model.nuisance.has_defects:
             return trial
         # Every window is known to begin where the motion is.
         rides = dataclasses.replace(problem, windows=found.windows).trajectories(problem.start)
         moves = _joined(problem, [np.concatenate([ride.q, ride.u, ride.x], axis=1).T for ride in rides])
         known = dict(zip(state_names(problem.system), moves, strict=True))
-        return trial.begun(known)
+        return trial.with_initial_state(known)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -318,5 +318,5 @@ def _descended(
 
 def _joined(problem: Problem, of_windows: Sequence[np.ndarray]) -> np.ndarray:
     """Rows (m, n_t) of the whole trial from those of its windows."""
-    pairs = zip(of_windows, problem.places, strict=True)
+    pairs = zip(of_windows, problem.slices, strict=True)
     return np.concatenate([rows[:, :n] for rows, (_, _, n) in pairs], axis=1)

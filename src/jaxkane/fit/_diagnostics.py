@@ -269,11 +269,11 @@ def wrong_noise(fit: Fit) -> list[str]:
     if fit.problem.model.noise is None:
         return []
     n = sum(int(np.isfinite(r).sum()) for channels in fit.residuals.values() for r in channels.values())
-    if not abs(fit.innovation - 1) > 4 * (2 / n) ** 0.5:
+    if not abs(fit.mean_normalized_innovation_squared - 1) > 4 * (2 / n) ** 0.5:
         return []
     return [
-        f"The innovations have the mean square {fit.innovation:.2f}, where the noise as it was given says one: the "
-        "standard errors are wrong. Have intensities and `sigma` found: Intensity(...), Sigma(...) among `free`."
+        f"The innovations have the mean square {fit.mean_normalized_innovation_squared:.2f}, where the noise as it was "
+        "given says one: standard errors are wrong. Estimate them: SpectralDensity(...), NoiseScale(...) among `free`."
     ]
 
 

@@ -56,9 +56,9 @@ def fit(
     input_gain: Names = (),
     input_delay: Names = (),
     priors: Mapping[str, Prior] | None = None,
-    hold: Sequence[str] = (),
+    zero_order_hold: Sequence[str] = (),
     window: float | None = None,
-    continuity: Mapping[str, float] | None = None,
+    defect_std: Mapping[str, float] | None = None,
     noise: Mapping[str, float] | None = None,
     processes: bool = False,
     simulation: Simulation | None = None,
@@ -86,18 +86,18 @@ def fit(
         (None: no prior).
     - `priors`: (mean, standard deviation) by name, of parameters that were measured elsewhere; names that are not free
         are passed over.
-    - `hold`: inputs under a zero-order hold, which keep each sample until the next; the others are linear
+    - `zero_order_hold`: inputs under a zero-order hold, which keep each sample until the next; the others are linear
         between their samples.
     - `window` [s]: cut the trials into windows of this length, each with its own unknown start (multiple shooting), as
         unstable motions need, and of two samples at least. By default a trial is one window (single shooting).
-    - `continuity`: by name, the standard deviation of the jump from a window's end to the next one's start, for what is
+    - `defect_std`: by name, the standard deviation of the jump from a window's end to the next one's start, for what is
         `unknown`; names left out jump freely. Small ones ask for one motion through all windows; with windows as short
         as the samples they are a process noise, and the sum of squares is that of a Kalman filter's prediction errors.
-    - `noise`: by name, intensities of the white noise that disturbs independent speeds and states [unit^2/s] and inputs
-        [unit^2 s]. The motion is then a random one, the cost is minus twice the log likelihood by an extended Kalman
-        filter, and `Intensity` and `Sigma` in `free` have intensities and the sensors' deviations found. {} for no
-        noise but the sensors'. `unknown` starts with a deviation are what the filter begins with, those without are
-        found; `window` is not needed, since the filter follows an unstable motion too.
+    - `noise`: by name, spectral densities of the white noise that disturbs independent speeds and states [unit^2/s] and
+        inputs [unit^2 s]. The motion is then a random one, the cost is minus twice the log likelihood by an extended
+        Kalman filter, and `SpectralDensity` and `NoiseScale` in `free` estimate these and the sensors' deviations. {}
+        for no noise but the sensors'. `unknown` starts with a deviation are what the filter begins with, those without
+        are estimated; `window` is not needed, since the filter follows an unstable motion too.
     - `processes`: let all processes of `jax.distributed` simulate together. Each is started with the same script,
         calls `jax.distributed.initialize(...)` before anything else, and this with all trials; each simulates a share
         of the windows, all take the same steps and return the same `Fit`, that of one process alone.
@@ -121,9 +121,9 @@ def fit(
         input_gain=input_gain,
         input_delay=input_delay,
         priors=priors,
-        hold=hold,
+        zero_order_hold=zero_order_hold,
         window=window,
-        continuity=continuity,
+        defect_std=defect_std,
         noise=noise,
         simulation=simulation,
         processes=processes,

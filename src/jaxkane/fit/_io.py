@@ -81,7 +81,7 @@ def described(problem: Problem) -> dict[str, Any]:
         "unknowns of trials": ", ".join(" ".join(pair) for pair in model.nuisance.trial) or "none",
         "channels": ", ".join(model.channels),
         "process noise": ", ".join(model.noise.names) or "zero" if model.noise is not None else "none",
-        "windows": len(problem.places),
+        "windows": len(problem.slices),
         "rtol": settings.rtol,
         "atol": settings.atol,
         "max_steps": settings.max_steps,

@@ -142,9 +142,9 @@ def filtered(model: Any, window: Windows, start: Array, b: Array, x: Array, begi
 
     `begin` (n,): standard deviations of v there, by default those that were given, and zero of what has none.
     """
-    system, roles = model.parameters.apply(model.system, x)
+    system, calibration = model.parameters.apply(model.system, x)
     y, weight, t = window.measured.T, window.weight.T, window.t  # (n_t, n_c), (n_t,)
-    factor = jnp.stack([jnp.asarray(roles.get(("sigma", c), 1.0), x.dtype) for c in model.channels])
+    factor = jnp.stack([jnp.asarray(calibration.get(("noise scale", c), 1.0), x.dtype) for c in model.channels])
     begin = _given_deviations(model, start.shape[0]) if begin is None else begin
     S = jnp.diag(begin)
     if has_configuration_constraints(system, t[0], start[: len(system.coordinates)]):
@@ -152,7 +152,7 @@ def filtered(model: Any, window: Windows, start: Array, b: Array, x: Array, begi
 
     def go_on(known: tuple[Array, Array], now: Any) -> tuple[Any, Any]:
         before, t, y, weight = now
-        v, S, h, F, back, status = _predicted(model, system, roles, window, known, before, t)
+        v, S, h, F, back, status = _predicted(model, system, calibration, window, known, before, t)
         seen = weight > 0
         sigma = factor / jnp.where(seen, weight, 1.0)
         new = update(jnp.where(seen, y - h, 0.0), F, sigma, seen)
@@ -167,15 +167,15 @@ def filtered(model: Any, window: Windows, start: Array, b: Array, x: Array, begi
     return Filtered(e.T, s.T, predicted.T, mean[start.shape[0] :], jnp.max(status), steps)
 
 
-def _predicted(model: Any, system: System, roles: Any, window: Windows, known: Any, t0: Array, t1: Array):
+def _predicted(model: Any, system: System, calibration: Any, window: Windows, known: Any, t0: Array, t1: Array):
     """Mean v and root S at t1, what is predicted there h (n_c,), its sensitivity F (n_c, n) in units of S, the rotation
     of that unit, and the worst status; by steps of at most the window's."""
     noise: Noise = model.noise
     v, S = known
     n, n_w, n_c, dtype = v.shape[0], len(noise.names), len(model.channels), v.dtype
-    intensity, named = noise.intensities(roles), (system.speeds, system.states)
-    lasts = intensity > 0
-    amplitude = jnp.where(lasts, jnp.sqrt(jnp.where(lasts, intensity, 1.0)), 0.0)
+    density, named = noise.spectral_densities(calibration), (system.speeds, system.states)
+    lasts = density > 0
+    amplitude = jnp.where(lasts, jnp.sqrt(jnp.where(lasts, density, 1.0)), 0.0)
     moving = t1 > t0
     number = jnp.maximum(jnp.ceil((t1 - t0) / window.step - 1e-6), 1.0)
     length = jnp.where(moving, (t1 - t0) / number, window.step)
@@ -192,7 +192,7 @@ def _predicted(model: Any, system: System, roles: Any, window: Windows, known: A
         ended = jnp.where(moving & (i + 1 >= number), t1, begun + length)
 
         def flow(v: Array, xi: Array) -> Any:
-            return _flow(model, system, roles, window, v, Disturbance(begun, ended, xi, noise.names, *named))
+            return _flow(model, system, calibration, window, v, Disturbance(begun, ended, xi, noise.names, *named))
 
         v_directions = jnp.concatenate([S.T, jnp.zeros((MODES * n_w, n), dtype)])
         along = lambda *direction: jax.jvp(flow, (v, jnp.zeros((MODES, n_w), dtype)), direction, has_aux=True)  # noqa: E731
@@ -207,16 +207,16 @@ def _predicted(model: Any, system: System, roles: Any, window: Windows, known: A
     return jax.lax.fori_loop(jnp.int32(0), number.astype(jnp.int32), piece, (v, S, *nothing))
 
 
-def _flow(model: Any, system: System, roles: Any, window: Windows, v: Array, disturbance: Disturbance):
+def _flow(model: Any, system: System, calibration: Any, window: Windows, v: Array, disturbance: Disturbance):
     """v at the end of a step, what is measured at its two ends (n_c, 2); and the simulation's status."""
     n = len(state_names(system))
     b, ts = v[n:], jnp.stack([disturbance.t0, disturbance.t1])
     settings = model.settings
     if settings.step is not None:
         settings = dataclasses.replace(settings, step=ts[1] - ts[0])
-    signals = with_one_times(model.signals(window, b, roles))
+    signals = with_one_times(model.signals(window, b, calibration))
     ride = solve(system, unpacked(system, v[:n]), ts, signals, settings, disturbance)
-    return (jnp.concatenate([packed(ride.state()), b]), model.simulated(ride, b, roles)), ride.status
+    return (jnp.concatenate([packed(ride.state()), b]), model.simulated(ride, b, calibration)), ride.status
 
 
 def brought_back(system: System, t: Array, v: Array, S: Array) -> tuple[Array, Array]:

@@ -18,7 +18,7 @@ from .._scalarjit.cache_key import compiled
 from .._scalarjit.compat import process_allgather
 from ._block_lsq import Blocks
 from ._kalman import Filtered, filtered, information_of, minus_twice_log_likelihood
-from ._model import Model, Seen, Unknowns
+from ._model import Model, Prediction, Unknowns
 from ._windows import Windows
 
 if TYPE_CHECKING:
@@ -56,10 +56,10 @@ def jacobian_of(model: Model, window: Windows, start: Array, start_dot: Array, z
 @compiled
 def blocks_of(
     model: Model, windows: Windows, by_trial: Array, point: Unknowns, starts: Array, starts_dot: Array
-) -> tuple[Blocks, Seen]:
+) -> tuple[Blocks, Prediction]:
     """Blocks, and what was seen of every window."""
     n_z, n_b = point.z.shape[1], point.b.shape[1]
-    n_next = n_z if model.nuisance.chained else 0
+    n_next = n_z if model.nuisance.has_defects else 0
 
     def window_block(arguments):
         window, z, z_next, b, start, start_dot = arguments
@@ -80,7 +80,7 @@ def blocks_of(
 
 
 @compiled
-def costs_of(model: Model, windows: Windows, point: Unknowns, starts: Array) -> tuple[Array, Seen]:
+def costs_of(model: Model, windows: Windows, point: Unknowns, starts: Array) -> tuple[Array, Prediction]:
     """Costs (W,), and what was seen: `blocks_of` without derivatives."""
 
     def window_cost(arguments):
@@ -91,7 +91,7 @@ def costs_of(model: Model, windows: Windows, point: Unknowns, starts: Array) -> 
             value = minus_twice_log_likelihood(found, window) + jnp.sum(priors**2)
             return value, _seen_by_filter(found, value)
         r, seen = model.residuals(window, start, z, b, point.x)
-        if model.nuisance.chained:
+        if model.nuisance.has_defects:
             r = r + by_next(model, window, r.shape[0]) @ z_next
         return jnp.sum(r**2), seen
 
@@ -104,8 +104,8 @@ def rides_of(model: Model, windows: Windows, point: Unknowns, starts: Array) -> 
     return each(lambda now: model.simulate(now[0], now[4], now[3], point.x), _arguments(windows, point, starts))
 
 
-def _seen_by_filter(found: Filtered, value: Array) -> Seen:
-    return Seen(found.predicted, found.status, found.deviation, value, found.unknowns)
+def _seen_by_filter(found: Filtered, value: Array) -> Prediction:
+    return Prediction(found.predicted, found.status, found.deviation, value, found.unknowns)
 
 
 def _arguments(windows: Windows, point: Unknowns, *more: Array) -> tuple[Any, ...]:
@@ -117,7 +117,7 @@ def by_next(model: Model, window: Windows, m: int) -> Array:
     """Derivatives (m, n_z) of a window's residuals by the next window's start."""
     n_z, before = window_size(model), window.weight.size
     links = jnp.zeros((m, n_z), window.t.dtype)
-    if not model.nuisance.chained:
+    if not model.nuisance.has_defects:
         return links
     places = jnp.arange(n_z, dtype=jnp.int32)
     return links.at[before + places, places].set(-window.linked / model.nuisance.jump)
@@ -137,7 +137,7 @@ def each(f: Callable[..., Any], windows: Any) -> Any:
 
 def blocks_of_all(
     model: Model, windows: Windows, by_trial: Array, point: Unknowns, starts: Array, starts_dot: Array
-) -> tuple[Blocks, Seen]:
+) -> tuple[Blocks, Prediction]:
     """`blocks_of`, by all processes together."""
 
     def own(windows, point, starts, starts_dot):
@@ -146,10 +146,10 @@ def blocks_of_all(
 
     R, seen = _by_all(own, windows, point, starts, starts_dot)
     n_z, n_b = point.z.shape[1], point.b.shape[1]
-    return Blocks(R, by_trial, n_z, n_z if model.nuisance.chained else 0, n_b), seen
+    return Blocks(R, by_trial, n_z, n_z if model.nuisance.has_defects else 0, n_b), seen
 
 
-def costs_of_all(model: Model, windows: Windows, point: Unknowns, starts: Array) -> tuple[Array, Seen]:
+def costs_of_all(model: Model, windows: Windows, point: Unknowns, starts: Array) -> tuple[Array, Prediction]:
     """`costs_of`, by all processes together."""
     return _by_all(lambda *share: costs_of(model, *share), windows, point, starts)
 
@@ -187,28 +187,28 @@ class Linearization(eqx.Module):
     """A problem at a point: its blocks, and what was seen of every window."""
 
     blocks: Blocks
-    seen: Seen
+    prediction: Prediction
 
     @property
     def simulated(self) -> Array:
         """(W, n_c, n_t)."""
-        return self.seen.simulated
+        return self.prediction.simulated
 
     @property
     def status(self) -> Array:
         """Of every window (W,)."""
-        return self.seen.status
+        return self.prediction.status
 
     @property
     def cost(self) -> float:
         """Sum of squares, with process noise minus twice the log likelihood; NaN or infinite where a window could not
         be simulated."""
-        return float(self.blocks.cost if self.seen.value is None else jnp.sum(self.seen.value))
+        return float(self.blocks.cost if self.prediction.value is None else jnp.sum(self.prediction.value))
 
     @property
     def costs(self) -> np.ndarray:
         """The part of every window (W,) in the cost; infinite where it is not `good`."""
-        own = jnp.sum(self.blocks.R[:, :, -1] ** 2, axis=1) if self.seen.value is None else self.seen.value
+        own = jnp.sum(self.blocks.R[:, :, -1] ** 2, axis=1) if self.prediction.value is None else self.prediction.value
         return np.where(self.good, np.asarray(own), np.inf)
 
     @property
@@ -251,7 +251,7 @@ def simulated(problem: Problem, point: Unknowns) -> np.ndarray:
     return all_of(_costs(problem, point, found[0])[1])
 
 
-def all_of(seen: Seen) -> np.ndarray:
+def all_of(seen: Prediction) -> np.ndarray:
     """Simulated measurements and their deviations, as `simulated` gives them."""
     parts = [x for x in (seen.simulated, seen.deviation) if x is not None]
     return np.concatenate(parts, axis=1)
@@ -260,14 +260,14 @@ def all_of(seen: Seen) -> np.ndarray:
 def without_start(problem: Problem, point: Unknowns) -> np.ndarray:
     """Whether the constraints can be met nowhere near the start of a window (W,)."""
     missing = []
-    for i in range(len(problem.places)):
+    for i in range(len(problem.slices)):
         windows, z = jax.tree.map(lambda x, i=i: x[i : i + 1], (problem.windows, point.z))
         alone = dataclasses.replace(problem, windows=windows)
         missing.append(_starts(alone, Unknowns(point.x, point.b, z)) is None)
     return np.array(missing)
 
 
-def _costs(problem: Problem, point: Unknowns, starts: Array) -> tuple[Array, Seen]:
+def _costs(problem: Problem, point: Unknowns, starts: Array) -> tuple[Array, Prediction]:
     return (costs_of_all if problem.processes else costs_of)(problem.model, problem.windows, point, starts)
 
 
@@ -299,7 +299,7 @@ def finer(problem: Problem, point: Unknowns) -> Problem:
     at a tolerance of 1e-7 against 100 of Bosh3, which differ by 0.002 of the measurements' deviation.
     """
     first, before = problem.windows.step, simulated(problem, point)
-    going, last = np.full(len(problem.places), True), np.full(len(problem.places), np.inf)
+    going, last = np.full(len(problem.slices), True), np.full(len(problem.slices), np.inf)
     for halvings in range(HALVINGS):
         half = jnp.where(jnp.asarray(going), problem.windows.step / 2, problem.windows.step)
         halved = problem.with_steps(half)
@@ -319,7 +319,7 @@ def finer(problem: Problem, point: Unknowns) -> Problem:
 def step_tolerance(problem: Problem) -> float:
     """By how much halving the step may move all residuals of one window together, in standard deviations."""
     one, together = STEP_TOLERANCE
-    return min(one, together / len(problem.places) ** 0.5)
+    return min(one, together / len(problem.slices) ** 0.5)
 
 
 def step_errors(problem: Problem, point: Unknowns, now: np.ndarray | None = None) -> np.ndarray:
@@ -329,7 +329,7 @@ def step_errors(problem: Problem, point: Unknowns, now: np.ndarray | None = None
     `now`: what is simulated at the point, where that is known.
     """
     if not has_steps(problem):
-        return np.full(len(problem.places), np.nan)
+        return np.full(len(problem.slices), np.nan)
     now = simulated(problem, point) if now is None else now
     return _apart(problem, now, simulated(problem.with_steps(problem.windows.step / 2), point))
 

@@ -75,7 +75,7 @@ class Simulation:
         )
 
 
-def earlier(t: Float[Array, " n"], y: Float[Array, " n"], delay: Array) -> Float[Array, " n"]:
+def delayed_signal(t: Float[Array, " n"], y: Float[Array, " n"], delay: Array) -> Float[Array, " n"]:
     """y(t - delay) of samples, by cubics with the slopes of parabolas through three neighbours (Catmull and Rom).
 
     Outside it is continued by a straight line. The last time may be repeated.
@@ -101,7 +101,7 @@ def earlier(t: Float[Array, " n"], y: Float[Array, " n"], delay: Array) -> Float
     return jnp.where(at < t[0], before, jnp.where(at > t[-1], after, inside))
 
 
-Roles = dict[tuple[str, str], Array]
+Calibration = dict[tuple[str, str], Array]
 """Gains, offsets and delays that all trials have in common, by what they are of: ("gain of input", name)."""
 
 
@@ -122,7 +122,7 @@ class Nuisance(eqx.Module):
 
     start: tuple[str, ...] = eqx.field(static=True)
     trial: tuple[tuple[str, str], ...] = eqx.field(static=True)
-    chained: bool = eqx.field(static=True)
+    has_defects: bool = eqx.field(static=True)
     start_deviation: Float[Array, " n_z"]
     trial_deviation: Float[Array, " n_b"]
     jump: Float[Array, " n_z"]
@@ -150,7 +150,7 @@ class Ramps(eqx.Module):
         return self.values[0] + jnp.sum(done * jnp.diff(self.values))
 
 
-class Seen(eqx.Module):
+class Prediction(eqx.Module):
     """What the model says of every window: `simulated` (W, n_c, n_t), with process noise predicted from what was
     measured before; `status` (W,). With process noise only: `deviation` (W, n_c, n_t) of what is predicted, `value`
     (W,), minus twice the log likelihood, and `unknowns` (W, n_b), what is unknown of the trial as it was found."""
@@ -176,7 +176,7 @@ class Model(eqx.Module):
     settings: Settings
     channels: tuple[str, ...] = eqx.field(static=True)
     driven: tuple[str, ...] = eqx.field(static=True)  # inputs of which there are samples
-    held: tuple[str, ...] = eqx.field(static=True)
+    zero_order_hold: tuple[str, ...] = eqx.field(static=True)
     assembled: tuple[str, ...] | None = eqx.field(static=True)  # coordinates that `assemble` moves, if not its own
     quaternions: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())  # places of Euler parameters
     noise: Noise | None = None
@@ -203,64 +203,68 @@ class Model(eqx.Module):
     def consistent(self, window: Windows, z: Array, x: Array) -> Array:
         """The start (n_q + n_u + n_x,) of one window, its dependent coordinates found by `assemble`. Euler
         parameters that were measured, or are unknown, are brought to unit norm."""
-        system, roles = self.parameters.apply(self.system, x)
+        system, calibration = self.parameters.apply(self.system, x)
         if self.noise is not None:  # a start with a deviation is no unknown of a filter, but what it begins with
             z = jnp.where(jnp.isfinite(self.nuisance.start_deviation), 0.0, z)
-        start = self.known(window.start, roles).at[self.unknown_places].add(z)
+        start = self.known(window.start, calibration).at[self.unknown_places].add(z)
         for four in self.quaternions:
             e = start[np.array(four)]
             start = start.at[np.array(four)].set(e / jnp.linalg.norm(e))
         state = unpacked(system, start)
         return packed(assemble(system, state.q, state.u, state.x, t=window.t[0], free=self.assembled))
 
-    def known(self, start: Array, roles: Roles) -> Array:
+    def known(self, start: Array, calibration: Calibration) -> Array:
         """What is known of a start (n_q + n_u + n_x,), with the gains and offsets that all trials have in common."""
         for i, name in enumerate(state_names(self.system)):
             for kind, change in (("gain of start", jnp.multiply), ("offset of start", jnp.add)):
-                if (kind, name) in roles:
-                    start = start.at[i].set(change(start[i], roles[kind, name]))
+                if (kind, name) in calibration:
+                    start = start.at[i].set(change(start[i], calibration[kind, name]))
         return start
 
     def simulate(self, window: Windows, start: Array, b: Array, x: Array) -> Trajectory:
         """One window's motion."""
-        system, roles = self.parameters.apply(self.system, x)
+        system, calibration = self.parameters.apply(self.system, x)
         settings = self.settings if self.settings.step is None else dataclasses.replace(self.settings, step=window.step)
-        signals = with_one_times(self.signals(window, b, roles))
+        signals = with_one_times(self.signals(window, b, calibration))
         return solve(system, unpacked(system, start), window.t, signals, settings)
 
-    def signals(self, window: Windows, b: Array, roles: Roles) -> dict[str, Any]:
+    def signals(self, window: Windows, b: Array, calibration: Calibration) -> dict[str, Any]:
         """The inputs of one window by name."""
         system, signals = self.system, {}
         # One array of times for all that have no delay: kinks that are known to be at the same times cost no more than
         # those of one input.
         prompt = window.acting(0.0)
         for i, name in enumerate(system.inputs):
-            bias = self.nuisance.of_trial(b, "bias of input", name, 0.0) + roles.get(("offset of input", name), 0.0)
+            bias = self.nuisance.of_trial(b, "bias of input", name, 0.0) + calibration.get(
+                ("offset of input", name), 0.0
+            )
             if name in self.driven:
-                gain = roles.get(("gain of input", name), 1.0) * self.nuisance.of_trial(b, "gain of input", name, 1.0)
-                delayed = ("delay of input", name) in roles or ("delay of input", name) in self.nuisance.trial
-                delay = roles.get(("delay of input", name), 0.0) + self.nuisance.of_trial(
+                gain = calibration.get(("gain of input", name), 1.0) * self.nuisance.of_trial(
+                    b, "gain of input", name, 1.0
+                )
+                delayed = ("delay of input", name) in calibration or ("delay of input", name) in self.nuisance.trial
+                delay = calibration.get(("delay of input", name), 0.0) + self.nuisance.of_trial(
                     b, "delay of input", name, 0.0
                 )
                 times, samples = window.acting(delay) if delayed else prompt
                 values = gain * samples[i] + bias
-                if name in self.held and delayed and self.settings.step is not None:
+                if name in self.zero_order_hold and delayed and self.settings.step is not None:
                     signals[name] = Ramps(times, values, 2.0 * window.step)
                 else:
-                    signals[name] = Samples(times, values, hold=name in self.held)
-            elif ("bias of input", name) in self.nuisance.trial or ("offset of input", name) in roles:
+                    signals[name] = Samples(times, values, hold=name in self.zero_order_hold)
+            elif ("bias of input", name) in self.nuisance.trial or ("offset of input", name) in calibration:
                 signals[name] = bias
         return signals
 
-    def simulated(self, ride: Trajectory, b: Array, roles: Roles) -> Array:
+    def simulated(self, ride: Trajectory, b: Array, calibration: Calibration) -> Array:
         """What the sensors would have measured (n_c, n_t)."""
         rows = []
         for c in self.channels:
             y = ride[c]
-            if ("delay of sensor", c) in roles:
-                y = earlier(ride.t, y, roles["delay of sensor", c])
-            gain = self.nuisance.of_trial(b, "gain of sensor", c, 1.0) * roles.get(("gain of sensor", c), 1.0)
-            bias = self.nuisance.of_trial(b, "bias of sensor", c, 0.0) + roles.get(("offset of sensor", c), 0.0)
+            if ("delay of sensor", c) in calibration:
+                y = delayed_signal(ride.t, y, calibration["delay of sensor", c])
+            gain = self.nuisance.of_trial(b, "gain of sensor", c, 1.0) * calibration.get(("gain of sensor", c), 1.0)
+            bias = self.nuisance.of_trial(b, "bias of sensor", c, 0.0) + calibration.get(("offset of sensor", c), 0.0)
             rows.append(gain * y + bias)
         return jnp.stack(rows)
 
@@ -268,21 +272,21 @@ class Model(eqx.Module):
         """Residuals of one window, priors included (m,), in which the next window starts where it is first thought to;
         and what was seen."""
         ride = self.simulate(window, start, b, x)
-        roles = self.parameters.apply(self.system, x)[1]
-        simulated, n = self.simulated(ride, b, roles), self.nuisance
+        calibration = self.parameters.apply(self.system, x)[1]
+        simulated, n = self.simulated(ride, b, calibration), self.nuisance
         difference = jnp.where(window.weight > 0, (simulated - window.measured) * window.weight, 0.0)
         end = packed(ride.state())
-        following = self.known(window.next_start, roles)
+        following = self.known(window.next_start, calibration)
         jump = jnp.where(window.linked > 0, (end - following)[self.unknown_places] / n.jump, 0.0)
-        rows = [difference.ravel(), *([jump] if n.chained else []), self.priors(window, z, b, x)]
-        return jnp.concatenate(rows), Seen(simulated, ride.status)
+        rows = [difference.ravel(), *([jump] if n.has_defects else []), self.priors(window, z, b, x)]
+        return jnp.concatenate(rows), Prediction(simulated, ride.status)
 
     def priors(self, window: Windows, z: Array, b: Array, x: Array) -> Array:
         """Of starts, a trial's unknowns and the parameters, each divided by its standard deviation."""
         n = self.nuisance
         # A prior of infinite width is a row of zeros. A trial's prior is counted in its first window, and so is that of
         # a start from which all else follows.
-        of_start = jnp.where(window.first, z / n.start_deviation, 0.0) if n.chained else z / n.start_deviation
+        of_start = jnp.where(window.first, z / n.start_deviation, 0.0) if n.has_defects else z / n.start_deviation
         of_trial = jnp.where(window.first, b / n.trial_deviation, 0.0)
         of_all = jnp.where(window.very_first, self.parameters.prior_residuals(x), 0.0)
         # What no measurement can tell, since starts are brought to unit norm: that it is one. It costs nothing.

@@ -19,7 +19,7 @@ from ._problem import Problem
 
 def moved(point: Unknowns, x: Array, eliminated: Eliminated) -> Unknowns:
     """The point after a step x of the parameters, with the nuisance values that go with it."""
-    z, b = eliminated.others(x)
+    z, b = eliminated.back_substitute(x)
     return Unknowns(point.x + x, point.b + b, point.z + z)
 
 
@@ -35,7 +35,7 @@ class Unsimulated(ValueError):
         bad = without_start(problem, point) if at is None else bad
         self.reasons: dict[int, str] = {}
         for i in np.flatnonzero(bad):
-            (k, first, n), why = problem.places[i], "no consistent start"
+            (k, first, n), why = problem.slices[i], "no consistent start"
             if at is not None:
                 status = int(at.status[i])
                 why = "not finite" if status == Status.COMPLETED else reason(status, _event_names(problem))
@@ -64,14 +64,14 @@ def solve_nuisance(
     try:
         return _solved(problem, point, steps, rtol)
     except Unsimulated:
-        if not problem.model.nuisance.chained:
+        if not problem.model.nuisance.has_defects:
             raise
-    point, _ = _solved(problem.unchained(), point, steps, rtol)
+    point, _ = _solved(problem.without_defects(), point, steps, rtol)
     return _solved(problem, point, steps, rtol)
 
 
 def _solved(problem: Problem, point: Unknowns, steps: int, rtol: float) -> tuple[Unknowns, Linearization]:
-    whole = np.array([n for _, _, n in problem.places])
+    whole = np.array([n for _, _, n in problem.slices])
     samples = whole.copy()
     at = linearize(problem.shortened(samples), point)
     while at is None or not at.good.all():
@@ -139,7 +139,7 @@ def _chosen(better: np.ndarray, owner: np.ndarray, new: Any, old: Any) -> tuple[
         return lambda a, b: jnp.where(jnp.reshape(which, (-1,) + (1,) * (a.ndim - 1)), a, b)
 
     of_windows = of(better[owner])
-    R, seen = of_windows(there.blocks.R, at.blocks.R), jax.tree.map(of_windows, there.seen, at.seen)
+    R, seen = of_windows(there.blocks.R, at.blocks.R), jax.tree.map(of_windows, there.prediction, at.prediction)
     b, z = of(better)(tried.b, point.b), of_windows(tried.z, point.z)
     return Unknowns(point.x, b, z), Linearization(eqx.tree_at(lambda blocks: blocks.R, at.blocks, R), seen)
 

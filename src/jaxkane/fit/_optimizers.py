@@ -114,7 +114,7 @@ def _is_refined(problem: Problem, at: Linearization) -> bool:
 
 def _part(problem: Problem, share: float) -> Problem:
     """The first part of every window."""
-    return problem.shortened(np.array([max(2, round(share * n)) for _, _, n in problem.places]))
+    return problem.shortened(np.array([max(2, round(share * n)) for _, _, n in problem.slices]))
 
 
 class DescentState(eqx.Module):
@@ -297,7 +297,7 @@ class BFGS(Optimizer):
         kinds = Unknowns(
             x=squares[-1 - n_x : -1],
             b=squares[-1 - n_x - n_b : -1 - n_x] / len(problem.trials),
-            z=squares[:n_z] / len(problem.places),
+            z=squares[:n_z] / len(problem.slices),
         )
         unit = jax.tree.map(
             lambda u, c: jnp.broadcast_to(jnp.where(c > 0, jax.lax.rsqrt(c), 1.0), u.shape), point, kinds

@@ -18,7 +18,7 @@ from .._kane.rhs import output_names
 from .._system.parameters import ANY, ParameterInfo, declared, leaf_name, learned_part, names_of_leaf
 from .._system.system import System, unit_of, units_of
 from ._bijections import Interval, PossibleBody
-from ._declarations import Delay, Free, Gain, Inertia, Intensity, Offset, Prior, Shared, Sigma, Where
+from ._declarations import Delay, Free, Gain, Inertia, NoiseScale, Offset, Prior, Shared, SpectralDensity, Where
 
 
 def one_leaf(system: System, name: str, shape: tuple[int, ...] = ()) -> int:
@@ -63,15 +63,17 @@ class Entry:
     name: str
     unit: str
     targets: tuple[tuple[int, int, float], ...] = ()
-    role: tuple[str, str] | None = None  # such as ("gain of input", name), ("intensity", disturbed), ("sigma", channel)
+    role: tuple[str, str] | None = (
+        None  # such as ("gain of input", name), ("spectral density", disturbed), ("noise scale", channel)
+    )
     part: str = ""  # the learned function that it belongs to
 
     @property
     def start_means_something(self) -> bool:
         """Whether its initial guess says of what size it is: not of a learned number, of the size of noise, nor of what
         has no zero of its own, as a delay."""
-        kind = self.role[0].split()[0] if self.role else ""
-        return not self.part and kind not in ("intensity", "sigma", "offset", "delay")
+        kind = self.role[0].partition(" of ")[0] if self.role else ""
+        return not self.part and kind not in ("spectral density", "noise scale", "offset", "delay")
 
 
 class Parameters(eqx.Module):
@@ -243,7 +245,7 @@ POSITIVE = ParameterInfo(True, ())
 
 def as_items(free: Any) -> list[Any]:
     """What a fit takes as `free`, one by one."""
-    if isinstance(free, (str, Free, Inertia, Intensity, Sigma, Gain, Offset, Delay)) or callable(free):
+    if isinstance(free, (str, Free, Inertia, SpectralDensity, NoiseScale, Gain, Offset, Delay)) or callable(free):
         return [free]
     if not isinstance(free, Iterable):
         raise TypeError(
@@ -273,7 +275,7 @@ def parameters_of(
     for item in free:
         if isinstance(item, Shared):
             parts.append(_of_all_trials(system, item, noise))
-        elif isinstance(item, (Intensity, Sigma)):
+        elif isinstance(item, (SpectralDensity, NoiseScale)):
             parts.append(_of_noise(system, item, noise, channels))
         elif isinstance(item, Inertia):
             parts.append(_of_body(system, item))
@@ -314,18 +316,20 @@ def _of_all_trials(system: System, item: Shared, noise: Mapping[str, float] | No
     return _scalar(entry, item, item.start, ANY)
 
 
-def _of_noise(system: System, item: Intensity | Sigma, noise: Mapping[str, float] | None, channels: Sequence[str]):
-    kind = type(item).__name__.lower()
-    what, of = (item.of, noise or {}) if isinstance(item, Intensity) else (item.channel, channels)
+def _of_noise(
+    system: System, item: SpectralDensity | NoiseScale, noise: Mapping[str, float] | None, channels: Sequence[str]
+):
+    kind = "spectral density" if isinstance(item, SpectralDensity) else "noise scale"
+    what, of = (item.of, noise or {}) if isinstance(item, SpectralDensity) else (item.channel, channels)
     if noise is None:
         raise ValueError(
             f"{type(item).__name__}({what!r}) is estimated by its likelihood, and this is a fit of least squares: give "
-            "`noise`, the intensities of what disturbs the motion by name, or {} where nothing does."
+            "`noise`, the spectral densities of what disturbs the motion by name, or {} where nothing does."
         )
     if what not in of:
-        where = "`noise`" if isinstance(item, Intensity) else "the measured channels"
+        where = "`noise`" if isinstance(item, SpectralDensity) else "the measured channels"
         raise ValueError(f"{type(item).__name__}({what!r}): {hint(what, tuple(of), f'{where} has')}")
-    given = (noise[what] if item.start is None else item.start) if isinstance(item, Intensity) else item.start
+    given = (noise[what] if item.start is None else item.start) if isinstance(item, SpectralDensity) else item.start
     start = real_number(given, f"{kind} of {what}: `start`")
     if not 0 < start < math.inf:
         raise ValueError(f"{kind} of {what} starts at {start}: it is searched for among positive numbers.")
@@ -334,7 +338,7 @@ def _of_noise(system: System, item: Intensity | Sigma, noise: Mapping[str, float
         if -math.inf < lower < 0:
             raise ValueError(f"{kind} of {what}: nothing below zero is possible, got the bounds {item.bounds}.")
         item = dataclasses.replace(item, bounds=(max(lower, 0.0), upper))
-    known = unit_of(what, units_of(system)) if kind == "intensity" else ""
+    known = unit_of(what, units_of(system)) if kind == "spectral density" else ""
     known = f"({known})" if set(known) & set(" /^") else known
     unit = (f"{known}^2 s" if what in system.inputs else f"{known}^2/s") if known else ""
     entry = Entry(item.name or f"{kind} of {what}", item.unit or unit, role=(kind, what))
@@ -399,7 +403,7 @@ def _followers(system: System, name: str, factor: float) -> list[tuple[int, int,
 
 def _scalar(
     entry: Entry,
-    item: Free | Shared | Intensity | Sigma,
+    item: Free | Shared | SpectralDensity | NoiseScale,
     start: Any,
     info: ParameterInfo,
     tied: Sequence[tuple[ParameterInfo, float]] = (),

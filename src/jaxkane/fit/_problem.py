@@ -27,11 +27,11 @@ from ._model import Model, Nuisance, Simulation, Unknowns
 from ._parameters import Parameters, as_items, parameters_of
 from ._process_noise import noise_of
 from ._trial import Trial, as_trials
-from ._windows import Place, Reach, Windows, cut, state_names
+from ._windows import Reach, Windows, WindowSlice, cut, state_names
 
 
 @dataclasses.dataclass(frozen=True)
-class Specification:
+class ProblemSpec:
     """The arguments of `jaxkane.fit.fit` that pose it, but for the trials: all that a `Problem` is derived from, and
     what it is posed by again."""
 
@@ -45,9 +45,9 @@ class Specification:
     input_gain: Names = ()
     input_delay: Names = ()
     priors: Mapping[str, Prior] | None = None
-    hold: Sequence[str] = ()
+    zero_order_hold: Sequence[str] = ()
     window: float | None = None
-    continuity: Mapping[str, float] | None = None
+    defect_std: Mapping[str, float] | None = None
     noise: Mapping[str, float] | None = None
     simulation: Simulation | None = None
     processes: bool = False
@@ -61,15 +61,15 @@ class Specification:
             refuse_other(self.simulation, Simulation, "`simulation=`", "Simulation(step=0.01)")
         if not isinstance(self.system, System):
             raise TypeError(f"`system` is a jaxkane.System, got {type(self.system).__name__}.")
-        for name in ("priors", "continuity"):
+        for name in ("priors", "defect_std"):
             if not isinstance(getattr(self, name), (Mapping, type(None))):
                 raise TypeError(f"`{name}` is a dict by name, got {getattr(self, name)!r}.")
         if self.window is not None and not real_number(self.window, "`window`") > 0:
             raise ValueError(f"`window` is a length of time [s], got {self.window}.")
-        if self.continuity is not None and self.window is None:
-            raise ValueError("`continuity` binds the windows of a trial together: give their length, `window` [s].")
+        if self.defect_std is not None and self.window is None:
+            raise ValueError("`defect_std` binds the windows of a trial together: give their length, `window` [s].")
 
-    def with_priors(self, priors: Mapping[str, Prior]) -> Specification:
+    def with_priors(self, priors: Mapping[str, Prior]) -> ProblemSpec:
         """The same with these priors in the place of those of the same names."""
         return dataclasses.replace(self, priors={**(self.priors or {}), **priors})
 
@@ -162,7 +162,7 @@ def starts_found(system: System, trials: Sequence[Trial], unknown: Sequence[str]
     return Starts(None if len(named) == len(system.coordinates) else moved, quaternions, guess)
 
 
-def nuisance_of(asked: Specification, channels: Sequence[str], driven: Sequence[str]) -> Nuisance:
+def nuisance_of(asked: ProblemSpec, channels: Sequence[str], driven: Sequence[str]) -> Nuisance:
     """What is unknown beside the parameters; `driven` are inputs with samples."""
     system = asked.system
     known = {
@@ -180,12 +180,12 @@ def nuisance_of(asked: Specification, channels: Sequence[str], driven: Sequence[
     turned = {system.coordinates[i] for four in euler_parameters(system) for i in four}
     independent = tuple(c for c in system.coordinates if c not in system.dependent_coordinates or c in turned)
     start = checked_names(system, "unknown", asked.unknown, (*independent, *system.speeds, *system.states))
-    jump = checked_names(system, "continuity", asked.continuity or {}, tuple(start))
+    jump = checked_names(system, "defect_std", asked.defect_std or {}, tuple(start))
     array = lambda numbers: jnp.asarray(np.array(list(numbers), float), jnp.result_type(float))  # noqa: E731
     return Nuisance(
         start=tuple(start),
         trial=tuple(trial),
-        chained=asked.continuity is not None,
+        has_defects=asked.defect_std is not None,
         start_deviation=array(start.values()),
         trial_deviation=array(trial.values()),
         jump=array(jump.get(name, float("inf")) for name in start),
@@ -229,8 +229,8 @@ class Problem:
     windows: Windows
     by_trial: Array
     trials: tuple[Trial, ...]
-    places: tuple[Place, ...]
-    specification: Specification
+    slices: tuple[WindowSlice, ...]
+    specification: ProblemSpec
 
     @classmethod
     def of(
@@ -241,10 +241,10 @@ class Problem:
         **options: Any,
     ) -> Problem:
         """Pose a fit. The arguments are those of `jaxkane.fit.fit`, from `unknown` to `simulation`."""
-        return cls.posed(Specification(system, free, **options), trials)
+        return cls.posed(ProblemSpec(system, free, **options), trials)
 
     @classmethod
-    def posed(cls, asked: Specification, trials: Sequence[Trial] | Trial) -> Problem:
+    def posed(cls, asked: ProblemSpec, trials: Sequence[Trial] | Trial) -> Problem:
         """What is asked, of these trials."""
         system, window, simulation = asked.system, asked.window, asked.simulation or Simulation()
         trials = as_trials(trials)
@@ -252,16 +252,16 @@ class Problem:
         driven = tuple(name for name in system.inputs if any(name in trial.inputs for trial in trials))
         nuisance = nuisance_of(asked, channels, driven)
         deviations = jnp.concatenate([nuisance.start_deviation, nuisance.trial_deviation])
-        of_noise = noise_of(system, asked.noise, deviations, window, asked.continuity)
-        held = tuple(checked_names(system, "hold", asked.hold, system.inputs))
+        of_noise = noise_of(system, asked.noise, deviations, window, asked.defect_std)
+        held = tuple(checked_names(system, "zero_order_hold", asked.zero_order_hold, system.inputs))
         starts = starts_found(system, trials, nuisance.start)
         parameters = parameters_of(system, asked.free, asked.noise, channels).with_priors(asked.priors or {})
-        windows, places = cut(
+        windows, slices = cut(
             system,
             trials,
             window,
             channels,
-            chained=nuisance.chained,
+            has_defects=nuisance.has_defects,
             reach=reach_of(trials, parameters, nuisance),
             step=simulation.step,
             guess=starts.guess,
@@ -274,14 +274,14 @@ class Problem:
             settings=simulation.settings(windows.t[0], varying or of_noise is not None),
             channels=channels,
             driven=driven,
-            held=held,
+            zero_order_hold=held,
             assembled=starts.moved,
             quaternions=starts.quaternions,
             noise=of_noise,
         )
         if asked.processes:
             check_same(model, windows)
-        problem = cls(model, windows, windows.by_trial, trials, places, asked)
+        problem = cls(model, windows, windows.by_trial, trials, slices, asked)
         problem.check_system(problem.start)
         return problem.finer(problem.start) if problem.chooses_steps else problem
 
@@ -346,7 +346,7 @@ class Problem:
     @property
     def start(self) -> Unknowns:
         """No parameter changed, no bias, every window starts as it was measured."""
-        p, T, W = len(self.parameters.entries), len(self.trials), len(self.places)
+        p, T, W = len(self.parameters.entries), len(self.trials), len(self.slices)
         zeros = lambda *shape: jnp.zeros(shape, self.windows.t.dtype)  # noqa: E731
         return Unknowns(zeros(p), zeros(T, len(self.model.nuisance.trial)), zeros(W, len(self.model.nuisance.start)))
 
@@ -369,10 +369,10 @@ class Problem:
         return eqx.tree_at(lambda p: p.x, point, x)
 
     @property
-    def seen(self) -> np.ndarray:
+    def active_windows(self) -> np.ndarray:
         """Whether a window (W,) holds a measurement that counts, or stands between such."""
         own = np.asarray(jnp.any(self.windows.weight > 0, axis=(1, 2)))
-        if not self.model.nuisance.chained:
+        if not self.model.nuisance.has_defects:
             return own
         owner = np.asarray(self.windows.trial)
         return np.isin(owner, owner[own])
@@ -380,31 +380,33 @@ class Problem:
     @property
     def clusters(self) -> int:
         """The number of trials that count."""
-        return len(np.unique(np.asarray(self.windows.trial)[self.seen]))
+        return len(np.unique(np.asarray(self.windows.trial)[self.active_windows]))
 
     @property
     def size(self) -> tuple[int, int]:
         """Numbers of residuals, priors and links among them, and of unknowns."""
-        n, seen, T = self.model.nuisance, self.seen, self.clusters
+        n, seen, T = self.model.nuisance, self.active_windows, self.clusters
         finite = lambda x: int(np.isfinite(np.asarray(x)).sum())  # noqa: E731
         residuals = int(jnp.sum(self.windows.weight > 0)) + finite(self.parameters.prior_deviation)
-        residuals += (T if n.chained else int(seen.sum())) * finite(n.start_deviation) + T * finite(n.trial_deviation)
+        residuals += (T if n.has_defects else int(seen.sum())) * finite(n.start_deviation) + T * finite(
+            n.trial_deviation
+        )
         residuals += int(np.asarray(self.windows.linked)[seen].sum()) * finite(n.jump)
         residuals += int(seen.sum()) * len(self.model.norms)
         unknowns = len(self.parameters.entries) + T * len(n.trial) + int(seen.sum()) * len(n.start)
         return residuals, unknowns
 
     def trajectories(self, point: Unknowns) -> list[Trajectory]:
-        """The motion of every window, in the order of `places`."""
+        """The motion of every window, in the order of `slices`."""
         rides = rides_of(self.model, self.windows, point, starts_of(self.model, self.windows, point)[0])
         return [
             jax.tree.map(lambda x, i=i, n=n: x[i, :n] if x.ndim > 1 else x[i], rides)
-            for i, (_, _, n) in enumerate(self.places)
+            for i, (_, _, n) in enumerate(self.slices)
         ]
 
     def shortened(self, samples: Any) -> Problem:
         """The same problem with only the first `samples` (W,) of every window; nothing is compiled anew."""
-        windows, whole = self.windows, np.array([n for _, _, n in self.places])
+        windows, whole = self.windows, np.array([n for _, _, n in self.slices])
         if np.all(np.asarray(samples) >= whole):
             return self
         keep = jnp.asarray(samples, dtype=jnp.int32)[:, None]  # (W, 1)
@@ -428,12 +430,12 @@ class Problem:
         """The same question, asked of other trials."""
         return Problem.posed(self.specification, trials)
 
-    def asking(self, other: Specification) -> Problem:
+    def asking(self, other: ProblemSpec) -> Problem:
         """Another question, asked of the same trials, of which the same count, with the same steps of integration."""
-        counted = np.unique(np.asarray(self.windows.trial)[self.seen])
+        counted = np.unique(np.asarray(self.windows.trial)[self.active_windows])
         return Problem.posed(other, self.trials).with_steps(self.windows.step).only(counted.tolist())
 
-    def unchained(self) -> Problem:
+    def without_defects(self) -> Problem:
         """The same problem in which every window starts freely; nothing is compiled anew."""
         windows = eqx.tree_at(lambda w: w.linked, self.windows, jnp.zeros_like(self.windows.linked))
         return dataclasses.replace(self, windows=windows)

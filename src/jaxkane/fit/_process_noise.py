@@ -2,7 +2,7 @@
 
     dq = q_dot dt,   du = u_dot(t, q, u, x, inputs + e) dt + dw,   dx = x_dot(...) dt + dw
 
-with w and the integral of e Wiener processes: dw has the variance (intensity dt), e the spectral density (intensity).
+with w and the integral of e Wiener processes: Q is the spectral density of e, and dw has the variance Q dt.
 What a sensor reads of accelerations and inputs is that of the motion without them: white noise has no value.
 
 Within a short time h white noise is a sum of orthonormal polynomials (Legendre's) with independent coefficients of
@@ -31,22 +31,22 @@ MODES = 3
 
 
 class Noise(eqx.Module):
-    """What is disturbed, `names`: independent speeds, states and inputs; how much, `intensity` (n_w,), as given.
+    """What is disturbed, `names`: independent speeds, states and inputs; `spectral_density` (n_w,), as given.
     `random` (n_z + n_b,): which of a trial's unknowns have a standard deviation, and so are variables of the filter."""
 
     names: tuple[str, ...] = eqx.field(static=True)
-    intensity: Float[Array, " n_w"]
+    spectral_density: Float[Array, " n_w"]
     random: tuple[bool, ...] = eqx.field(static=True)
 
-    def intensities(self, roles: Mapping[tuple[str, str], Array]) -> Array:
-        """(n_w,), those that are free by ("intensity", name)."""
-        pairs = zip(self.names, self.intensity, strict=True)
-        found = [roles.get(("intensity", name), x) for name, x in pairs]
-        return jnp.stack(found) if found else self.intensity
+    def spectral_densities(self, calibration: Mapping[tuple[str, str], Array]) -> Array:
+        """(n_w,), those that are free by ("spectral density", name)."""
+        pairs = zip(self.names, self.spectral_density, strict=True)
+        found = [calibration.get(("spectral density", name), x) for name, x in pairs]
+        return jnp.stack(found) if found else self.spectral_density
 
 
 class Disturbance(eqx.Module):
-    """White noise of intensity one for a time from t0 to t1 [s], times a factor: `xi` (MODES, n_w) its coefficients."""
+    """White noise of spectral density one from t0 to t1 [s], times a factor: `xi` (MODES, n_w) its coefficients."""
 
     t0: Float[Array, ""]
     t1: Float[Array, ""]
@@ -69,20 +69,22 @@ class Disturbance(eqx.Module):
         return disturbed, State(jnp.zeros_like(state.q), row(self.speeds), x)
 
 
-def noise_of(system: System, given: Any, deviations: Any, window: Any, continuity: Any) -> Noise | None:
+def noise_of(system: System, given: Any, deviations: Any, window: Any, defect_std: Any) -> Noise | None:
     """The process noise that a fit was given by name, checked; None for a fit of least squares. `deviations`
     (n_z + n_b,): of a trial's unknowns."""
     if given is None:
         return None
     if not isinstance(given, Mapping):
-        raise TypeError(f"`noise` is a dict of intensities by name, {{{system.speeds[0]!r}: 0.1}}; got {given!r}.")
-    if window is not None or continuity is not None:
+        raise TypeError(
+            f"`noise` is a dict of spectral densities by name, {{{system.speeds[0]!r}: 0.1}}; got {given!r}."
+        )
+    if window is not None or defect_std is not None:
         raise ValueError(
             "`noise` and `window` are two ways to follow a motion that one start does not determine: a filter, which "
             "goes on from every measurement, and windows, each with a start of its own. Give one of them."
         )
     known = (*system.speeds, *system.states, *system.inputs)
-    for name, intensity in given.items():
+    for name, density in given.items():
         if name not in known:
             more = (
                 " A dependent speed is disturbed by what disturbs the independent ones."
@@ -92,10 +94,10 @@ def noise_of(system: System, given: Any, deviations: Any, window: Any, continuit
                 else ""
             )
             raise ValueError(f"`noise` names {name}; {hint(name, known, 'it may name')}{more}")
-        if not 0 <= real_number(intensity, f"`noise`: the intensity of {name}") < math.inf:
+        if not 0 <= real_number(density, f"`noise`: the spectral density of {name}") < math.inf:
             raise ValueError(
-                f"`noise`: the intensity of {name} is a number that is not negative and finite; got {intensity!r}. To "
-                f"have it found, start from such a number and name Intensity({name!r}) among `free`."
+                f"`noise`: the spectral density of {name} is not negative, and finite; got {density!r}. "
+                f"To estimate it, start from such a number and name SpectralDensity({name!r}) among `free`."
             )
     dtype = jnp.result_type(float)
     random = tuple(bool(x) for x in np.isfinite(np.asarray(deviations)))

@@ -201,7 +201,8 @@ def ending(fit: Fit) -> str:
     if fit.problem.model.noise is None:
         size = f"Variance of a residual: {fit.variance:.3g} (one where sigma and the model are right)."
     else:
-        size = f"Mean square of the normalized innovations: {fit.innovation:.3g} (one where the noise is right)."
+        nis = fit.mean_normalized_innovation_squared
+        size = f"Mean square of the normalized innovations: {nis:.3g} (one where the noise is right)."
     return f"{name[0].upper()}{name[1:]} {fit.history[0]:.6g} → {fit.cost:.6g} {how} {size}"
 
 
@@ -266,7 +267,7 @@ def settings_of(fit: Fit) -> Iterable[tuple[str, str]]:
         fixed = f"steps of {steps.min():.3g} to {steps.max():.3g} s, halved: {fit.step_error:.2g} standard deviations"
     yield "simulation", f"{type(s.solver).__name__}, {fixed}"
     lengths = np.asarray(problem.windows.t[:, -1] - problem.windows.t[:, 0])
-    kind = "chained" if problem.model.nuisance.chained else "with free starts"
+    kind = "chained" if problem.model.nuisance.has_defects else "with free starts"
     yield "windows", f"{len(lengths)} of {lengths.min():.3g} to {lengths.max():.3g} s, {kind}"
     yield "unknown at their starts", ", ".join(problem.model.nuisance.start) or "nothing"
     yield "measured", ", ".join(problem.channels)

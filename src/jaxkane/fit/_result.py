@@ -23,7 +23,7 @@ from ._block_lsq import Blocks
 from ._identifiability import Identifiability, identifiability_at
 from ._io import described, read_state, tree_of, write_state
 from ._linearize import STEP_TOLERANCE, Linearization, all_of, cost
-from ._model import Seen, Unknowns
+from ._model import Prediction, Unknowns
 from ._parameters import Parameters
 from ._problem import Problem, refuse_other
 from ._statistics import ByTrial, ResidualTest, residual_test
@@ -75,10 +75,10 @@ class Fit:
 
         With a fixed step of integration all windows are simulated once more, with half of it; not after Ctrl-C.
         """
-        errors = np.full(len(problem.places), np.nan)
+        errors = np.full(len(problem.slices), np.nan)
         if status != "interrupted":
             try:
-                errors = problem.step_errors(point, all_of(at.seen))
+                errors = problem.step_errors(point, all_of(at.prediction))
             except KeyboardInterrupt:
                 status = "interrupted"
         return cls(problem, point, at, errors, tuple(history), status, method)
@@ -103,7 +103,7 @@ class Fit:
         return self.identifiability.variance
 
     @property
-    def innovation(self) -> float:
+    def mean_normalized_innovation_squared(self) -> float:
         """The mean square of the normalized residuals; with process noise one where all noise is as it was taken."""
         flat = np.concatenate([r for channels in self.residuals.values() for r in channels.values()])
         return float(np.nanmean(flat**2))
@@ -227,7 +227,7 @@ class Fit:
 
     @functools.cached_property
     def residuals(self) -> ByTrial:
-        deviation = self.linearization.seen.deviation
+        deviation = self.linearization.prediction.deviation
         known = None if deviation is None else residuals.by_trial(self.problem, np.asarray(deviation))
         return residuals.scaled_residuals(self.problem, self.fitted, known)
 
@@ -258,7 +258,7 @@ class Fit:
 
     @property
     def nuisance(self) -> dict[str, dict[str, Any]]:
-        return nuisance_by_trial(self.problem, self.point, self.linearization.seen)
+        return nuisance_by_trial(self.problem, self.point, self.linearization.prediction)
 
     @functools.cached_property
     def notes(self) -> tuple[str, ...]:
@@ -277,7 +277,7 @@ class Fit:
             **described(self.problem),
         }
         at, step = self.linearization, self.problem.windows.step
-        numbers = {"R": at.blocks.R, "seen": at.seen, "step_errors": self.step_errors}
+        numbers = {"R": at.blocks.R, "seen": at.prediction, "step_errors": self.step_errors}
         write_state(path, key, {"point": self.point, "step": step, "history": np.array(self.history), **numbers})
         return path
 
@@ -331,10 +331,10 @@ def load(path: str | os.PathLike[str], problem: Problem) -> Fit:
         raise ValueError(f"{path} is the fit of another problem. It differs in {wrong}. Pose the problem as it was.")
     like: dict[str, Any] = {"point": problem.start, "R": 0.0, "step_errors": 0.0, "history": 0.0}
     there_too = jnp.zeros(()) if problem.model.noise is not None else None
-    like["seen"] = Seen(jnp.zeros(()), jnp.zeros(()), there_too, there_too, there_too)
+    like["seen"] = Prediction(jnp.zeros(()), jnp.zeros(()), there_too, there_too, there_too)
     found = {name: tree_of(path, arrays, name, tree) for name, tree in like.items()}
     point, n_z, n_b = found["point"], found["point"].z.shape[1], found["point"].b.shape[1]
-    blocks = Blocks(found["R"], problem.by_trial, n_z, n_z if problem.model.nuisance.chained else 0, n_b)
+    blocks = Blocks(found["R"], problem.by_trial, n_z, n_z if problem.model.nuisance.has_defects else 0, n_b)
     at = Linearization(blocks, found["seen"])
     if there["program"] != here["program"]:
         _refuse_changed(path, problem, point, at, there["versions"])
@@ -360,4 +360,4 @@ def trajectories(fit: Fit) -> list[tuple[str, Trajectory]]:
     if fit.problem.model.noise is not None:
         raise ValueError("trajectories: process noise disturbs this fit's motion, which `smoothed(fit)` gives.")
     rides = fit.problem.trajectories(fit.point)
-    return [(fit.trial_names[k], ride) for (k, _, _), ride in zip(fit.problem.places, rides, strict=True)]
+    return [(fit.trial_names[k], ride) for (k, _, _), ride in zip(fit.problem.slices, rides, strict=True)]

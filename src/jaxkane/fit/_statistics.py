@@ -82,8 +82,8 @@ def clusters_of(problem: Problem) -> tuple[str, int]:
     p = len(problem.parameters.names)
     if are_enough(problem.clusters, p):
         return "trial", problem.clusters
-    windows, nuisance = int(problem.seen.sum()), problem.model.nuisance
-    if are_enough(windows, p) and windows > problem.clusters and not nuisance.chained:
+    windows, nuisance = int(problem.active_windows.sum()), problem.model.nuisance
+    if are_enough(windows, p) and windows > problem.clusters and not nuisance.has_defects:
         return "window", windows
     return "", 0
 
@@ -96,7 +96,7 @@ def covariance_by_cluster(problem: Problem, point: Unknowns, at: Linearization, 
     k = directions.shape[1]
     if not kind:
         return np.full((k, k), np.nan)
-    blocks, owner, seen = at.blocks, np.asarray(problem.windows.trial), problem.seen
+    blocks, owner, seen = at.blocks, np.asarray(problem.windows.trial), problem.active_windows
     clusters, n_own = owner, 0
     if kind == "window":  # each a trial of its own, whose biases are shared with others
         clusters, n_own = np.arange(len(owner), dtype=np.int32), blocks.n_b
@@ -125,15 +125,15 @@ def prior_rows(problem: Problem, point: Unknowns) -> tuple[np.ndarray, int]:
     """The rows (W, n_z + n_b + p, n) of all priors in the columns of a window's block [z, z_next, b, x, r], zero where
     there is none, and how many there are."""
     parameters, windows, nuisance = problem.parameters, problem.windows, problem.model.nuisance
-    seen, owner = problem.seen, np.asarray(windows.trial)
+    seen, owner = problem.active_windows, np.asarray(windows.trial)
     z, b, x = (np.asarray(u, float) for u in (point.z, point.b[windows.trial], parameters.prior_residuals(point.x)))
     of_trial = np.asarray(windows.first) & np.isin(owner, owner[seen])
-    counts = (of_trial if nuisance.chained else seen, of_trial, np.asarray(windows.very_first))
+    counts = (of_trial if nuisance.has_defects else seen, of_trial, np.asarray(windows.very_first))
     deviations = [np.asarray(d, float) for d in (nuisance.start_deviation, nuisance.trial_deviation)]
     residuals = (z / deviations[0], b / deviations[1], np.broadcast_to(x, (len(owner), len(x))))
     of_x = np.asarray(slopes_of(parameters, point.x), float) / np.asarray(parameters.prior_deviation, float)[:, None]
     slopes = np.asarray(scipy.linalg.block_diag(*(np.diag(1.0 / d) for d in deviations), of_x))
-    n_z, n_next = z.shape[1], z.shape[1] if nuisance.chained else 0
+    n_z, n_next = z.shape[1], z.shape[1] if nuisance.has_defects else 0
     slopes = np.insert(slopes, [n_z] * n_next, 0.0, axis=1)
     known = np.isfinite(np.concatenate([*deviations, np.asarray(parameters.prior_deviation, float)]))
     there = np.concatenate([np.tile(c[:, None], r.shape[1]) for c, r in zip(counts, residuals, strict=True)], axis=1)
@@ -164,7 +164,7 @@ def priors_of(problem: Problem, point: Unknowns, eliminated: Eliminated) -> Prio
     of_x, others, determined = rows[:, -p:, -p - 1 : -1], rows[:, :-p], 0.0
     information = np.einsum("wmi,wmj->ij", of_x, of_x)
     if others.any():
-        still, *moved = (eliminated.others(x) for x in jnp.eye(p + 1, p, -1, dtype=point.x.dtype))
+        still, *moved = (eliminated.back_substitute(x) for x in jnp.eye(p + 1, p, -1, dtype=point.x.dtype))
         z, b = (np.array([new - old for new in news]).T for *news, old in zip(*moved, still, strict=True))  # by x
         follow = np.concatenate([z.swapaxes(0, 1), b.swapaxes(0, 1)[np.asarray(problem.windows.trial)]], axis=1)
         places = [*range(blocks.n_z), *range(blocks.n_z + blocks.n_next, rows.shape[2] - p - 1)]
@@ -235,7 +235,7 @@ def by_trial(problem: Problem, simulated: np.ndarray) -> ByTrial:
             if channel not in trial.measured:
                 continue
             y = np.full(trial.t.shape, np.nan)
-            for i, (owner, first, n) in enumerate(problem.places):
+            for i, (owner, first, n) in enumerate(problem.slices):
                 if owner == k:
                     y[first : first + n] = simulated[i, c, :n]
             found[name][channel] = y

@@ -14,7 +14,7 @@ from .._common.lookup import refuse_unknown
 from .._system.system import System
 from ._bijections import PossibleBody
 from ._linearize import starts_of
-from ._model import Seen, Unknowns
+from ._model import Prediction, Unknowns
 from ._parameters import Parameters, leaf_names
 from ._problem import Problem
 from ._statistics import trial_names
@@ -59,11 +59,11 @@ def _in_words(values: np.ndarray, moves: tuple[int, ...]) -> str:
     return ", ".join(words)
 
 
-def nuisance_by_trial(problem: Problem, point: Unknowns, seen: Seen) -> dict[str, dict[str, Any]]:
+def nuisance_by_trial(problem: Problem, point: Unknowns, seen: Prediction) -> dict[str, dict[str, Any]]:
     """By trial, values of the biases and gains, and of the starts of its windows (W,), by name."""
     n = problem.model.nuisance
     starts = np.asarray(starts_of(problem.model, problem.windows, point)[0])[:, problem.model.unknown_places]
-    owner = np.array([k for k, _, _ in problem.places])
+    owner = np.array([k for k, _, _ in problem.slices])
     found = {}
     b = point.b if seen.unknowns is None else seen.unknowns  # with process noise a window is a trial
     given = np.isfinite(np.asarray(n.start_deviation)) & (problem.model.noise is not None)
@@ -90,7 +90,7 @@ def title(fit: Fit) -> str:
     n_r, n_unknown = fit.problem.size
     return (
         f"{type(fit.problem.system).__name__}: {len(fit.problem.trials)} trials, "
-        f"{len(fit.problem.places)} windows, {n_r} residuals, {len(fit.names)} parameters, "
+        f"{len(fit.problem.slices)} windows, {n_r} residuals, {len(fit.names)} parameters, "
         f"{n_unknown - len(fit.names)} nuisance values"
     )
 

@@ -156,7 +156,7 @@ class Trial:
             name=self.name,
         )
 
-    def begun(self, initial: Mapping[str, Any]) -> Trial:
+    def with_initial_state(self, initial: Mapping[str, Any]) -> Trial:
         """The same, with another `initial`."""
         return Trial(self.t, self.measured, self.inputs, sigma=self.sigma, initial=initial, name=self.name)
 

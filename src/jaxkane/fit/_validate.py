@@ -168,7 +168,7 @@ def costs_by_trial(problem: Problem, point: Unknowns) -> np.ndarray:
             others = problem.with_trials([problem.trials[k] for k in kept])
             costs[kept] = costs_by_trial(others, dataclasses.replace(others.start, x=point.x))
         return costs
-    value = at.seen.value
+    value = at.prediction.value
     costs = np.sum(np.asarray(at.blocks.R)[:, :, -1] ** 2, axis=1) if value is None else np.asarray(value)
     return np.bincount(np.asarray(problem.windows.trial), costs, minlength=len(problem.trials))
 

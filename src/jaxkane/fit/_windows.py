@@ -16,14 +16,14 @@ from ._trial import Trial
 Reach = tuple[float, float]
 """By how much inputs may act late and early [s]."""
 
-Place = tuple[int, int, int]
+WindowSlice = tuple[int, int, int]
 """Of a window: trial, first sample, number of samples."""
 
 
 class Windows(eqx.Module):
     """All windows of all trials, stacked; a short one repeats its last time with weight zero.
 
-    - `t` (W, n_t) [s]; where windows are chained, the last is the next window's first.
+    - `t` (W, n_t) [s]; where windows are has_defects, the last is the next window's first.
     - `measured`, `weight` (W, n_c, n_t): samples, and 1/sigma or zero.
     - `t_input` (W, n_in) [s], `inputs` (W, inputs, n_in): samples of the inputs, from before and after too where they
       are delayed. At most `n_acting` of them act within a window.
@@ -74,21 +74,23 @@ def cut(
     window: float | None,
     channels: Sequence[str],
     *,
-    chained: bool = False,
+    has_defects: bool = False,
     reach: Reach | None = None,
     step: float | None = None,
     guess: Mapping[str, float] | None = None,
-) -> tuple[Windows, tuple[Place, ...]]:
+) -> tuple[Windows, tuple[WindowSlice, ...]]:
     """Windows of `window` [s], or one a trial; and the place of each.
 
     A last piece shorter than half a window is joined to the one before, a lone sample to what follows. `reach`: of
     delays, None where there are none. `step` [s]: of the integration, by default that of the samples. `guess`: by name,
     where coordinates start of which nothing is known, if not at zero.
     """
-    places = [(k, i, n) for k, trial in enumerate(trials) for i, n in _pieces(trial, window, chained)]
-    if not chained:  # a window without one measurement would only add unknowns
+    places = [(k, i, n) for k, trial in enumerate(trials) for i, n in _pieces(trial, window, has_defects)]
+    if not has_defects:  # a window without one measurement would only add unknowns
         places = [place for place in places if any(np.isfinite(_take(trials, place, c)).any() for c in channels)]
-    linked = [chained and place[0] == after[0] for place, after in zip(places, [*places[1:], (-1, 0, 0)], strict=True)]
+    linked = [
+        has_defects and place[0] == after[0] for place, after in zip(places, [*places[1:], (-1, 0, 0)], strict=True)
+    ]
     n_t = max(n + more for (_, _, n), more in zip(places, linked, strict=True))
     found: dict[str, list[np.ndarray]] = {key: [] for key in ("t", "measured", "weight", "t_input", "inputs", "step")}
     kept: list[tuple[int, int]] = []  # the first sample of the inputs, and the one behind the last
@@ -136,7 +138,7 @@ def state_names(system: System) -> tuple[str, ...]:
     return (*system.coordinates, *system.speeds, *system.states)
 
 
-def _pieces(trial: Trial, window: float | None, chained: bool) -> list[tuple[int, int]]:
+def _pieces(trial: Trial, window: float | None, has_defects: bool) -> list[tuple[int, int]]:
     """First sample and number of samples of every window of a trial."""
     t = trial.t
     if window is None:
@@ -146,12 +148,12 @@ def _pieces(trial: Trial, window: float | None, chained: bool) -> list[tuple[int
     starts = np.flatnonzero(np.append(True, np.diff(number) > 0))
     if len(starts) > 1 and (t[-1] - t[starts[-1]] < 0.5 * window or starts[-1] == len(t) - 1):
         starts = starts[:-1]
-    if not chained:  # one sample says nothing about motion, unless the next window goes on from it
+    if not has_defects:  # one sample says nothing about motion, unless the next window goes on from it
         between = np.median(np.diff(t))
         if window < between * (1 - 1e-9):
             raise ValueError(
                 f"{trial.name}: its times are {between:.6g} s apart, so a `window` of {window:.6g} s holds one sample, "
-                "from which no motion follows. Give a longer one, or bind the windows together by `continuity`."
+                "from which no motion follows. Give a longer one, or bind the windows together by `defect_std`."
             )
         starts = np.array(_without_lone(starts.tolist(), len(t)))
     return [(int(i), int(n)) for i, n in zip(starts, np.diff(np.append(starts, len(t))), strict=True)]
@@ -179,7 +181,7 @@ def _most_within(t: np.ndarray, lasts: float) -> int:
     return int(np.max(np.searchsorted(t, t + lasts * (1 + 1e-9), side="right") - np.arange(len(t)))) + 2
 
 
-def _take(trials: Sequence[Trial], place: Place, channel: str) -> np.ndarray:
+def _take(trials: Sequence[Trial], place: WindowSlice, channel: str) -> np.ndarray:
     """Samples (n,) of one window, NaN where the trial has no such channel."""
     k, i, n = place
     return trials[k].measured.get(channel, np.full_like(trials[k].t, np.nan))[i : i + n]

@@ -42,7 +42,7 @@ def fit_bicycle(
         fit_bicycle(rides, bicycle, free=("steer_damping",), input_bias=("roll_torque", "steer_torque"), window=1.0)
 
     **Arguments:** `rides`, `bicycle`, `free` and `options` as in `bicycle_problem`, of which the most used are
-    `unknown`, `window`, `input_bias`, `sensor_bias`, `priors`, `hold` and `simulation`; the rest as in `fit`.
+    `unknown`, `window`, `input_bias`, `sensor_bias`, `priors` and `zero_order_hold`; the rest as in `fit`.
 
     **Returns:** a `Fit`.
 
@@ -138,4 +138,4 @@ def _with_wheel_rate(ride: Trial, bicycle: WhippleBicycle) -> Trial:
         initial["rear_wheel_rate"] = -initial.pop("speed") / float(bicycle.rR)
     elif "rear_wheel_rate" not in initial and "rear_wheel_rate" not in ride.measured:
         raise ValueError(f"{ride.name}: a ride needs its speed: Trial(..., initial={{'speed': v}}) [m/s].")
-    return ride.begun(initial)
+    return ride.with_initial_state(initial)
