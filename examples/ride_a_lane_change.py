@@ -31,7 +31,7 @@ import numpy as np
 from matplotlib.patches import Ellipse
 
 import jaxkane as jk
-from jaxkane.bicycles import Bicycle, LaneChange, PathFollower, SequentialLoopRider, lqr
+from jaxkane.bicycles import Bicycle, LaneChange, PathFollower, SequentialLoopRider, scheduled_lqr
 
 jax.config.update("jax_enable_x64", True)
 
@@ -43,7 +43,7 @@ RIDERS = {
     "sequential loops": SequentialLoopRider.benchmark(SPEED, path=PATH, preview=LOOKS_AHEAD["sequential loops"]),
     "regulator": (
         PathFollower(PATH, preview=LOOKS_AHEAD["regulator"]),
-        lqr(BICYCLE, [2.0, 3.0, 4.0], Q=[10.0, 1.0, 1.0, 0.1], R=0.01),
+        scheduled_lqr(BICYCLE, [2.0, 3.0, 4.0], Q=[10.0, 1.0, 1.0, 0.1], R=0.01),
     ),
 }
 COLORS = {"sequential loops": "#14507a", "regulator": "#c8552b"}

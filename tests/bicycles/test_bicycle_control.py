@@ -27,11 +27,10 @@ from jaxkane.bicycles import (
     SteeringMotor,
     Tyre,
     follow_gain,
-    lqr,
+    scheduled_lqr,
 )
 from jaxkane.catalog import WhippleBicycle
-from jaxkane.stability import eigenvalues, linearize, straight_ahead
-from jaxkane.stability import lqr as regulator
+from jaxkane.stability import eigenvalues, linearize, lqr, straight_ahead
 
 BENCHMARK = Bicycle.benchmark()
 LATERAL = ("roll", "steer", "roll_rate", "steer_rate")
@@ -215,8 +214,8 @@ def test_gains_are_linear_between_the_speeds_of_a_schedule():
 def test_regulators_are_scheduled_over_speed():
     """1e-12 against the regulator of one speed; stable at the speeds between and above."""
     Q, R = [10.0, 1.0, 1.0, 0.1], 0.01
-    control = lqr(BENCHMARK, [2.0, 4.0, 6.0], Q, R)
-    K, _, _ = regulator(straight(BENCHMARK, 4.0), Q, R, inputs=["steer_torque"])
+    control = scheduled_lqr(BENCHMARK, [2.0, 4.0, 6.0], Q, R)
+    K, _, _ = lqr(straight(BENCHMARK, 4.0), Q, R, inputs=["steer_torque"])
     np.testing.assert_allclose(control.gains[1], K[0], rtol=1e-12)
     steered = eigenvalues(BENCHMARK.with_parts(control=control), np.linspace(2.0, 8.0, 13)).eigenvalues
     assert np.asarray(steered).real.max() < -1.0
@@ -225,7 +224,7 @@ def test_regulators_are_scheduled_over_speed():
 @pytest.mark.slow
 def test_a_bicycle_leans_as_far_as_it_is_asked():
     """By `follow_gain`, 1e-9: the regulator's own is one at a speed of a schedule of one."""
-    regulated = BENCHMARK.with_parts(control=lqr(BENCHMARK, [4.0], [10.0, 1.0, 1.0, 0.1], 0.01))
+    regulated = BENCHMARK.with_parts(control=scheduled_lqr(BENCHMARK, [4.0], [10.0, 1.0, 1.0, 0.1], 0.01))
     np.testing.assert_allclose(follow_gain(regulated, 4.0), 1.0, rtol=1e-9)
     with pytest.raises(ValueError, match="desired_roll"):
         follow_gain(BENCHMARK, 4.0)

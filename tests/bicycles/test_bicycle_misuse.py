@@ -30,7 +30,7 @@ from jaxkane.bicycles import (
     SteeringMotor,
     Trailer,
     Tyre,
-    lqr,
+    scheduled_lqr,
     schwalbe_energizer,
     separate_rider,
 )
@@ -76,7 +76,7 @@ class Aside(Part):
         (lambda: Named(), TypeError, r"is a tuple of names, got 'drop'"),
         (lambda: separate_rider(BENCHMARK.with_parts(rider=RIDER), RIDER), ValueError, "has a rider already"),
         (
-            lambda: lqr(BENCHMARK.with_parts(control=LeanSteerGains()), [4.0], np.ones(4), 0.1),
+            lambda: scheduled_lqr(BENCHMARK.with_parts(control=LeanSteerGains()), [4.0], np.ones(4), 0.1),
             ValueError,
             "balance alr",
         ),

@@ -1,24 +1,23 @@
 """Bicycles put together from parts: tyres, riders, steering, frames, drives, and who steers them."""
 
-from ._arms import Arms as Arms
 from ._bicycle import Bicycle as Bicycle
-from ._carried import ConstantSpeed as ConstantSpeed
-from ._carried import Drag as Drag
-from ._carried import Trailer as Trailer
 from ._control import LaneChange as LaneChange
 from ._control import LeanSteerGains as LeanSteerGains
 from ._control import PathFollower as PathFollower
 from ._control import ScheduledGains as ScheduledGains
 from ._control import SequentialLoopRider as SequentialLoopRider
 from ._control import follow_gain as follow_gain
-from ._control import lqr as lqr
+from ._control import scheduled_lqr as scheduled_lqr
+from ._drive import ConstantSpeed as ConstantSpeed
+from ._drive import Drag as Drag
 from ._ground import Ground as Ground
 from ._ground import Road as Road
 from ._ground import Slope as Slope
 from ._literature import browser_jason as browser_jason
 from ._literature import sharp_motorcycle as sharp_motorcycle
 from ._literature import toroidal as toroidal
-from ._parts import Part as Part
+from ._part import Part as Part
+from ._rider import Arms as Arms
 from ._rider import LeaningRider as LeaningRider
 from ._rider import Rider as Rider
 from ._rider import RigidRider as RigidRider
@@ -27,11 +26,12 @@ from ._steering import HeadTwist as HeadTwist
 from ._steering import SteerByWire as SteerByWire
 from ._steering import SteeringFriction as SteeringFriction
 from ._steering import SteeringMotor as SteeringMotor
+from ._trailer import Trailer as Trailer
 from ._tyre import Contact as Contact
 from ._tyre import Tyre as Tyre
 from ._tyre_laws import LateralSlip as LateralSlip
 from ._tyre_laws import LongitudinalSlip as LongitudinalSlip
 from ._tyre_laws import MagicFormula as MagicFormula
 from ._tyre_laws import MagicFormula89 as MagicFormula89
-from ._tyre_laws import Slip as Slip
+from ._tyre_laws import TyreForceLaw as TyreForceLaw
 from ._tyre_laws import schwalbe_energizer as schwalbe_energizer

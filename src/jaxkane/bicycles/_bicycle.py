@@ -1,4 +1,4 @@
-"""A bicycle put together from parts, on the parameters of the Whipple bicycle. Knows kinematics and its parts' methods.
+"""A bicycle put together from parts, on the parameters of the Whipple bicycle.
 
 Its motion follows Example 7 and Meijaard et al. (2007). Where a tyre slips, velocities of its contact that ideal
 rolling makes zero are speeds, and forces of the tyre stand in the place of those of the constraint.
@@ -8,48 +8,42 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
 import equinox as eqx
 import jax.numpy as jnp
 
-from .._common.lookup import refuse_unknown
+from .._common.lookup import not_there, refuse_unknown
 from .._kane.arguments import as_row
+from .._kane.checks import is_concrete
 from .._kane.rhs import named_row
-from .._scalarjit.components import Component, add
+from .._scalarjit.components import Component, add, component, total
 from .._system.kinematics import Frame, Point, Vector
-from .._system.motion import Motion
+from .._system.motion import Motion, NameTaken
 from .._system.parameters import parameters_in, with_parameters
 from ..catalog.bicycle import WhippleBicycle
 from ._files import as_meijaard, read_yaml
-from ._ground import Ground
-from ._kinematics import clearance, motion_of, off_road, place_rates
-from ._part_methods import (
-    as_tuple,
-    by_name,
-    commanded,
-    deflections_of_tyres,
-    front_speeds,
-    label_of,
-    lateral_names,
-    load_transfers,
-    mode_groups,
-    needs_trim,
-    of_parts,
-    refuse_misfits,
-    road_coordinates,
-    slip_speeds,
-)
-from ._parts import Part
+from ._ground import Ground, Slope
+from ._kinematics import FRONT, REAR, bicycle_motion, clearance, contact_rates, off_road, wheels
+from ._part import NAMES, BicycleMotion, Part, called
 from ._rider import rider_of
 from ._steering import HeadTwist
 from ._tyre import Tyre
-from ._tyre_forces import deflection_rates, loads_of_tyres, overloaded, transfer_rates, tyre_forces, tyre_loads
 
 OFF_ROAD = 1e-3
 """[m]: a motion over a `Road` ends where a contact is further from it than that."""
+
+_ORDER = "rider, control, steering, drive, extra"
+_SECOND_OF_A_KIND = "Values are read by name: for a second part of a kind write a Part of your own, with other names."
+_ASIDE = ("_lateral_slip", "_lateral_deflection")
+
+
+def _as_tuple(parts: Any) -> tuple[Any, ...]:
+    if isinstance(parts, (tuple, list)):
+        return tuple(parts)
+    return () if parts is None else (parts,)
 
 
 class Bicycle(WhippleBicycle):
@@ -89,11 +83,34 @@ class Bicycle(WhippleBicycle):
     control: Part | tuple[Part, ...] | None = None
     steering: Part | tuple[Part, ...] | None = None
     drive: Part | tuple[Part, ...] | None = None
-    extra: tuple[Part, ...] = eqx.field(default=(), converter=as_tuple)
+    extra: tuple[Part, ...] = eqx.field(default=(), converter=_as_tuple)
     road: Ground = eqx.field(default_factory=Ground)
 
     def __check_init__(self) -> None:
-        refuse_misfits(self)
+        name = type(self).__name__
+        for field, kind in (("rear_tyre", Tyre), ("front_tyre", Tyre), ("head", HeadTwist), ("road", Ground)):
+            value = getattr(self, field)
+            if not (isinstance(value, kind) or (field == "head" and value is None)):
+                or_none = " or None" if field == "head" else ""
+                raise TypeError(f"{name}: `{field}` is a {kind.__name__}{or_none}, got {called(value)}.")
+        for field in _ORDER.split(", "):
+            for part in _as_tuple(getattr(self, field)):
+                if not isinstance(part, Part):
+                    raise TypeError(f"{name}: `{field}` holds a Part of jaxkane.bicycles, got {called(part)}.")
+        _refuse_equal_names(self)
+        known = (*self.coordinates, *self.speeds, *self.dependent_speeds, *self.states)
+        for part in self.parts:
+            part.check(self)
+            refuse_unknown(part.lateral(), known, f"{_method(part, 'lateral')}: {name} has no")
+        for end, tyre, radius in ((REAR, self.rear_tyre, self.rR), (FRONT, self.front_tyre, self.rF)):
+            crown = tyre.crown
+            if crown is None or not is_concrete(crown, radius) or crown.ndim or radius.ndim:
+                continue  # members of a batch are not looked at
+            if float(crown) >= float(radius):  # numbers, where others are traced
+                raise ValueError(
+                    f"{name}: {end}_tyre.crown = {crown} m is the radius of the tyre's cross section, and must be less "
+                    f"than that of its wheel, {radius} m."
+                )
 
     def with_parts(self, **parts: Any) -> Self:
         """A copy with other parts by the names of the fields, or with other parameters by their names, those of a part
@@ -119,67 +136,70 @@ class Bicycle(WhippleBicycle):
             return super().from_file(path)
         kind, values = read_yaml(path)
         try:
-            found, rider = as_meijaard(kind, values)
-            return cls.from_parameters(found | ({} if rider is None else {"rider": rider_of(rider)}))
+            parameters, rider = as_meijaard(kind, values)
+            return cls.from_parameters(parameters | ({} if rider is None else {"rider": rider_of(rider)}))
         except ValueError as error:
             raise ValueError(f"{os.fspath(path)}: {error}") from None
 
     @property
     def parts(self) -> tuple[Part, ...]:
         """All parts, in the order in which their methods are called; tyres are not among them."""
-        held = (getattr(self, field.name) for field in dataclasses.fields(self))
-        return tuple(part for each in held for part in as_tuple(each) if isinstance(part, Part))
+        values = (getattr(self, field.name) for field in dataclasses.fields(self))
+        return tuple(part for value in values for part in _as_tuple(value) if isinstance(part, Part))
 
     @property
     def coordinates(self) -> tuple[str, ...]:
-        return (*WhippleBicycle.coordinates, *road_coordinates(self), *of_parts(self, "coordinates"))
+        return (*WhippleBicycle.coordinates, *_road_coordinates(self), *_of_parts(self, "coordinates"))
 
     @property
     def speeds(self) -> tuple[str, ...]:
-        held = of_parts(self, "dependent_speeds")  # a part may hold a speed of the bicycle
-        independent = (*WhippleBicycle.speeds, *slip_speeds(self), *of_parts(self, "speeds"))
-        return tuple(name for name in independent if name not in held)
+        dependent = _of_parts(self, "dependent_speeds")  # a part may prescribe a speed of the bicycle
+        independent = (*WhippleBicycle.speeds, *_slip_speeds(self), *_of_parts(self, "speeds"))
+        return tuple(name for name in independent if name not in dependent)
 
     @property
     def dependent_speeds(self) -> tuple[str, ...]:
-        return (*WhippleBicycle.dependent_speeds, *front_speeds(self), *of_parts(self, "dependent_speeds"))
+        return (*WhippleBicycle.dependent_speeds, *_front_speeds(self), *_of_parts(self, "dependent_speeds"))
 
     @property
     def dependent_coordinates(self) -> tuple[str, ...]:
-        return (
-            *WhippleBicycle.dependent_coordinates,
-            *road_coordinates(self),
-            *of_parts(self, "dependent_coordinates"),
-        )
+        own = (*WhippleBicycle.dependent_coordinates, *_road_coordinates(self))
+        return (*own, *_of_parts(self, "dependent_coordinates"))
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        return (*WhippleBicycle.inputs, *of_parts(self, "inputs"))
+        return (*WhippleBicycle.inputs, *_of_parts(self, "inputs"))
 
     @property
     def states(self) -> tuple[str, ...]:
-        return (*deflections_of_tyres(self), *load_transfers(self), *of_parts(self, "states"))
+        return (*_deflections(self), *_load_transfers(self), *_of_parts(self, "states"))
 
     @property
     def units(self) -> Mapping[str, str]:
-        found = {**WhippleBicycle.units, **dict.fromkeys(slip_speeds(self), "m/s")}
-        found |= dict.fromkeys((*deflections_of_tyres(self), *road_coordinates(self)), "m") | dict.fromkeys(
-            front_speeds(self), "m/s"
-        )
+        units = {**WhippleBicycle.units, **dict.fromkeys((*_slip_speeds(self), *_front_speeds(self)), "m/s")}
+        units |= dict.fromkeys((*_deflections(self), *_road_coordinates(self)), "m")
         for part in self.parts:
-            found |= part.units
-        return found | {f"applied_{name}": found[name] for name in self.inputs if name in found}
+            units |= part.units
+        return units | {f"applied_{name}": units[name] for name in self.inputs if name in units}
 
     @property
     def lateral(self) -> tuple[str, ...]:
         """Names of what its linear model about straight riding holds: the coordinates, speeds and states that move to
         first order when it leaves the upright plane."""
-        return lateral_names(self)
+        of_tyres = [name for name in (*_slip_speeds(self), *_deflections(self)) if name.endswith(_ASIDE)]
+        moving = {*WhippleBicycle.lateral, *of_tyres, *(name for part in self.parts for name in part.lateral())}
+        return tuple(name for name in (*self.coordinates, *self.speeds, *self.states) if name in moving)
 
     @property
     def needs_trim(self) -> bool:
         """Whether riding straight on takes a torque of the drive, or moves coordinates of parts that gravity loads."""
-        return needs_trim(self)
+        resists = any(part.resists for part in self.parts) or isinstance(self.road, Slope)
+        moves = any(
+            name not in (*part.lateral(), *part.dependent_coordinates)
+            for part in self.parts
+            for name in part.coordinates
+        )
+        return resists or moves or any(tyre.rolling_resistance is not None for _, tyre in _tyres(self))
 
     @property
     def mode_groups(self) -> dict[str, tuple[str, ...]]:
@@ -187,16 +207,25 @@ class Bicycle(WhippleBicycle):
 
         The front end gives way in the tyre's relaxation or the frame's torsion: then it can wobble.
         """
-        return mode_groups(self)
+        lateral, groups = self.lateral, {}
+        for end in (REAR, FRONT):
+            names = (f"{end}_lateral_slip", f"{end}_lateral_deflection")
+            groups[f"{end} tyre"] = tuple(name for name in names if name in lateral)
+        for field in dataclasses.fields(self):
+            parts = [part for part in _as_tuple(getattr(self, field.name)) if isinstance(part, Part)]
+            groups[field.name] = tuple(name for part in parts for name in part.lateral())
+        elastic = [groups.pop("head"), *([groups.pop("front tyre")] if len(groups["front tyre"]) == 2 else [])]
+        groups |= dict(zip(("wobble", "front end"), [names for names in elastic if names], strict=False))
+        return {name: names for name, names in groups.items() if names}
 
     def q_dot(self, t, q, u):
-        turning = [u[f"{part}_rate"] for part in ("roll", "rear_wheel", "steer", "yaw", "pitch", "front_wheel")]
-        moving = list(place_rates(self, q, u))
+        turning = [u[f"{name}_rate"] for name in ("roll", "rear_wheel", "steer", "yaw", "pitch", "front_wheel")]
+        rates = self.road.rates(q["x"], q["y"], q["yaw"], *contact_rates(self, q, u))
+        moving = list(rates)
         if self.road.curved:
-            climbing = self.road.climbing(q["x"], q["y"], place_rates(self, q, u))
-            moving += [*(u[name] for name in front_speeds(self)), climbing]
+            moving += [*(u[name] for name in _front_speeds(self)), self.road.climbing(q["x"], q["y"], rates)]
         for part in self.parts:
-            moving += as_row(part.q_dot(self, t, q, u), part.coordinates, label_of(part, "q_dot"))
+            moving += as_row(part.q_dot(self, t, q, u), part.coordinates, _method(part, "q_dot"))
         return (*turning, *moving)
 
     @property
@@ -208,7 +237,10 @@ class Bicycle(WhippleBicycle):
         return x, -self.rR - x * sin / cos
 
     def motion(self, t, q, u):
-        return motion_of(self, t, q, u)
+        motion = bicycle_motion(self, q, u)
+        for part in self.parts:
+            motion = _motion_with(self, part, motion, t, q, u)
+        return motion
 
     def on_frame(self, motion: Motion, x: Component, y: Component, z: Component) -> Point:
         """A point that is fixed in the frame B, in Meijaard's measures: from the rear contact of the upright bicycle,
@@ -225,58 +257,228 @@ class Bicycle(WhippleBicycle):
     def tyre_loads(self, motion: Any) -> dict[str, Component]:
         """What the ground carries under each wheel [N], "rear" and "front", if nothing accelerated: from the moments of
         all weights about the contacts."""
-        return tyre_loads(self, motion)
+        gravity, Y, P = self.gravity(motion.N), motion["Y"], motion["P"]
+        moments = [body.center.position_from(P).cross(body.mass * gravity).dot(Y.y) for body in motion.bodies]
+        front = sum(moments[1:], moments[0]) / motion["Q"].position_from(P).cross(motion.front.normal).dot(Y.y)
+        pressing = _mass(motion) * gravity.dot(motion.rear.normal)
+        return {REAR: pressing - front * motion.front.normal.dot(motion.rear.normal), FRONT: front}
 
     def tyre_forces(self, motion: Any, values: Mapping[str, Component]) -> dict[str, Component]:
         """Forces of the ground on the tyres that slip [N], as "front_lateral_force"; `values` as of `loads`."""
-        return tyre_forces(self, motion, values)
-
-    def loads(self, t, q, u, motion, inputs):
-        values = commanded(self, t, q, u, motion, inputs)
-        found: list[Any] = [super().loads(t, q, u, motion, values)]
-        found += loads_of_tyres(self, motion, values)
-        found += [part.loads(self, t, q, u, motion, values) for part in self.parts]
-        return found
+        carried, forces = _loads_with_transfer(self, motion, values), {}
+        for end, tyre, contact, _, _ in wheels(self, motion):
+            of_tyre = tyre.forces(contact, carried[end], _deflections_of(end, tyre, values))
+            forces |= {f"{end}_{name}_force": force for name, force in of_tyre.items()}
+        return forces
 
     def why_not_finite(self, motion, inputs):
-        return overloaded(self, motion, inputs)
+        carried = _loads_with_transfer(self, motion, inputs)
+        return " and ".join(
+            f"the {end} tyre carries {float(carried[end]):.4g} N, more than the largest_load of its "
+            f"{type(law).__name__}, {law.largest_load:g} N,"
+            for end, tyre in _tyres(self)
+            for _, law in tyre.laws
+            if float(carried[end]) > law.largest_load
+        )
+
+    def loads(self, t, q, u, motion, inputs):
+        values = _commanded(self, t, q, u, motion, inputs)
+        loads: list[Any] = [super().loads(t, q, u, motion, values)]
+        slipping = [each for each in wheels(self, motion) if each[1].laws or each[1].rolling_resistance is not None]
+        carried = _loads_with_transfer(self, motion, values) if slipping else {}
+        for end, tyre, contact, wheel, radius in slipping:
+            deflections = _deflections_of(end, tyre, values)
+            loads.append(tuple(tyre.loads(contact, wheel, radius, carried[end], deflections)))
+        loads += [part.loads(self, t, q, u, motion, values) for part in self.parts]
+        return loads
 
     def state_rates(self, t, q, u, x, motion: Any, now):
-        now = now.with_values(commanded(self, t, q, u, motion, now))
-        rates = [*deflection_rates(self, motion, x), *transfer_rates(self, motion, now)]
+        now = now.with_values(_commanded(self, t, q, u, motion, now))
+        rates = []
+        for end, tyre, contact, _, _ in wheels(self, motion):
+            rates += tyre.deflection_rates(contact, _deflections_of(end, tyre, x))
+        carried = _loads_with_transfer(self, motion, now) if _load_transfers(self) else {}
+        for (end, tyre), point, contact in zip(_tyres(self), "PQ", (motion.rear, motion.front), strict=True):
+            if tyre.load_lag is not None:
+                load = -now.force(point).dot(contact.normal)
+                rates.append((load - carried[end]) / (_mass(motion) * self.g * tyre.load_lag))
         for part in self.parts:
-            rates += named_row(
-                part.state_rates(self, t, q, u, x, motion, now), part.states, label_of(part, "state_rates")
-            )
+            of_part = part.state_rates(self, t, q, u, x, motion, now)
+            rates += named_row(of_part, part.states, _method(part, "state_rates"))
         return rates
 
     def outputs(self, t, q, u, motion: Any, now):
-        given = commanded(self, t, q, u, motion, now)
-        now = now.with_values(given)
-        found: dict[str, Any] = dict(self.tyre_forces(motion, now))
-        found |= {f"applied_{name}": now[name] for name in given.commanded}
+        values = _commanded(self, t, q, u, motion, now)
+        now = now.with_values(values)
+        outputs: dict[str, Any] = dict(self.tyre_forces(motion, now))
+        outputs |= {f"applied_{name}": now[name] for name in values.commanded}
         for part in self.parts:
-            more = by_name(part.outputs(self, t, q, u, motion, now), label_of(part, "outputs"))
-            twice = [name for name in more if name in found]
+            label = _method(part, "outputs")
+            of_part = _checked_dict(part.outputs(self, t, q, u, motion, now), label)
+            twice = [name for name in of_part if name in outputs]
             if twice:
-                raise ValueError(f"{label_of(part, 'outputs')}: there is an output {twice[0]!r} already.")
-            found |= more
-        return found
+                raise ValueError(f"{label}: there is an output {twice[0]!r} already.")
+            outputs |= of_part
+        return outputs
 
     def configuration_constraints(self, t, q):
-        motion = self.motion(t, q, (0.0,) * (len(self.speeds) + len(self.dependent_speeds)))
-        held = off_road(self, motion, q)
+        motion = _motion_at_rest(self, t, q)
+        residuals = off_road(self, motion, q)
         if self.road.curved:
-            there = sum(x * x for x in held) < (1e-3 * OFF_ROAD) ** 2  # not on the way of a solver
-            refused = there & (clearance(self, motion) <= 0.0)
-            held = [jnp.where(refused, jnp.nan, x) for x in held]
-        return [*held, *(x for part in self.parts for x in part.configuration_constraints(self, t, q, motion))]
+            on_road = sum(x * x for x in residuals) < (1e-3 * OFF_ROAD) ** 2  # not on the way of a solver
+            refused = on_road & (clearance(self, motion) <= 0.0)
+            residuals = [jnp.where(refused, jnp.nan, x) for x in residuals]
+        return [*residuals, *(x for part in self.parts for x in part.configuration_constraints(self, t, q, motion))]
 
     def events(self, t, q, u):
-        found = super().events(t, q, u)
+        events = super().events(t, q, u)
         if not self.road.curved:
-            return found
-        at_rest = self.motion(t, q, (0.0,) * (len(self.speeds) + len(self.dependent_speeds)))
+            return events
+        motion = _motion_at_rest(self, t, q)
         # An edge that is narrower than a step of the solver shows by what is off the road after it.
-        on_road = 1.0 - sum(x * x for x in off_road(self, at_rest, q)) / OFF_ROAD**2
-        return {**found, "wheel_touches_twice": clearance(self, at_rest), "wheel_off_the_road": on_road}
+        on_road = 1.0 - sum(x * x for x in off_road(self, motion, q)) / OFF_ROAD**2
+        return {**events, "wheel_touches_twice": clearance(self, motion), "wheel_off_the_road": on_road}
+
+
+def _of_parts(bicycle: Bicycle, kind: str) -> tuple[str, ...]:
+    return tuple(name for part in bicycle.parts for name in getattr(part, kind))
+
+
+def _tyres(bicycle: Bicycle) -> Iterator[tuple[str, Tyre]]:
+    yield from ((REAR, bicycle.rear_tyre), (FRONT, bicycle.front_tyre))
+
+
+def _slip_speeds(bicycle: Bicycle) -> tuple[str, ...]:
+    return tuple(f"{end}_{name}_slip" for end, tyre in _tyres(bicycle) for name, _ in tyre.laws)
+
+
+def _deflections(bicycle: Bicycle) -> tuple[str, ...]:
+    return tuple(f"{end}_{name}_deflection" for end, tyre in _tyres(bicycle) for name in tyre.deflects)
+
+
+def _load_transfers(bicycle: Bicycle) -> tuple[str, ...]:
+    """States by which the loads of tyres follow what the ground carries."""
+    return tuple(f"{end}_load_transfer" for end, tyre in _tyres(bicycle) if tyre.load_lag is not None)
+
+
+def _road_coordinates(bicycle: Bicycle) -> tuple[str, ...]:
+    return ("front_x", "front_y", "rear_height") if bicycle.road.curved else ()
+
+
+def _front_speeds(bicycle: Bicycle) -> tuple[str, ...]:
+    return ("front_x_rate", "front_y_rate") if bicycle.road.curved else ()
+
+
+def _places(bicycle: Bicycle) -> list[str]:
+    """Where each part stands, and what it is: "extra[0], a Trailer"; one part may stand in two places."""
+    places = []
+    for field in dataclasses.fields(bicycle):
+        value = getattr(bicycle, field.name)
+        for i, part in enumerate(_as_tuple(value)):
+            place = f"{field.name}[{i}]" if isinstance(value, (tuple, list)) else field.name
+            places += [f"{place}, {called(part)}"] * isinstance(part, Part)
+    return places
+
+
+def _refuse_equal_names(bicycle: Bicycle) -> None:
+    """Parts of one kind have the same names: values could not be told apart."""
+    owners: dict[str, int] = {}
+    places = _places(bicycle)
+    for i, part in enumerate(bicycle.parts):
+        for kind in NAMES:
+            for name in getattr(part, kind):
+                if owners.setdefault(name, i) != i:
+                    raise ValueError(
+                        f"{type(bicycle).__name__}: the name {name!r} stands twice in `{kind}`: of "
+                        f"{places[owners[name]]} and of {places[i]}. {_SECOND_OF_A_KIND}"
+                    )
+
+
+def _motion_with(bicycle: Bicycle, part: Part, motion: BicycleMotion, t: Component, q: Any, u: Any) -> BicycleMotion:
+    try:
+        extended = part.motion(bicycle, motion, t, q, u)
+    except NameTaken as error:
+        places = zip(bicycle.parts, _places(bicycle), strict=True)
+        place = next((place for each, place in places if each is part), called(part))
+        raise ValueError(f"{type(bicycle).__name__}: {place}: {error} {_SECOND_OF_A_KIND}") from None
+    if not isinstance(extended, type(motion)):
+        hint = " Does it end without a `return`?" if extended is None else ""
+        raise TypeError(f"{_method(part, 'motion')} returns `motion.extended(...)`, got {extended!r}.{hint}")
+    return extended
+
+
+def _loads_with_transfer(bicycle: Bicycle, motion: Any, values: Mapping[str, Component]) -> dict[str, Component]:
+    """Loads that the laws of the tyres read [N]."""
+    loads = bicycle.tyre_loads(motion)
+    for name in _load_transfers(bicycle):
+        end = name.partition("_")[0]
+        loads[end] = loads[end] + _mass(motion) * bicycle.g * values[name]
+    return loads
+
+
+def _commanded(bicycle: Bicycle, t: Any, q: Any, u: Any, motion: Any, values: Mapping[str, Component]) -> _Commanded:
+    """Inputs and states by name, with what the parts add to the inputs.
+
+    **Raises:** `KeyError` for an input that no part has; `ValueError` for one that its part has read before.
+    """
+    name = type(bicycle).__name__
+    commanded = _Commanded(values)
+    late: set[str] = set()
+    for part in bicycle.parts:
+        commanded.read.clear()
+        kind = type(part).__name__
+        commands = _checked_dict(part.commands(bicycle, t, q, u, motion, commanded), _method(part, "commands"))
+        for to, command in commands.items():
+            if to not in bicycle.inputs:
+                raise not_there(to, bicycle.inputs, f"the inputs of {name}, of which {kind} adds to this one")
+            if to in late:
+                raise ValueError(
+                    f"{name}: {kind} adds to {to!r} after the part that reads it, which would miss it. Put it "
+                    f"before that part; parts are called in the order {_ORDER}."
+                )
+            commanded[to] = add(commanded.get(to), component(command))
+            commanded.commanded[to] = None
+        late |= commanded.read.intersection(part.inputs)
+    return commanded
+
+
+def _motion_at_rest(bicycle: Bicycle, t: Component, q: Any) -> Any:
+    return bicycle.motion(t, q, (0.0,) * (len(bicycle.speeds) + len(bicycle.dependent_speeds)))
+
+
+class _Commanded(dict[str, Any]):
+    """Inputs and states by name, as parts receive them.
+
+    `commanded`: names of those inputs that parts add to; `read`: names that were looked up.
+    """
+
+    def __init__(self, values: Mapping[str, Component]):
+        super().__init__(values)
+        self.commanded: dict[str, None] = {}
+        self.read: set[str] = set()
+
+    def __getitem__(self, name: str) -> Component:
+        self.read.add(name)
+        return super().__getitem__(name)
+
+    def __missing__(self, name: str) -> Component:
+        raise not_there(name, self, "the inputs and states of this bicycle")
+
+
+def _method(part: Part, method: str) -> str:
+    return f"{type(part).__name__}.{method}"
+
+
+def _checked_dict(returned: Any, label: str) -> Mapping[str, Any]:
+    if not isinstance(returned, Mapping):
+        hint = " Does it end without a `return`?" if returned is None else ""
+        raise TypeError(f"{label} returns numbers by name, in a dict; got {returned!r}.{hint}")
+    return returned
+
+
+def _deflections_of(end: str, tyre: Tyre, values: Any) -> dict[str, Component]:
+    return {name: values[f"{end}_{name}_deflection"] for name in tyre.deflects}
+
+
+def _mass(motion: Motion) -> Component:
+    return total(component(body.mass) for body in motion.bodies)

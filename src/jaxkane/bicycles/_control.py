@@ -17,10 +17,9 @@ from .._scalarjit.components import Component, Scalar, mul, sub
 from .._system.parameters import Learned, learned, parameter, to_float
 from ..catalog.bicycle import TILT
 from ..loads import smooth_abs
-from ..stability import linearize, straight_ahead
-from ..stability import lqr as regulator
+from ..stability import linearize, lqr, straight_ahead
 from ._bicycle import Bicycle
-from ._parts import Part, check_parameters
+from ._part import Part, check_parameters
 
 STEER = "steer_torque"
 
@@ -61,7 +60,7 @@ class ScheduledGains(Part):
 
     Between the speeds of the schedule the gains are linear in v, with corners that are rounded over a twentieth of the
     smallest interval, so that every derivative is finite. Below the first speed and above the last the gains stay what
-    they are there. `lqr` makes such a part.
+    they are there. `scheduled_lqr` makes such a part.
 
     **Arguments:** `at` (n,) [m/s]: the speeds of the schedule, increasing; `measured`: m names of coordinates, speeds
     and states of the first order; `gains` (n, m), in N m for the unit of each; `follow` (n,) [N m/rad]; `command`: the
@@ -144,7 +143,7 @@ def follow_gain(bicycle: Bicycle, speed: float) -> float:
     return float(1.0 / turned[model.states.index("roll")])
 
 
-def lqr(
+def scheduled_lqr(
     bicycle: Bicycle,
     speeds: Sequence[float],
     Q: Any,
@@ -155,7 +154,7 @@ def lqr(
 ) -> ScheduledGains:
     """Linear-quadratic regulators of riding straight at several speeds, as one part with scheduled gains.
 
-        bicycle.with_parts(control=lqr(bicycle, jnp.linspace(2.0, 8.0, 7), Q=[10.0, 1.0, 1.0, 0.1], R=0.01))
+        bicycle.with_parts(control=scheduled_lqr(bicycle, jnp.linspace(2.0, 8.0, 7), Q=[10.0, 1.0, 1.0, 0.1], R=0.01))
 
     At each speed `jaxkane.stability.lqr` of `jaxkane.stability.linearize`. The gain of "desired_roll" is the one with
     which a steady turn of that linear model has this roll.
@@ -167,12 +166,14 @@ def lqr(
     **Raises:** `ValueError` as those two functions, as where no regulator exists, and for a bicycle with a balance.
     """
     if "desired_roll" in bicycle.inputs:
-        raise ValueError(f"lqr: the {type(bicycle).__name__} has a balance already: bicycle.with_parts(control=None).")
+        raise ValueError(
+            f"scheduled_lqr: the {type(bicycle).__name__} has a balance already: bicycle.with_parts(control=None)."
+        )
     names = bicycle.lateral if states is None else as_names(states)
     gains, follow = [], []
     for v in np.asarray(speeds, dtype=float):
         model = linearize(bicycle, straight_ahead(bicycle, v), states=names)
-        K, _, _ = regulator(model, Q, R, inputs=[command])
+        K, _, _ = lqr(model, Q, R, inputs=[command])
         A, B = np.asarray(model.A), np.asarray(model.B)[:, model.inputs.index(command)]
         turned = np.linalg.solve(A - B[:, None] @ K, -B)  # the steady states of a constant command beside the feedback
         gains.append(K[0])

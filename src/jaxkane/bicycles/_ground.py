@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -19,11 +19,7 @@ from .._scalarjit.components import Component, Scalar, add, dot, mul, sub
 from .._system.kinematics import Frame, Point, Vector
 from .._system.parameters import learned, parameter
 from ..catalog.bicycle import TILT
-from ._parts import check_parameters
-
-if TYPE_CHECKING:
-    from ._tyre import Contact
-
+from ._part import Contact, check_parameters
 
 Pair = tuple[Component, Component]
 TURN = 2.0 * math.pi

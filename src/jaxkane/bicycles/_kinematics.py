@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import jax.numpy as jnp
 
@@ -11,26 +11,19 @@ from .._scalarjit.components import Component, add
 from .._system.bodies import Body
 from .._system.kinematics import Frame, Point, Vector, inertial
 from .._system.motion import Motion
-from ._part_methods import FRONT, REAR, moved
-from ._tyre import Contact, Tyre, rolling_speed
+from ._part import BicycleMotion, Contact
+from ._tyre import Tyre, rolling_speed
 
-if TYPE_CHECKING:
-    from ._bicycle import Bicycle
-
-
-class BicycleMotion(Motion):
-    """A motion that knows both contacts with the ground."""
-
-    __slots__ = ("front", "rear")
-
-    rear: Contact
-    front: Contact
+REAR, FRONT = "rear", "front"
 
 
-def motion_of(bicycle: Bicycle, t: Component, q: Any, u: Any) -> BicycleMotion:
-    """Bodies, contacts and velocity residuals of a bicycle, with what its parts add."""
+def bicycle_motion(bicycle: Any, q: Any, u: Any) -> BicycleMotion:
+    """Bodies, contacts and velocity residuals of a `Bicycle`, without what its parts add."""
     N, O = inertial()
-    T = bicycle.road.tangent(N, q["x"], q["y"], lambda: place_rates(bicycle, q, u))
+    forward, contact_aside = contact_rates(bicycle, q, u)
+    T = bicycle.road.tangent(
+        N, q["x"], q["y"], lambda: bicycle.road.rates(q["x"], q["y"], q["yaw"], forward, contact_aside)
+    )
     Y = T.rotate(3, q["yaw"], u["yaw_rate"], "Y")
     R = Y.rotate(1, q["roll"], u["roll_rate"], "R")
     B = R.rotate(2, q["pitch"], u["pitch_rate"], "B")  # rear frame
@@ -38,7 +31,7 @@ def motion_of(bicycle: Bicycle, t: Component, q: Any, u: Any) -> BicycleMotion:
 
     xS, zS = bicycle.steer_point
     omega_A = B.angular_velocity + u["rear_wheel_rate"] * B.y
-    along, across = slip_of(bicycle, REAR, u)
+    along, across = _slip(bicycle, REAR, u)
     place = q["x"] * N.x + q["y"] * N.y
     if bicycle.road.curved:
         place = place - q["rear_height"] * N.z
@@ -58,7 +51,7 @@ def motion_of(bicycle: Bicycle, t: Component, q: Any, u: Any) -> BicycleMotion:
     G_C = S.fixed(from_S(bicycle.xH, bicycle.zH))
     G_D = S.fixed(from_S(bicycle.w, -bicycle.rF))
     omega_D = C.angular_velocity + u["front_wheel_rate"] * C.y
-    normal = bicycle.road.normal(N, *front_place(bicycle, q))
+    normal = bicycle.road.normal(N, *_front_place(bicycle, q))
     n1, _, n3 = normal.components_in(C)
     down = C.vector(n1, 0.0, n3).normalize()  # in the plane of the front wheel
     r_D_Q = bicycle.front_tyre.reach(down, normal, bicycle.rF)
@@ -67,43 +60,35 @@ def motion_of(bicycle: Bicycle, t: Component, q: Any, u: Any) -> BicycleMotion:
     bodies = bicycle.bodies((G_A, G_B, G_C, G_D), (R, B, H, C), omega_A, omega_D)
     frames = {"Y": Y, "B": B, "C": C, "H": H}
     motion = BicycleMotion(bodies, points={"P": P, "Q": Q, "S": S}, frames=frames)
-    forward, _ = contact_rates(bicycle, q, u)
     motion.rear = Contact(P, Y.x, Y.y, T.z, R.z, q["roll"], forward, (along, across))
-    motion.front, residuals = front_contact(bicycle, Q, C, down, normal, q, u)
-    motion = motion.extended((), residuals)
-    for part in bicycle.parts:
-        motion = moved(part, bicycle, motion, t, q, u)
-    return motion
+    motion.front, residuals = _front_contact(bicycle, Q, C, down, normal, q, u)
+    return motion.extended((), residuals)
 
 
-def front_place(bicycle: Bicycle, q: Any) -> tuple[Component, Component]:
+def _front_place(bicycle: Any, q: Any) -> tuple[Component, Component]:
     return (q["front_x"], q["front_y"]) if bicycle.road.curved else (0.0, 0.0)
 
 
-def slip_of(bicycle: Bicycle, end: str, u: Any) -> tuple[Component, Component]:
+def _slip(bicycle: Any, end: str, u: Any) -> tuple[Component, Component]:
     """Velocities of a tyre's contact, along the heading and across it [m/s]; exactly zero where it rolls."""
     tyre = bicycle.rear_tyre if end == REAR else bicycle.front_tyre
     along = 0.0 if tyre.longitudinal is None else u[f"{end}_longitudinal_slip"]
     return along, 0.0 if tyre.lateral is None else u[f"{end}_lateral_slip"]
 
 
-def place_rates(bicycle: Bicycle, q: Any, u: Any) -> tuple[Component, Component]:
-    return bicycle.road.rates(q["x"], q["y"], q["yaw"], *contact_rates(bicycle, q, u))
-
-
-def contact_rates(bicycle: Bicycle, q: Any, u: Any) -> tuple[Component, Component]:
+def contact_rates(bicycle: Any, q: Any, u: Any) -> tuple[Component, Component]:
     """Velocities of the place of the rear contact on the ground, forward and to the right [m/s].
 
     Of a torus with the crown radius c, that rolls without slip: -(spin) (r - c + c cos(roll)) and c * roll_rate.
     """
-    tyre, (along, across) = bicycle.rear_tyre, slip_of(bicycle, REAR, u)
+    tyre, (along, across) = bicycle.rear_tyre, _slip(bicycle, REAR, u)
     spin = u["rear_wheel_rate"] + u["pitch_rate"]
     forward = rolling_speed(tyre, spin, jnp.cos(q["roll"]), bicycle.rR, along)
     return forward, across if tyre.crown is None else add(across, tyre.crown * u["roll_rate"])
 
 
-def front_contact(
-    bicycle: Bicycle, Q: Point, C: Frame, down: Vector, normal: Vector, q: Any, u: Any
+def _front_contact(
+    bicycle: Any, Q: Point, C: Frame, down: Vector, normal: Vector, q: Any, u: Any
 ) -> tuple[Contact, list[Any]]:
     """The front contact, and what is zero there [m/s].
 
@@ -111,7 +96,7 @@ def front_contact(
     wheel spins against its contact with the front wheel's rate + (omega . across - heading . n_dot) / cos(camber),
     and the camber grows with omega . heading + (axle . n_dot) / cos(camber).
     """
-    tyre, slip = bicycle.front_tyre, slip_of(bicycle, FRONT, u)
+    tyre, slip = bicycle.front_tyre, _slip(bicycle, FRONT, u)
     heading = C.y.cross(normal).normalize()
     across = normal.cross(heading)
     sin_camber, cos_camber = C.y.dot(normal), down.dot(normal)
@@ -131,21 +116,21 @@ def front_contact(
     return contact, [*tyre.residuals(contact), moved.dot(heading) - speed, moved.dot(across) - aside]
 
 
-def wheels(bicycle: Bicycle, motion: Any) -> Iterator[tuple[str, Tyre, Contact, Body, Component]]:
+def wheels(bicycle: Any, motion: Any) -> Iterator[tuple[str, Tyre, Contact, Body, Component]]:
     yield REAR, bicycle.rear_tyre, motion.rear, motion["rear wheel"], bicycle.rR
     yield FRONT, bicycle.front_tyre, motion.front, motion["front wheel"], bicycle.rF
 
 
-def off_road(bicycle: Bicycle, motion: Motion, q: Any) -> list[Component]:
+def off_road(bicycle: Any, motion: Motion, q: Any) -> list[Component]:
     """How far the contacts are from the ground [m]."""
     Q, N = motion["Q"].position, motion.N
     if not bicycle.road.curved:
         return [Q.dot(N.z)]
-    front = Q - bicycle.road.place(N, *front_place(bicycle, q))
+    front = Q - bicycle.road.place(N, *_front_place(bicycle, q))
     return [*(front.dot(axis) for axis in (N.x, N.y, N.z)), q["rear_height"] - bicycle.road.at(q["x"], q["y"])]
 
 
-def clearance(bicycle: Bicycle, motion: Any) -> Component:
+def clearance(bicycle: Any, motion: Any) -> Component:
     """Of both wheels, see `Road.clearance`."""
     room = [
         bicycle.road.clearance(motion.N, contact, wheel.center, radius, tyre.crown)

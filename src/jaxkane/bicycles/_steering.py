@@ -13,7 +13,7 @@ from .._system.kinematics import Frame, Point
 from .._system.parameters import parameter
 from ..catalog.bicycle import ABOVE_GROUND, FAR
 from ..loads import coulomb, rotor
-from ._parts import Part
+from ._part import Part
 
 
 class HeadTwist(Part):

@@ -3,37 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
 
 from .._scalarjit.components import Component, Scalar, is_zero, mul, sub
 from .._system.bodies import Body, Force, Torque
-from .._system.kinematics import Point, Vector
+from .._system.kinematics import Vector
 from .._system.parameters import parameter
-from ._parts import called, check_parameters
-from ._tyre_laws import LongitudinalSlip, Slip
-
-
-class Contact(NamedTuple):
-    """A wheel on the ground, at one instant.
-
-    - `point`: of the tyre, at the contact; its velocity is that of slip.
-    - `heading`, `across`, `normal`: unit vectors; along the wheel's plane and across it in the ground, and downwards.
-        `down`: in the wheel's plane, from its centre towards the ground.
-    - `camber` [rad]: the wheel's inclination, positive to the right. `speed` [m/s]: of the contact along `heading`.
-    - `slip` [m/s]: the velocity of `point` along `heading` and `across`.
-    """
-
-    point: Point
-    heading: Vector
-    across: Vector
-    normal: Vector
-    down: Vector
-    camber: Component
-    speed: Component
-    slip: tuple[Component, Component]
+from ._part import Contact, called, check_parameters
+from ._tyre_laws import LongitudinalSlip, TyreForceLaw
 
 
 class Tyre(eqx.Module):
@@ -54,7 +34,7 @@ class Tyre(eqx.Module):
     """
 
     crown: Scalar | None = parameter(None, positive=True, unit="m")
-    lateral: Slip | None = None
+    lateral: TyreForceLaw | None = None
     longitudinal: LongitudinalSlip | None = None
     rolling_resistance: Scalar | None = parameter(None, within=(0.0, 1.0))
     load_lag: Scalar | None = parameter(None, positive=True, within=(0.0, 5.0), unit="s")
@@ -64,7 +44,7 @@ class Tyre(eqx.Module):
         along, across = self.longitudinal, self.lateral
         if not (along is None or isinstance(along, LongitudinalSlip)):
             raise TypeError(f"Tyre: `longitudinal` is a LongitudinalSlip or None, got {called(along)}.")
-        if isinstance(across, LongitudinalSlip) or not (across is None or isinstance(across, Slip)):
+        if isinstance(across, LongitudinalSlip) or not (across is None or isinstance(across, TyreForceLaw)):
             raise TypeError(f"Tyre: `lateral` is a law of lateral slip or None, got {called(across)}.")
 
     @property
@@ -73,7 +53,7 @@ class Tyre(eqx.Module):
         return self.lateral is None and self.longitudinal is None
 
     @property
-    def laws(self) -> tuple[tuple[str, Slip], ...]:
+    def laws(self) -> tuple[tuple[str, TyreForceLaw], ...]:
         """Those directions in which it slips."""
         laws = (("longitudinal", self.longitudinal), ("lateral", self.lateral))
         return tuple((name, law) for name, law in laws if law is not None)
@@ -104,7 +84,9 @@ class Tyre(eqx.Module):
         """Of the ground on the tyre [N], by direction. `load` [N]; `deflection` [m] by direction."""
         return {name: law.force(slip, load, contact.camber) for name, law, slip in self._slips(contact, deflection)}
 
-    def _slips(self, contact: Contact, deflection: dict[str, Component]) -> Iterator[tuple[str, Slip, Component]]:
+    def _slips(
+        self, contact: Contact, deflection: dict[str, Component]
+    ) -> Iterator[tuple[str, TyreForceLaw, Component]]:
         for name, law in self.laws:
             yield name, law, law.slip(*_moving(name, contact), deflection.get(name))
 
@@ -134,7 +116,7 @@ def _direction(name: str, contact: Contact) -> Vector:
 
 
 def _moving(name: str, contact: Contact) -> tuple[Component, Component, Component]:
-    """Slip velocity [m/s], speed and camber, as a law asks for them."""
+    """TyreForceLaw velocity [m/s], speed and camber, as a law asks for them."""
     return contact.slip[name == "lateral"], contact.speed, contact.camber
 
 

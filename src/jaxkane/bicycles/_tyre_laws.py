@@ -16,13 +16,13 @@ from jaxtyping import Array, Float
 from .._scalarjit.components import Component, Scalar
 from .._system.parameters import parameter
 from ..catalog.bicycle import FAR, TILT
-from ._parts import check_parameters
+from ._part import check_parameters
 
 CREEPING = 0.01
 """[m/s]: below this speed the law of a tyre without relaxation length is smoothed, so that it stays finite."""
 
 
-class Slip(eqx.Module):
+class TyreForceLaw(eqx.Module):
     """How a tyre's slip gives a force. A law of your own gives `force`; and `equivalent`, where camber counts."""
 
     if TYPE_CHECKING:
@@ -60,7 +60,7 @@ class Slip(eqx.Module):
         return -velocity - jnp.abs(speed) * lag
 
 
-class _Aligning(Slip):
+class _AligningLaw(TyreForceLaw):
     """A law whose lateral force acts behind the contact, and whose camber twists the tyre."""
 
     if TYPE_CHECKING:
@@ -76,7 +76,7 @@ class _Aligning(Slip):
         return moment
 
 
-class LateralSlip(_Aligning):
+class LateralSlip(_AligningLaw):
     """Lateral force in proportion to slip and camber, as in Sharp (1971).
 
         sigma / |V| dF/dt + F = cornering_stiffness * slip + camber_stiffness * camber
@@ -101,7 +101,7 @@ class LateralSlip(_Aligning):
         return self.camber_stiffness / self.cornering_stiffness * camber
 
 
-class MagicFormula(_Aligning):
+class MagicFormula(_AligningLaw):
     """Lateral force by the Magic Formula, in proportion to the load (Pacejka 2012, eq. 4.1 to 4.6).
 
         F = load * friction * sin(shape * atan(b - curvature * (b - atan(b)))),
@@ -131,7 +131,7 @@ class MagicFormula(_Aligning):
         return 0.0 if self.camber_ratio is None else self.camber_ratio * camber
 
 
-class LongitudinalSlip(Slip):
+class LongitudinalSlip(TyreForceLaw):
     """Longitudinal force in proportion to the slip ratio.
 
     **Arguments:** `stiffness` [N]: force over slip ratio; `relaxation_length` [m] as in `LateralSlip`.
@@ -147,7 +147,7 @@ class LongitudinalSlip(Slip):
 _DEGREE = math.pi / 180.0
 
 
-class MagicFormula89(Slip):
+class MagicFormula89(TyreForceLaw):
     """Lateral force and aligning moment by the Magic Formula of 1989, with all its coefficients.
 
         C = a0,   D = a1 Fz^2 + a2 Fz,   B C D = a3 sin(2 atan(Fz / a4)) (1 - a5 |camber|),   E = a6 Fz + a7,

@@ -1,20 +1,17 @@
-"""What a bicycle can carry: the methods of a part, how they are called and checked, and the names that they bring."""
+"""A part of a bicycle, and what it sees of the bicycle's motion. A part of your own begins with `Part`."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 
 from .._scalarjit.components import Component
+from .._system.kinematics import Point, Vector
+from .._system.motion import Motion
 from .._system.parameters import check_parameter, parameter_info
-
-if TYPE_CHECKING:
-    from ._bicycle import Bicycle
-    from ._kinematics import BicycleMotion
-
 
 NAMES = ("coordinates", "speeds", "dependent_speeds", "dependent_coordinates", "inputs", "states")
 
@@ -33,6 +30,35 @@ def check_parameters(part: Any) -> None:
 def called(value: Any) -> str:
     """What was given, in the words of an error: a module by its class, which is shorter than its numbers."""
     return f"a {type(value).__name__}" if isinstance(value, eqx.Module) else repr(value)
+
+
+class Contact(NamedTuple):
+    """Where a wheel meets the ground at an instant.
+
+    - `point`: of the tyre, at the contact; its velocity is that of slip.
+    - `heading`, `across`, `normal`: unit vectors; along the wheel's plane and across it in the ground, and downwards.
+        `down`: in the wheel's plane, from its centre towards the ground.
+    - `camber` [rad]: the wheel's inclination, positive to the right. `speed` [m/s]: of the contact along `heading`.
+    - `slip` [m/s]: the velocity of `point` along `heading` and `across`.
+    """
+
+    point: Point
+    heading: Vector
+    across: Vector
+    normal: Vector
+    down: Vector
+    camber: Component
+    speed: Component
+    slip: tuple[Component, Component]
+
+
+class BicycleMotion(Motion):
+    """The motion of a bicycle with its two contacts."""
+
+    __slots__ = ("front", "rear")
+
+    rear: Contact
+    front: Contact
 
 
 class Part(eqx.Module):
@@ -68,14 +94,14 @@ class Part(eqx.Module):
             if isinstance(names := getattr(self, kind), str):
                 raise TypeError(f"{type(self).__name__}.{kind} is a tuple of names, got {names!r}: ({names!r},).")
 
-    def check(self, bicycle: Bicycle) -> None:
+    def check(self, bicycle: Any) -> None:
         """Refuse, by an error, a bicycle that this part does not fit."""
 
-    def q_dot(self, bicycle: Bicycle, t: Component, q: Any, u: Any) -> Sequence[Component]:
+    def q_dot(self, bicycle: Any, t: Component, q: Any, u: Any) -> Sequence[Component]:
         """Rates of the part's coordinates. By default those speeds that have the coordinates' names and "_rate"."""
         return [u[f"{name}_rate"] for name in self.coordinates]
 
-    def motion(self, bicycle: Bicycle, motion: BicycleMotion, t: Component, q: Any, u: Any) -> BicycleMotion:
+    def motion(self, bicycle: Any, motion: BicycleMotion, t: Component, q: Any, u: Any) -> BicycleMotion:
         """The motion of the bicycle with what the part adds: bodies, velocity residuals, points and frames.
 
         `motion` is that of the bicycle and the parts before this one: `motion.extended([...])`.
@@ -83,7 +109,7 @@ class Part(eqx.Module):
         return motion
 
     def commands(
-        self, bicycle: Bicycle, t: Component, q: Any, u: Any, motion: BicycleMotion, values: Mapping[str, Component]
+        self, bicycle: Any, t: Component, q: Any, u: Any, motion: BicycleMotion, values: Mapping[str, Component]
     ) -> Mapping[str, Component]:
         """What the part adds to inputs of the bicycle, by name: `{"steer_torque": -self.gain * q["roll"]}`.
 
@@ -93,31 +119,29 @@ class Part(eqx.Module):
         return {}
 
     def loads(
-        self, bicycle: Bicycle, t: Component, q: Any, u: Any, motion: BicycleMotion, values: Mapping[str, Component]
+        self, bicycle: Any, t: Component, q: Any, u: Any, motion: BicycleMotion, values: Mapping[str, Component]
     ) -> Any:
         """Forces and torques; `values` holds inputs, with all that was added to them, and states by name."""
         return ()
 
     def state_rates(
-        self, bicycle: Bicycle, t: Component, q: Any, u: Any, x: Any, motion: BicycleMotion, now: Any
+        self, bicycle: Any, t: Component, q: Any, u: Any, x: Any, motion: BicycleMotion, now: Any
     ) -> Sequence[Component] | Mapping[str, Component]:
         """Rates of the part's states of the first order, in their order or by name; `now` as in `System.state_rates`,
         its inputs with all that was added to them."""
         return ()
 
-    def outputs(
-        self, bicycle: Bicycle, t: Component, q: Any, u: Any, motion: BicycleMotion, now: Any
-    ) -> Mapping[str, Any]:
+    def outputs(self, bicycle: Any, t: Component, q: Any, u: Any, motion: BicycleMotion, now: Any) -> Mapping[str, Any]:
         """What the part's sensors say, by name."""
         return {}
 
     def configuration_constraints(
-        self, bicycle: Bicycle, t: Component, q: Any, motion: BicycleMotion
+        self, bicycle: Any, t: Component, q: Any, motion: BicycleMotion
     ) -> Sequence[Component]:
         """Residuals that are zero in every possible configuration; `motion` is that of rest."""
         return ()
 
-    def draw(self, bicycle: Bicycle, motion: BicycleMotion, sketch: Any) -> None:
+    def draw(self, bicycle: Any, motion: BicycleMotion, sketch: Any) -> None:
         """Add the part to the picture of the bicycle: `sketch.line("green", motion["O"], motion["A"])`, see
         `jaxkane.animate`."""
 
