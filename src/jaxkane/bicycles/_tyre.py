@@ -116,7 +116,7 @@ def _direction(name: str, contact: Contact) -> Vector:
 
 
 def _moving(name: str, contact: Contact) -> tuple[Component, Component, Component]:
-    """TyreForceLaw velocity [m/s], speed and camber, as a law asks for them."""
+    """Slip velocity [m/s], speed and camber, as a law asks for them."""
     return contact.slip[name == "lateral"], contact.speed, contact.camber
 
 
