@@ -130,7 +130,7 @@ def motor_and_fork(recording):
 def ratio(fit, first, second):
     """Of two estimates, and its standard deviation, to first order."""
     (a, b), (i, j) = ((fit.estimates[n] for n in (first, second)), (fit.names.index(n) for n in (first, second)))
-    covariance = fit.clustered_covariance if fit.robust else fit.covariance
+    covariance = fit.clustered_covariance if fit.uses_clustered_errors else fit.covariance
     slopes = np.array([1 / b, -a / b**2])
     return a / b, float(slopes @ covariance[np.ix_([i, j], [i, j])] @ slopes) ** 0.5
 
@@ -167,7 +167,7 @@ def draw_bicycle(axis, fit):
         axis.add_patch(Circle((x, r), r, fill=False, color=INK, linewidth=2))
     axis.plot([0, S[0], b.w], [b.rR, S[1], b.rF], color=INK, linewidth=2)
     axis.plot(b.xB, -b.zB, "o", color=INK, label="mass centre of the rear frame")
-    C = fit.clustered_covariance if fit.robust else fit.covariance
+    C = fit.clustered_covariance if fit.uses_clustered_errors else fit.covariance
     i = [fit.names.index(name) for name in names]
     sizes, turned = np.linalg.eigh(C[np.ix_(i, i)])
     angle = np.degrees(np.arctan2(-turned[1, 1], turned[0, 1]))

@@ -6,8 +6,8 @@ from scipy import stats
 from systems import Track
 
 from jaxkane.fit import Free, LeastSquares, Problem, Simulation, Trial, laplace, minimize, profile
-from jaxkane.fit._score_test import beside_zero
-from jaxkane.fit._statistics import autocorrelations, clustered_covariance
+from jaxkane.fit._covariance import jackknife_covariance
+from jaxkane.fit._statistics import autocorrelations, wald_test
 
 LOW, HIGH = 0.93, 0.97
 t = np.arange(0.0, 2.0, 0.1)
@@ -72,7 +72,7 @@ def covered(kind, n, seed=0):
         of_laplace = np.full(2, np.nan)
         if "laplace" in names:
             of_laplace = laplace(found).covariance.diagonal() ** 0.5 * np.array(problem.parameters.scale)
-        quantile = stats.t.ppf(0.975, found.identifiability.freedom)
+        quantile = stats.t.ppf(0.975, found.identifiability.degrees_of_freedom)
         intervals = found.intervals()
         for j, (name, value) in enumerate(TRUTH.items()):
             error, (low, high) = abs(found.estimates[name] - value), intervals[name]
@@ -110,10 +110,10 @@ def test_few_trials_scatter_more_than_a_sandwich_sees(T, p, spread):
         x = np.linalg.solve(information.sum(axis=0), gradient.sum(axis=0))
         scores = np.einsum("tmi,tm->ti", A, e - A @ x)
         places = np.tile(np.arange(p), (T, 1))
-        C = clustered_covariance(information, scores, places, np.zeros((p, p)))
+        C = jackknife_covariance(information, scores, places, np.zeros((p, p)))
         hits += np.mean(np.abs(x) <= stats.t.ppf(0.975, T - 1) * C.diagonal() ** 0.5) / n
         q = min(p, 3)
-        false += (beside_zero(x[:q], C[:q, :q], T) < 0.05) / n
+        false += (wald_test(x[:q], C[:q, :q], T) < 0.05) / n
     assert LOW <= hits <= HIGH
     assert 0.02 < false < 0.07
 

@@ -26,7 +26,7 @@ from jaxkane.fit import (
     save_report,
 )
 from jaxkane.fit._candidates import groups_of
-from jaxkane.fit._score_test import bic_change
+from jaxkane.fit._statistics import bic_change
 
 TS = np.linspace(0.0, 2.0, 41)
 NOISE = {"angle": 0.004, "rate": 0.02}
@@ -272,21 +272,21 @@ def test_fits_beside_each_other(rubbing, found):
     held = record(9, system=Pendulum(dry=0.4))
     table = compare({"viscous": rubbing, "with friction": found.fit}, held, plausible={"damping": 0.5})
     assert table.held_out["with friction"].cost < 0.3 * table.held_out["viscous"].cost
-    assert table.objections["viscous"] == ("damping = 0.5362 is above 0.45",)
+    assert table.bound_violations["viscous"] == ("damping = 0.5362 is above 0.45",)
     text = str(table)
     # Where a search starts says nothing: of what nothing is said, anything is believed.
-    assert compare({"viscous": rubbing}).objections["viscous"] == ()
+    assert compare({"viscous": rubbing}).bound_violations["viscous"] == ()
     for words in ("with friction", "dry", f"{found.fit.cost:.6g}", "swing 5", "neighbours' correlation", "Held back"):
         assert words in text
     assert f"{found.fit.cost:.6g}" in table._repr_html_()
     assert "status" in text
-    # An objection is a row: a cell of all of them would make every column as wide.
-    assert [row for heading, rows in table.tables if heading == "Not plausible" for row in rows] == [
-        ["fit", "objection"],
+    # A violation is a row: a cell of all of them would make every column as wide.
+    assert [row for heading, rows in table.tables if heading == "Bound violations" for row in rows] == [
+        ["fit", "violation"],
         ["viscous", "damping = 0.5362 is above 0.45"],
     ]
     said = {"damping": (0.0, 0.45), "gain of angle": 0.2}  # as a search was given
-    assert compare({"viscous": rubbing}, plausible=said).objections["viscous"]
+    assert compare({"viscous": rubbing}, plausible=said).bound_violations["viscous"]
     with pytest.raises(ValueError, match="`plausible` names dampign; did you mean 'damping'"):
         compare([rubbing], plausible={"dampign": 0.5})
     with pytest.raises(ValueError, match="There is no fit"):

@@ -16,12 +16,12 @@ from jaxkane.fit import (
     Problem,
     Simulation,
     Trial,
-    applied_to,
     compare,
     cross_validate,
     fit,
     load,
     minimize,
+    validate,
 )
 from jaxkane.fit._validate import costs_by_trial
 
@@ -47,8 +47,8 @@ def falling():
 
 
 def test_trials_that_cannot_be_simulated_are_told_and_the_rest_is_kept(falling, tmp_path):
-    held = applied_to(falling, [FAR[0], *NEAR, FAR[1]])
-    alone = applied_to(falling, NEAR)
+    held = validate(falling, [FAR[0], *NEAR, FAR[1]])
+    alone = validate(falling, NEAR)
     assert held.trial_names == ("near a", "near b", "near c")
     assert held.cost == pytest.approx(alone.cost, rel=1e-6)
     assert list(held.failed) == ["far (0)", "far (4)"]
@@ -60,7 +60,7 @@ def test_trials_that_cannot_be_simulated_are_told_and_the_rest_is_kept(falling, 
     assert np.isnan(errors).all()
     assert load(held.save(tmp_path / "held.npz"), held.problem).failed == held.failed
     with pytest.raises(ValueError, match=r"None of these trials can be simulated .*: far \(0\), from"):
-        applied_to(falling, FAR)
+        validate(falling, FAR)
     text = str(compare({"one": falling}, held_out=[FAR[0], *NEAR]))
     assert "3 of 4 trials" in text
     assert "not simulated" in text

@@ -114,7 +114,7 @@ def case(request):
     records = recorded(1, wander=request.param)
     found = fitted(records, *FREE)
     assert found.ok, found.message
-    assert found.robust == (request.param > 0)
+    assert found.uses_clustered_errors == (request.param > 0)
     A, y = dense(records)
     best = np.linalg.lstsq(A, y, rcond=None)[0]
     return records, found, A, y, best
@@ -156,7 +156,7 @@ def test_estimates_and_formal_errors(case):
     rss = np.sum((A @ best - y) ** 2)
     assert found.cost == pytest.approx(rss, rel=TIGHT)
     C, variance, freedom = formal(A, y)
-    assert found.freedom == pytest.approx(N - 1 if found.robust else freedom, rel=TIGHT)
+    assert found.degrees_of_freedom == pytest.approx(N - 1 if found.uses_clustered_errors else freedom, rel=TIGHT)
     assert found.variance == pytest.approx(variance, rel=TIGHT)
     np.testing.assert_allclose(found.covariance, C[:2, :2], rtol=10 * TIGHT)
     assert found.correlation[0, 1] == pytest.approx(C[0, 1] / np.sqrt(C[0, 0] * C[1, 1]), rel=TIGHT)
@@ -205,8 +205,8 @@ def test_errors_by_window():
 
 def test_intervals_and_profiles_have_the_same_freedom(case):
     records, found, *_, best = case
-    C = errors_by_trial(records) if found.robust else found.covariance
-    half = stats.t.ppf(0.95, found.freedom) * np.sqrt(C.diagonal())
+    C = errors_by_trial(records) if found.uses_clustered_errors else found.covariance
+    half = stats.t.ppf(0.95, found.degrees_of_freedom) * np.sqrt(C.diagonal())
     for i, name in enumerate(("gain", "drift")):
         low, high = best[i] - half[i], best[i] + half[i]
         assert found.intervals(0.9)[name] == pytest.approx((low, high), abs=1e-4 * half[i])
@@ -330,7 +330,7 @@ def test_what_has_no_influence_takes_no_error_from_the_others():
         minimize(Problem.of(Track(), trials, free, **OPTIONS), LeastSquares(rtol=1e-14))
         for free in (("gain", "drift"), ("drift",))
     )
-    assert both.robust
+    assert both.uses_clustered_errors
     for errors, others in ((both.standard_errors, alone.standard_errors), (both.errors, alone.errors)):
         assert errors["gain"] == np.inf
         assert errors["drift"] == pytest.approx(others["drift"], rel=1e-2)

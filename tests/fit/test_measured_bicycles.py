@@ -53,7 +53,7 @@ def test_the_damping_of_the_robot_bicycle(steered):
     # The linear model's 465 are of twice as many samples.
     assert len(steered) == 38
     assert found.cost < 465 / 2
-    assert found.robust
+    assert found.uses_clustered_errors
     low, high = found.intervals()["steer_damping"]
     assert low < 1.49 < high  # of the linear model
     assert found.clustered_errors["steer_damping"] > 5 * found.standard_errors["steer_damping"]

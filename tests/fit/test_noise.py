@@ -177,7 +177,7 @@ def test_the_fit_is_the_maximum(case, found):
     assert found.mean_normalized_innovation_squared == pytest.approx(1.0, abs=0.3)
     assert found.variance == 1.0
     # How large noise is nobody knows beforehand: nothing is implausible.
-    assert compare({"one": found}).objections["one"] == ()
+    assert compare({"one": found}).bound_violations["one"] == ()
     n = sum(np.isfinite(v).sum() for v in y.values())
     assert sum(np.isfinite(r).sum() for r in found.residuals["trial"].values()) == n
     assert found.nuisance == {"trial": {}}

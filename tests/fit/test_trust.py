@@ -18,7 +18,6 @@ from jaxkane.fit import (
     Problem,
     Simulation,
     Trial,
-    applied_to,
     check_signs,
     cross_validate,
     identifiability,
@@ -29,6 +28,7 @@ from jaxkane.fit import (
     profile,
     report,
     save_report,
+    validate,
 )
 from jaxkane.fit._diagnostics import doubled_trials, empty_columns, suspicious_records
 from jaxkane.fit._nuisance import solve_nuisance
@@ -80,7 +80,7 @@ def test_white_residuals_are_called_white(result):
     tests = [t["x"] for t in result.tests.values()]
     assert sum(t.is_white for t in tests) >= 5
     assert result.variance_accounted_for["x"] > 0.99
-    assert not result.robust
+    assert not result.uses_clustered_errors
     assert not any("noise" in note for note in result.notes)
 
 
@@ -105,7 +105,7 @@ def test_clustered_errors_see_what_differs_from_trial_to_trial(problem, result):
         for seed in range(6)
     ]
     found = again(problem, varied)
-    assert found.robust
+    assert found.uses_clustered_errors
     assert found.clustered_errors["stiffness"] > 2.0 * found.standard_errors["stiffness"] / np.sqrt(found.variance)
     assert 0.3 < result.clustered_errors["stiffness"] / result.standard_errors["stiffness"] < 3.0
     assert any("not noise" in note for note in found.notes)
@@ -133,7 +133,7 @@ def test_trials_left_out(result):
 
 def test_other_trials_are_looked_at_with_the_parameters_held(result):
     others = [record(T, seed) for seed in range(20, 26)]
-    held = applied_to(result, others)
+    held = validate(result, others)
     assert held.status == "applied"
     assert held.estimates == result.estimates
     # What is left is noise: the parameters were found elsewhere, only starts were found here.
@@ -305,13 +305,13 @@ def test_of_what_changes_nothing_the_simplest_is_told(trials):
     free = ("stiffness", "more_damping", "damping", "more_stiffness")
     seen = identifiability(Problem.of(Twice(), trials, free, **UNKNOWN))
     assert seen.count == 2
-    assert seen.how_many == "Of 4 parameters 2 combinations are determined."
+    assert seen.rank_message == "Of 4 parameters 2 combinations are determined."
     pairs = {frozenset(name for name, _ in direction.parts) for direction in seen.undetermined}
     assert pairs == {frozenset({"stiffness", "more_stiffness"}), frozenset({"damping", "more_damping"})}
     for direction in seen.undetermined:  # as much of the one as less of the other
         (one, a), (other, b) = direction.parts
         assert a * seen.scales[seen.names.index(one)] == pytest.approx(-b * seen.scales[seen.names.index(other)])
-    assert seen.how_many in str(seen)
+    assert seen.rank_message in str(seen)
 
 
 # The report.

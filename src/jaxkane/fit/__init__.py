@@ -60,8 +60,8 @@ from ._studies import profile as profile
 from ._trial import Trial as Trial
 from ._trial import read_trials as read_trials
 from ._validate import CrossValidation as CrossValidation
-from ._validate import applied_to as applied_to
 from ._validate import cross_validate as cross_validate
+from ._validate import validate as validate
 from .bicycle import bicycle_priors as bicycle_priors
 from .bicycle import bicycle_problem as bicycle_problem
 from .bicycle import bicycle_rides as bicycle_rides

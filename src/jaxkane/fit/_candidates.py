@@ -13,12 +13,12 @@ import numpy as np
 from .._common.lookup import refuse_unknown
 from .._system.system import System
 from ._bijections import Interval
+from ._covariance import parameter_values
 from ._declarations import Delay, Free, Shared
 from ._model import Simulation, Unknowns
 from ._parameters import Part, as_items, parameters_of
 from ._problem import Names, Problem, ProblemSpec, deviations_by_name
 from ._result import Fit
-from ._statistics import values_of
 
 Bounds = tuple[float | None, float | None]
 
@@ -308,7 +308,7 @@ def _pairs(candidate: Candidate) -> list[tuple[str, str]]:
 def carried(there: Problem, at: Unknowns, problem: Problem, names: Sequence[str]) -> Unknowns:
     """A point of one problem as one of another that has more unknowns: what is new is where it starts."""
     point, old, new = problem.start, there.model.nuisance, problem.model.nuisance
-    known, values = there.parameters.names, np.asarray(values_of(there.parameters, at.x))
+    known, values = there.parameters.names, np.asarray(parameter_values(there.parameters, at.x))
     if bool(eqx.tree_equal(problem.system, there.system)):
         to, of = (
             np.array([all_names.index(n) for n in names], dtype=int) for all_names in (problem.parameters.names, known)

@@ -17,7 +17,7 @@ from ._problem import refuse_other
 from ._result import Fit
 from ._tables import html_table, plain
 from ._trial import Trial
-from ._validate import applied_to
+from ._validate import validate
 
 Range = tuple[float, float]
 
@@ -31,7 +31,7 @@ class Plausible:
 
     ranges: Mapping[str, Range]
 
-    def objections(self, values: Mapping[str, float]) -> list[str]:
+    def bound_violations(self, values: Mapping[str, float]) -> list[str]:
         """What is not believed of these values, in words."""
         found = []
         for name, value in values.items():
@@ -90,20 +90,24 @@ class Comparison:
     """What `compare` gives; print it for the tables.
 
     - `fits`: by name. `held_out`: by name, the parameters of each on trials that were held back; empty without any.
-    - `objections`: by name, what is not plausible of each fit's parameters, in words.
+    - `bound_violations`: by name, what is not plausible of each fit's parameters, in words.
     """
 
     fits: Mapping[str, Fit]
     held_out: Mapping[str, Fit]
-    objections: Mapping[str, tuple[str, ...]]
+    bound_violations: Mapping[str, tuple[str, ...]]
 
     @property
     def tables(self) -> list[Table]:
         """A heading and rows, of which the first is the head, for each."""
         found = [("Parameters, with the errors of their intervals", self._parameters()), ("All", self._sums())]
-        if any(self.objections.values()):
-            rows = [[name, objection] for name, objections in self.objections.items() for objection in objections]
-            found.append(("Not plausible", [["fit", "objection"], *rows]))
+        if any(self.bound_violations.values()):
+            rows = [
+                [name, violation]
+                for name, bound_violations in self.bound_violations.items()
+                for violation in bound_violations
+            ]
+            found.append(("Bound violations", [["fit", "violation"], *rows]))
         found.append(("Sum of squares and variance accounted for, by channel", self._channels(self.fits)))
         found.append(("Sum of squares, by trial", self._trials(self.fits)))
         if self.held_out:
@@ -183,7 +187,7 @@ def compare(
 
     - `fits`: by name; of a sequence, the free parameters are the names.
     - `held_out`: trials that none of them has seen: their starts and biases are found, the parameters are not
-        (`applied_to`). Those of bicycles by `bicycle_rides`.
+        (`validate`). Those of bicycles by `bicycle_rides`.
     - `plausible`: as in `forward_selection`; names that none of the fits frees are passed over.
 
     **Returns:** a `Comparison`: print it for tables of parameters with errors (clustered by trial where the residuals
@@ -206,14 +210,15 @@ def compare(
         raise ValueError("There is no fit to compare.")
     for fit in named.values():
         refuse_other(fit, Fit, "compare", "compare({'first': fit(...), 'second': fit(...)})")
-    said = plausible or {}
+    ranges = plausible or {}
     free = {name for fit in named.values() for name in fit.names}
-    if not free & set(said):  # of a table that served a search, names that no fit frees are no slip
-        refuse_unknown(said, free, "`plausible` names")
+    if not free & set(ranges):  # of a table that served a search, names that no fit frees are no slip
+        refuse_unknown(ranges, free, "`plausible` names")
     return Comparison(
         fits=named,
-        held_out={} if held_out is None else {name: applied_to(fit, held_out) for name, fit in named.items()},
-        objections={
-            name: tuple(plausible_of(fit.parameters, said).objections(fit.estimates)) for name, fit in named.items()
+        held_out={} if held_out is None else {name: validate(fit, held_out) for name, fit in named.items()},
+        bound_violations={
+            name: tuple(plausible_of(fit.parameters, ranges).bound_violations(fit.estimates))
+            for name, fit in named.items()
         },
     )

@@ -17,11 +17,11 @@ from tqdm import tqdm
 
 from .._common.lookup import as_names, refuse_unknown
 from .._system.system import System, packed
+from ._covariance import infinite_along
 from ._linearize import by_next, each, jacobian_of, starts_of
 from ._model import Model, Unknowns
 from ._parameters import parameters_of
 from ._problem import Problem
-from ._statistics import infinite_along
 from ._trial import Trial
 from ._windows import Windows, state_names
 

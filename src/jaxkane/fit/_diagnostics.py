@@ -148,7 +148,7 @@ def notes_of(fit: Fit) -> tuple[str, ...]:
     return (
         *not_converged(fit),
         *(f"{name} is left out: {why}." for name, why in fit.failed.items()),
-        *filter(None, [fit.identifiability.how_many]),
+        *filter(None, [fit.identifiability.rank_message]),
         *fit.identifiability.messages,
         *trade_offs(fit),
         *odd_trials(fit),
@@ -223,7 +223,7 @@ def bad_channels(fit: Fit) -> list[str]:
     bad = [
         channel
         for channel in fit.problem.channels
-        if any(c[channel].accounted <= 0.5 for c in fit.tests.values() if channel in c)
+        if any(c[channel].variance_accounted_for <= 0.5 for c in fit.tests.values() if channel in c)
     ]
     if not bad:
         return []
@@ -279,7 +279,7 @@ def wrong_noise(fit: Fit) -> list[str]:
 
 def wrong_sigma(fit: Fit) -> list[str]:
     """Residuals of another size than `sigma` says, by more than four deviations of chi^2."""
-    freedom = fit.identifiability.freedom
+    freedom = fit.identifiability.degrees_of_freedom
     if np.isnan(fit.variance) or not (fit.variance - 1) ** 2 > 16 * 2 / freedom:
         return []
     chi = f"chi^2 is {fit.variance * freedom:.4g} with {freedom:.4g} degrees of freedom"
@@ -378,7 +378,7 @@ def trade_offs(fit: Fit) -> list[str]:
 def only_priors(fit: Fit) -> list[str]:
     """Parameters of which the data say nothing beyond what was known."""
     notes, deviations = [], np.asarray(fit.parameters.prior_deviation)
-    for i, (name, error) in enumerate(zip(fit.names, fit.identifiability.given_errors, strict=True)):
+    for i, (name, error) in enumerate(zip(fit.names, fit.identifiability.given_sigma_errors, strict=True)):
         if not fit.parameters.learned[i] and np.isfinite(deviations[i]) and error > 0.95 * deviations[i]:
             notes.append(f"{name} is known by its prior alone: the data add nothing.")
     return notes

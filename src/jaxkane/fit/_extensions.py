@@ -16,6 +16,7 @@ from .._common.lookup import refuse_unknown
 from ._block_lsq import Blocks, eliminate
 from ._candidates import Candidate, Extended, candidates_of, carried, extended, groups_of, posed_with
 from ._compare import Plausible, plausible_of
+from ._covariance import parameter_slopes, parameter_values
 from ._fit import solve
 from ._linearize import Linearization, linearize
 from ._model import Unknowns
@@ -24,8 +25,17 @@ from ._optimize import minimize, uninterrupted
 from ._optimizers import LeastSquares
 from ._problem import Problem, refuse_other
 from ._result import Fit
-from ._score_test import Rows, beside_zero, bic_change, chance, independent_share, is_clustered, score, solved
-from ._statistics import check_level, slopes_of, values_of
+from ._statistics import (
+    LinearizedProblem,
+    bic_change,
+    check_level,
+    effective_sample_fraction,
+    f_test,
+    score_test,
+    solved,
+    use_clusters,
+    wald_test,
+)
 from ._tables import html_table, plain
 from ._validate import folds_of
 
@@ -43,7 +53,7 @@ class Standing:
     cost: float
     freedom: int
     correlation: float
-    rows: Rows
+    rows: LinearizedProblem
 
     @classmethod
     def of(cls, fit: Fit) -> Standing:
@@ -62,12 +72,12 @@ class Standing:
 
     @property
     def values(self) -> dict[str, float]:
-        values = np.asarray(values_of(self.problem.parameters, self.point.x))
+        values = np.asarray(parameter_values(self.problem.parameters, self.point.x))
         return {name: float(values[i]) for name, i in zip(self.names, self.places, strict=True)}
 
     def held_out_cost(self, folds: Folds) -> float:
         """The sum of squares of trials left out in turn, with the parameters that the others say; NaN without folds."""
-        return self.rows.left_out(self.places, folds) if folds is not None else float("nan")
+        return self.rows.cost_left_out(self.places, folds) if folds is not None else float("nan")
 
     def carried_to(self, problem: Problem) -> Unknowns:
         """The same point of a problem that has all these unknowns, and others."""
@@ -79,7 +89,7 @@ def without_priors(problem: Problem) -> Problem:
     return problem.with_priors(dict.fromkeys(problem.parameters.names, (0.0, float("inf"))))
 
 
-def rows_of(problem: Problem, at: Linearization, point: Unknowns, b: Sequence[int]) -> Rows:
+def rows_of(problem: Problem, at: Linearization, point: Unknowns, b: Sequence[int]) -> LinearizedProblem:
     """A linearization without priors, starts and these unknowns of trials eliminated, the others held."""
     blocks, parameters = at.blocks, problem.parameters
     first = blocks.n_z + blocks.n_next
@@ -87,8 +97,10 @@ def rows_of(problem: Problem, at: Linearization, point: Unknowns, b: Sequence[in
     R = blocks.R[:, :, jnp.asarray(kept, dtype=jnp.int32)]
     reduced = Blocks(R, blocks.windows, blocks.n_z, blocks.n_next, len(list(b)))
     deviation, norms = np.asarray(parameters.prior_deviation, float)[:, None], np.asarray(blocks.column_norms, float)
-    slopes, off = np.asarray(slopes_of(parameters, point.x)), np.asarray(parameters.prior_residuals(point.x))
-    return Rows(np.asarray(eliminate(reduced, 0.0).R, float), np.column_stack([slopes / deviation, off]), norms)
+    slopes, off = np.asarray(parameter_slopes(parameters, point.x)), np.asarray(parameters.prior_residuals(point.x))
+    return LinearizedProblem(
+        np.asarray(eliminate(reduced, 0.0).R, float), np.column_stack([slopes / deviation, off]), norms
+    )
 
 
 HEAD = ("candidate", "estimate", "std. error", "predicted cost", "cost", "p", "criterion", "held-out cost", "decision")
@@ -276,21 +288,29 @@ class Trying:
         count = self._unknowns(candidate, more)
         without = None
         if count:  # what the fit has without them, in its own rows
-            without = rows_of(more.problem, common.at, more.point, more.base_b).least(more.base_x)[1]
-        found = score(
-            rows, more.base_x, new, freedom=was.freedom, more=count, correlation=was.correlation, without=without
+            without = rows_of(more.problem, common.at, more.point, more.base_b).minimum(more.base_x)[1]
+        found = score_test(
+            rows,
+            more.base_x,
+            new,
+            degrees_of_freedom=was.freedom,
+            more=count,
+            correlation=was.correlation,
+            without=without,
         )
         A, r = rows.of(x)
         here = common.at.cost + float(np.sum(rows.priors[x, -1] ** 2))
         nested = abs(here - was.cost) <= NEUTRAL * was.cost + 1e-9
-        slopes = np.asarray(slopes_of(more.problem.parameters, more.point.x))
+        slopes = np.asarray(parameter_slopes(more.problem.parameters, more.point.x))
         moved = np.zeros(len(more.names))
         moved[x] = solved(A, r)
-        values = np.asarray(values_of(more.problem.parameters, more.point.x)) + slopes @ moved
+        values = np.asarray(parameter_values(more.problem.parameters, more.point.x)) + slopes @ moved
         left_out = float("nan")
         if nested and self.folds is not None:
             freedom = was.freedom - len(new) - count
-            left_out = rows.left_out(x, self.folds) + _own_share(count, found.least, freedom, was.correlation)
+            left_out = rows.cost_left_out(x, self.folds) + _own_share(
+                count, found.minimal_cost, freedom, was.correlation
+            )
         row_names = tuple(more.names[i] for i in new)
         row = Extension(
             name=candidate.name,
@@ -303,7 +323,7 @@ class Trying:
             held_out_cost=left_out,
             reason=_undetermined(more, new, found) if nested else "",
         )
-        objections = common.plausible.objections(row.values)
+        objections = common.plausible.bound_violations(row.values)
         return Promise(candidate, row, more, common, nested, tuple(objections))
 
     def _fitted(self, promise: Promise) -> tuple[Extension, Standing | None]:
@@ -323,20 +343,25 @@ class Trying:
         k = len(found.names) - n + count
         rows = rows_of(problem, at, found.point, more.owned([promise.candidate])[1])
         after = Standing(problem, found.point, found.names, found.cost, was.freedom - k, found.autocorrelation, rows)
-        now = score(
-            rows, range(n), range(n, len(found.names)), freedom=was.freedom, more=count, correlation=after.correlation
+        now = score_test(
+            rows,
+            range(n),
+            range(n, len(found.names)),
+            degrees_of_freedom=was.freedom,
+            more=count,
+            correlation=after.correlation,
         )
-        slopes = np.asarray(slopes_of(problem.parameters, found.point.x))
+        slopes = np.asarray(parameter_slopes(problem.parameters, found.point.x))
         p, criterion, reason = float("nan"), "trials left out", ""
         if promise.nested:
-            p, criterion = chance(was.cost - after.cost, k, after.cost, after.freedom, after.correlation), "F test"
-            if not count and is_clustered(rows, len(found.names), after.correlation):
-                p = beside_zero(np.asarray(found.point.x - start.x)[n:], now.covariance, len(rows.data))
+            p, criterion = f_test(was.cost - after.cost, k, after.cost, after.freedom, after.correlation), "F test"
+            if not count and use_clusters(rows, len(found.names), after.correlation):
+                p = wald_test(np.asarray(found.point.x - start.x)[n:], now.covariance, len(rows.data))
                 criterion = "t test"
         elif self.folds is None:
             change, criterion = bic_change(was.cost, after.cost, k, self.fit.problem.size[0], after.correlation), "BIC"
             reason = "" if change < 0 else f"its BIC is higher by {change:.3g}"
-        before = set(common.plausible.objections(was.values))
+        before = set(common.plausible.bound_violations(was.values))
         row = dataclasses.replace(
             row,
             values=after.values,
@@ -347,7 +372,7 @@ class Trying:
             reason=reason,
             held_out_cost=after.held_out_cost(self.folds)
             + _own_share(count, after.cost, after.freedom, after.correlation),
-            objections=tuple(o for o in common.plausible.objections(after.values) if o not in before),
+            objections=tuple(o for o in common.plausible.bound_violations(after.values) if o not in before),
         )
         return row, after
 
@@ -404,7 +429,7 @@ def _held(at: Linearization) -> np.ndarray:
 def _own_share(count: int, cost: float, freedom: int, correlation: float) -> float:
     """What unknowns of the trials' own flatter a prediction by: trials that are left out find theirs, which takes away
     a variance each, and adds one to what comes after (as in Akaike's criterion)."""
-    return 2.0 * count * cost / freedom / independent_share(correlation) if count and freedom > 0 else 0.0
+    return 2.0 * count * cost / freedom / effective_sample_fraction(correlation) if count and freedom > 0 else 0.0
 
 
 def _errors(names: Sequence[str], slopes: np.ndarray, covariance: np.ndarray) -> dict[str, float]:
@@ -414,10 +439,10 @@ def _errors(names: Sequence[str], slopes: np.ndarray, covariance: np.ndarray) ->
 
 def _undetermined(more: Extended, new: Sequence[int], found: Any) -> str:
     """What the data do not determine, in words."""
-    unseen = [more.names[i] for i, seen in zip(new, found.seen, strict=True) if not seen]
+    unseen = [more.names[i] for i, seen in zip(new, found.sensitive, strict=True) if not seen]
     if unseen:
         return f"{', '.join(unseen)} is not seen by these data"
-    lost = [more.names[i] for i, apart in zip(new, found.apart, strict=True) if not apart]
+    lost = [more.names[i] for i, apart in zip(new, found.distinguishable, strict=True) if not apart]
     return f"{', '.join(lost)} cannot be distinguished from what is free" if lost else ""
 
 

@@ -11,11 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from ._block_lsq import eliminate
+from ._covariance import formal_covariance, infinite_along, prior_information
 from ._linearize import Linearization
 from ._model import Unknowns
 from ._nuisance import solve_nuisance
 from ._problem import Problem, refuse_other
-from ._statistics import formal_covariance, infinite_along, priors_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,7 +45,8 @@ class Identifiability:
     - `undetermined`: the directions that the data do not determine, weakest first. Where several change nothing at
         all, so does every sum of them: those are taken in which the fewest parameters move.
     - `variance` of a residual, by which `covariance` and `deviations` count the data: of a `Fit` what is left there, by
-        `freedom`, the residuals less the unknowns that they and not priors determine; else one, as `sigma` says.
+        `degrees_of_freedom`, the residuals less the unknowns that they and not priors determine; else one, as `sigma`
+        says.
     - `covariance` (p, p) of the parameters in their units, infinite for those that are not determined.
     - `covariance_of_x` (p, p) of the free numbers x behind them, with `sigma` as it was given (Laplace); `directions`
         (p, k): steps of x, of one along each row of `vectors` that the data determine.
@@ -61,7 +62,7 @@ class Identifiability:
     at_bound: tuple[str, ...]
     undetermined: tuple[Direction, ...]
     variance: float
-    freedom: float
+    degrees_of_freedom: float
     covariance: np.ndarray
     covariance_of_x: np.ndarray
     directions: np.ndarray
@@ -81,7 +82,7 @@ class Identifiability:
         return tuple(direction.text for direction in self.undetermined)
 
     @property
-    def how_many(self) -> str:
+    def rank_message(self) -> str:
         """In words, where combinations are determined and not the parameters themselves; else ""."""
         if all(len(direction.parts) == 1 for direction in self.undetermined):
             return ""
@@ -93,7 +94,7 @@ class Identifiability:
         return (self.vectors.T * self.singular_values**2) @ self.vectors
 
     @property
-    def given_errors(self) -> np.ndarray:
+    def given_sigma_errors(self) -> np.ndarray:
         """Standard errors (p,) with `sigma` as it was given, whatever is left; infinite where nothing determines."""
         known = self.singular_values > 0
         parts = np.where(known[:, None], self.vectors / np.where(known, self.singular_values, 1.0)[:, None], 0.0)
@@ -115,7 +116,7 @@ class Identifiability:
         return "\n".join(lines)
 
     def __str__(self) -> str:
-        return "\n".join([self.table, *filter(None, [self.how_many]), *self.messages])
+        return "\n".join([self.table, *filter(None, [self.rank_message]), *self.messages])
 
 
 def identifiability(problem: Problem, *, flat: float = 0.5, at: Unknowns | None = None) -> Identifiability:
@@ -161,12 +162,14 @@ def identifiability_at(
     no_influence = before <= 1e4 * eps * before.max()
     s, V = _by_singular_values(A, no_influence, 1e3 * eps * before.max())
     inverse = (V[s > 0].T / s[s > 0] ** 2) @ V[s > 0]
-    priors = priors_of(problem, point, eliminated)
+    priors = prior_information(problem, point, eliminated)
     of_priors = to_x.T @ priors.information @ to_x
-    freedom = problem.size[0] - priors.number - problem.size[1] + priors.determined + np.sum(inverse * of_priors)
+    degrees_of_freedom = (
+        problem.size[0] - priors.number - problem.size[1] + priors.determined + np.sum(inverse * of_priors)
+    )
     variance = 1.0
     if not given and problem.model.noise is None:  # a likelihood knows how large residuals are
-        variance = (at.cost - priors.squares) / freedom if freedom > 1e-3 else np.nan
+        variance = (at.cost - priors.squares) / degrees_of_freedom if degrees_of_freedom > 1e-3 else np.nan
     # Without a degree of freedom nothing says that `sigma` is wrong.
     along = V @ formal_covariance(inverse, of_priors, 1.0 if np.isnan(variance) else variance) @ V.T
     covariance = formal_covariance(inverse, of_priors, variance) * np.outer(scales, scales)
@@ -185,7 +188,7 @@ def identifiability_at(
         at_bound=named(at_bound),
         undetermined=(),
         variance=float(variance),
-        freedom=float(freedom),
+        degrees_of_freedom=float(degrees_of_freedom),
         covariance=infinite_along(covariance, V[s == 0]),
         covariance_of_x=to_x @ inverse @ to_x.T,
         directions=to_x @ V[s > 0].T,

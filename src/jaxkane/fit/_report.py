@@ -169,7 +169,10 @@ def draw_profiles(fit: Fit, profiles: Sequence[Profile]) -> Any:
     axes = figure.subplots(1 + (len(profiles) - 1) // 3, min(3, len(profiles)), squeeze=False).ravel()
     for ax, profile in zip(axes, profiles, strict=False):
         ax.plot(profile.values, profile.costs, "o-", markersize=3)
-        error, best = fit.identifiability.given_errors[fit.names.index(profile.name)], fit.estimates[profile.name]
+        error, best = (
+            fit.identifiability.given_sigma_errors[fit.names.index(profile.name)],
+            fit.estimates[profile.name],
+        )
         ax.plot(profile.values, fit.cost + ((profile.values - best) / error) ** 2, "--", color="0.6")
         for end in profile.interval:
             ax.axvline(end, color="C3", linewidth=1)
@@ -207,7 +210,7 @@ def ending(fit: Fit) -> str:
 
 
 def how_sure(fit: Fit) -> str:
-    if fit.robust:
+    if fit.uses_clustered_errors:
         return (
             "Intervals are built on the cluster-robust errors "
             f"(by {fit.clusters[0]}), since the residuals are correlated "
@@ -245,7 +248,7 @@ def residual_rows(fit: Fit) -> Rows:
     rows = []
     for name, channels in fit.tests.items():
         for channel, t in channels.items():
-            row = [name, channel, str(t.n), f"{100 * t.accounted:.1f} %", f"{t.rms:.2f}", f"{t.mean:+.2f}"]
+            row = [name, channel, str(t.n), f"{100 * t.variance_accounted_for:.1f} %", f"{t.rms:.2f}", f"{t.mean:+.2f}"]
             rows.append([*row, f"{t.ljung_box:.2g}", f"{t.runs:.2g}"])
     head = ("trial", "channel", "samples", "accounted for", "rms [σ]", "mean [σ]", "p, Ljung-Box", "p, runs")
     return [head, *rows]

@@ -16,8 +16,8 @@ import numpy as np
 from .._common.files import differences
 from .._integrate.trajectory import Trajectory
 from .._system.system import System
+from . import _covariance as covariance
 from . import _diagnostics as notes
-from . import _statistics as covariance
 from . import _statistics as residuals
 from ._block_lsq import Blocks
 from ._identifiability import Identifiability, identifiability_at
@@ -54,7 +54,7 @@ class Fit:
     - `nuisance`: by trial, values of the biases and of the windows' starts by name; with process noise, starts that
         were given a deviation are part of the filter (`jaxkane.fit.smoothed`).
     - `step_error`: by how much halving the step of integration moves the residuals.
-    - `failed`: by name, trials that could not be simulated and are not among these, with the reason (`applied_to`).
+    - `failed`: by name, trials that could not be simulated and are not among these, with the reason (`validate`).
     - `notes`: what a reader should know, in words.
     """
 
@@ -157,7 +157,7 @@ class Fit:
 
     @property
     def covariance(self) -> np.ndarray:
-        """(p, p), in the parameters' units; NaN of parameters that are those of another fit (`applied_to`)."""
+        """(p, p), in the parameters' units; NaN of parameters that are those of another fit (`validate`)."""
         return self._of_estimates(self.identifiability.covariance)
 
     def _of_estimates(self, covariance: np.ndarray) -> np.ndarray:
@@ -172,7 +172,7 @@ class Fit:
         """(p, p), in the parameters' units, robust to residuals that are correlated within a trial, or a window: see
         `clusters`."""
         seen = self.identifiability
-        along = covariance.covariance_by_cluster(self.problem, self.point, self.linearization, seen.directions)
+        along = covariance.cluster_robust_covariance(self.problem, self.point, self.linearization, seen.directions)
         return self._of_estimates(seen.in_units(along))
 
     @property
@@ -180,14 +180,14 @@ class Fit:
         return dict(zip(self.names, np.sqrt(self.clustered_covariance.diagonal()).tolist(), strict=True))
 
     @property
-    def robust(self) -> bool:
+    def uses_clustered_errors(self) -> bool:
         """Whether `errors` are the cluster-robust ones: residuals are no noise, and trials or windows are enough."""
         return bool(self.clusters[1] and abs(self.autocorrelation) > residuals.CORRELATED)
 
     @property
     def errors(self) -> dict[str, float]:
-        """Those of all intervals: the cluster-robust ones where `robust`, else the formal ones."""
-        return self.clustered_errors if self.robust else self.standard_errors
+        """Those of all intervals: the cluster-robust ones where `uses_clustered_errors`, else the formal ones."""
+        return self.clustered_errors if self.uses_clustered_errors else self.standard_errors
 
     @property
     def clusters(self) -> tuple[str, int]:
@@ -196,19 +196,19 @@ class Fit:
         return covariance.clusters_of(self.problem)
 
     @property
-    def freedom(self) -> float:
-        """Degrees of freedom of all intervals: trials (or windows) less one where `robust`, else residuals less the
+    def degrees_of_freedom(self) -> float:
+        """Of all intervals: trials (or windows) less one where `uses_clustered_errors`, else residuals less the
         unknowns that they and not priors determine."""
-        return self.clusters[1] - 1 if self.robust else self.identifiability.freedom
+        return self.clusters[1] - 1 if self.uses_clustered_errors else self.identifiability.degrees_of_freedom
 
     def quantile(self, level: float = 0.95) -> float:
-        """Of Student's distribution, two-sided, with as many degrees of freedom as `freedom`."""
-        return covariance.t_quantile(level, self.freedom)
+        """Of Student's distribution, two-sided, with as many degrees of freedom as `degrees_of_freedom`."""
+        return residuals.t_quantile(level, self.degrees_of_freedom)
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Confidence intervals by name, inside a parameter's bounds: symmetric in the free numbers.
 
-        From `errors`; `freedom` says with how many degrees.
+        From `errors`; `degrees_of_freedom` says with how many degrees.
 
         **Raises:** `ValueError` for a level that is not between 0 and 1.
         """
@@ -229,7 +229,11 @@ class Fit:
     def residuals(self) -> ByTrial:
         deviation = self.linearization.prediction.deviation
         known = None if deviation is None else residuals.by_trial(self.problem, np.asarray(deviation))
-        return residuals.scaled_residuals(self.problem, self.fitted, known)
+        scaled = {}
+        for (name, channels), trial in zip(self.fitted.items(), self.problem.trials, strict=True):
+            sigma = trial.sigma if known is None else known[name]
+            scaled[name] = {channel: (y - trial.measured[channel]) / sigma[channel] for channel, y in channels.items()}
+        return scaled
 
     @functools.cached_property
     def tests(self) -> dict[str, dict[str, ResidualTest]]:
@@ -243,7 +247,13 @@ class Fit:
 
     @property
     def variance_accounted_for(self) -> dict[str, float]:
-        return residuals.variance_accounted_for(self.problem, self.fitted)
+        trials = list(zip(self.fitted.values(), self.problem.trials, strict=True))
+        return {
+            channel: residuals.variance_accounted_for(
+                *zip(*((t.measured[channel], y[channel]) for y, t in trials if channel in y), strict=True)
+            )
+            for channel in self.problem.channels
+        }
 
     @functools.cached_property
     def autocorrelation(self) -> float:

@@ -1,192 +1,22 @@
-"""Statistics of a fit: covariances, intervals, and tests of the residuals. Knows numbers."""
+"""Tests of a fit: of its residuals, of parameters beside zero (F, t and score test), and information criteria."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Sequence
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-import scipy.linalg
-from jaxtyping import Array
 from scipy import stats
 
 from .._common.lookup import real_number
-from .._scalarjit.cache_key import compiled
-from ._block_lsq import Blocks, Eliminated, eliminate
-from ._linearize import Linearization
-from ._model import Unknowns
-from ._parameters import Parameters
+from ._covariance import enough_clusters, formal_covariance, jackknife_covariance
 from ._problem import Problem
 
+ByTrial = dict[str, dict[str, np.ndarray]]
+"""By the names of trial and channel, samples (n_t,)."""
 
-def formal_covariance(inverse: np.ndarray, of_priors: np.ndarray, variance: float) -> np.ndarray:
-    """B (v D + P) B,   B = (D + P)^-1   (p, p)
-
-    of unknowns with the information D from data whose residuals have the variance v, and P from priors, which are
-    measurements with the deviations that they were given. `inverse`: B.
-    """
-    return variance * inverse + (1.0 - variance) * inverse @ of_priors @ inverse
-
-
-def clustered_covariance(
-    information: np.ndarray, scores: np.ndarray, places: np.ndarray, of_priors: np.ndarray
-) -> np.ndarray:
-    """(G - 1) / G sum_g d_g d_g^T + B P B,   d_g = (N - N_g)^-1 s_g,   B = N^-1,   N = sum_g N_g + P   (n, n)
-
-    Robust to whatever correlates inside a cluster. d_g is what leaving out the cluster g moves, linearized (the
-    jackknife; CR3 of Bell and McCaffrey 2002): a sandwich without it is too small where a cluster has much influence.
-
-    **Arguments:** of every cluster the `information` N_g (G, k, k) and the `scores` s_g (G, k) of its data about the
-    unknowns at `places` (G, k); `of_priors`: P (n, n), of no cluster.
-    """
-    N, G = of_priors.copy(), len(places)
-    rows, columns = places[:, :, None], places[:, None, :]
-    np.add.at(N, (rows, columns), information)
-    scale = np.sqrt(np.maximum(N.diagonal(), np.finfo(float).tiny))
-    B = np.linalg.pinv(N / np.outer(scale, scale), rcond=1e-13, hermitian=True)
-    values, V = np.linalg.eigh(information / (scale[rows] * scale[columns]))
-    roots = np.sqrt(np.maximum(values, 0.0))
-    S, known = V * roots[:, None, :], roots > 1e-7  # N_g = S S^T,  s_g = S c
-    c = np.einsum("gij,gi->gj", V, scores / scale[places]) * known / np.where(known, roots, 1.0)
-    # (N - S S^T)^-1 S = B S (I - S^T B S)^-1. What one cluster alone determines stays where it is without it.
-    left = np.linalg.pinv(np.eye(S.shape[2]) - S.mT @ B[rows, columns] @ S, rcond=1e-9, hermitian=True)
-    moved = np.einsum("gni,gij,gj->gn", np.moveaxis(B[:, places], 1, 0) @ S, left, c)
-    covariance = (G - 1) / G * moved.T @ moved + B @ (of_priors / np.outer(scale, scale)) @ B
-    return covariance / np.outer(scale, scale)
-
-
-def infinite_along(covariance: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """A covariance (p, p) with the variance of every parameter infinite that has a part in one of these directions
-    (k, p), which nothing determines; between it and the others NaN."""
-    there = np.any(np.abs(directions) > 1e-5, axis=0)
-    found = np.where(there[:, None] | there[None, :], np.nan, covariance)
-    found[there, there] = np.inf
-    return found
-
-
-def are_enough(clusters: int, parameters: int) -> bool:
-    """Whether so many clusters say how parameters scatter."""
-    return clusters >= parameters + 2
-
-
-def clusters_of(problem: Problem) -> tuple[str, int]:
-    """Within what residuals are taken to be correlated, and how many there are: trials, where these are more than the
-    parameters by two; else windows, where these start freely and are more by two; ("", 0) where neither is.
-
-    Windows of one trial have its biases in common, and whatever else differs from trial to trial: errors by window do
-    not see that.
-    """
-    p = len(problem.parameters.names)
-    if are_enough(problem.clusters, p):
-        return "trial", problem.clusters
-    windows, nuisance = int(problem.active_windows.sum()), problem.model.nuisance
-    if are_enough(windows, p) and windows > problem.clusters and not nuisance.has_defects:
-        return "window", windows
-    return "", 0
-
-
-def covariance_by_cluster(problem: Problem, point: Unknowns, at: Linearization, directions: np.ndarray) -> np.ndarray:
-    """Cluster-robust covariance (k, k) along directions (p, k) of the free numbers, by `clusters_of`; NaN where there
-    are too few. What every cluster has of its own is eliminated: by trial its starts and biases, by window its start.
-    The parameters' priors, and by window those of the biases, are part of no cluster."""
-    kind, _ = clusters_of(problem)
-    k = directions.shape[1]
-    if not kind:
-        return np.full((k, k), np.nan)
-    blocks, owner, seen = at.blocks, np.asarray(problem.windows.trial), problem.active_windows
-    clusters, n_own = owner, 0
-    if kind == "window":  # each a trial of its own, whose biases are shared with others
-        clusters, n_own = np.arange(len(owner), dtype=np.int32), blocks.n_b
-        blocks = Blocks(blocks.R, jnp.asarray(clusters[:, None]), blocks.n_z, 0, 0)
-    p = directions.shape[0]
-
-    def squares(rows: np.ndarray) -> np.ndarray:
-        """Of clusters, information (G, c, c) about what is shared and along the directions, bordered by the scores."""
-        rows = np.concatenate([rows[..., : -p - 1], rows[..., -p - 1 : -1] @ directions, rows[..., -1:]], axis=-1)
-        return rows.mT @ rows
-
-    data = squares(np.asarray(eliminate(blocks, 0.0).R, float))
-    of_priors = np.zeros_like(data)
-    np.add.at(of_priors, clusters, squares(prior_rows(problem, point)[0][:, -n_own - p :, -n_own - p - 1 :]))
-    n = len(problem.trials) * n_own + k
-    places = np.tile(np.arange(n - k, n), (len(data), 1))
-    if kind == "window":
-        places = np.column_stack([owner[:, None] * n_own + np.arange(n_own), places])
-    P = np.zeros((n, n))
-    np.add.at(P, (places[:, :, None], places[:, None, :]), of_priors[:, :-1, :-1])
-    kept, data = np.unique(clusters[seen]), data - of_priors
-    return clustered_covariance(data[kept, :-1, :-1], data[kept, :-1, -1], places[kept], P)[-k:, -k:]
-
-
-def prior_rows(problem: Problem, point: Unknowns) -> tuple[np.ndarray, int]:
-    """The rows (W, n_z + n_b + p, n) of all priors in the columns of a window's block [z, z_next, b, x, r], zero where
-    there is none, and how many there are."""
-    parameters, windows, nuisance = problem.parameters, problem.windows, problem.model.nuisance
-    seen, owner = problem.active_windows, np.asarray(windows.trial)
-    z, b, x = (np.asarray(u, float) for u in (point.z, point.b[windows.trial], parameters.prior_residuals(point.x)))
-    of_trial = np.asarray(windows.first) & np.isin(owner, owner[seen])
-    counts = (of_trial if nuisance.has_defects else seen, of_trial, np.asarray(windows.very_first))
-    deviations = [np.asarray(d, float) for d in (nuisance.start_deviation, nuisance.trial_deviation)]
-    residuals = (z / deviations[0], b / deviations[1], np.broadcast_to(x, (len(owner), len(x))))
-    of_x = np.asarray(slopes_of(parameters, point.x), float) / np.asarray(parameters.prior_deviation, float)[:, None]
-    slopes = np.asarray(scipy.linalg.block_diag(*(np.diag(1.0 / d) for d in deviations), of_x))
-    n_z, n_next = z.shape[1], z.shape[1] if nuisance.has_defects else 0
-    slopes = np.insert(slopes, [n_z] * n_next, 0.0, axis=1)
-    known = np.isfinite(np.concatenate([*deviations, np.asarray(parameters.prior_deviation, float)]))
-    there = np.concatenate([np.tile(c[:, None], r.shape[1]) for c, r in zip(counts, residuals, strict=True)], axis=1)
-    there &= known
-    rows = np.concatenate(
-        [np.broadcast_to(slopes, (len(owner), *slopes.shape)), np.hstack(residuals)[..., None]], axis=2
-    )
-    return there[..., None] * rows, int(there.sum())
-
-
-class Priors(NamedTuple):
-    """What all priors say together.
-
-    - `information` (p, p): about the free numbers, starts and biases following them.
-    - `determined`: how many of the starts and biases they determine and not the data, a share where both do.
-    - `number`: of them; `squares`: the sum of their squared residuals.
-    """
-
-    information: np.ndarray
-    determined: float
-    number: int
-    squares: float
-
-
-def priors_of(problem: Problem, point: Unknowns, eliminated: Eliminated) -> Priors:
-    """Of a problem whose linearization at the point has been `eliminated`."""
-    (rows, number), blocks, p = prior_rows(problem, point), eliminated.blocks, point.x.shape[0]
-    of_x, others, determined = rows[:, -p:, -p - 1 : -1], rows[:, :-p], 0.0
-    information = np.einsum("wmi,wmj->ij", of_x, of_x)
-    if others.any():
-        still, *moved = (eliminated.back_substitute(x) for x in jnp.eye(p + 1, p, -1, dtype=point.x.dtype))
-        z, b = (np.array([new - old for new in news]).T for *news, old in zip(*moved, still, strict=True))  # by x
-        follow = np.concatenate([z.swapaxes(0, 1), b.swapaxes(0, 1)[np.asarray(problem.windows.trial)]], axis=1)
-        places = [*range(blocks.n_z), *range(blocks.n_z + blocks.n_next, rows.shape[2] - p - 1)]
-        J = others[:, :, places] @ follow
-        information += np.einsum("wmi,wmj->ij", J, J)
-        # d log det (N + e P) / de = tr (P N^-1), of starts and biases
-        e = float(jnp.finfo(blocks.R.dtype).eps) ** (1 / 3)
-        R = np.linalg.qr(np.concatenate([np.asarray(blocks.R), e**0.5 * others], axis=1), mode="r")
-        more = eliminate(eqx.tree_at(lambda blocks: blocks.R, blocks, jnp.asarray(R, blocks.R.dtype)), 0.0)
-        determined = float(more.log_determinant - eliminated.log_determinant) / e
-    return Priors(information, determined, number, float(np.sum(rows[:, :, -1] ** 2)))
-
-
-def intervals(parameters: Parameters, x: Array, half: np.ndarray) -> list[tuple[float, float]]:
-    """Around every parameter an interval of half the width `half` (p,), inside its bounds: symmetric in the free
-    numbers x (p,). What moves with others, as a body's values do, is taken as linear."""
-    values, slopes = np.asarray(values_of(parameters, x)), np.asarray(slopes_of(parameters, x))
-    alone = (np.count_nonzero(slopes, axis=1) == 1) & (slopes.diagonal() != 0)
-    in_x = np.where(alone & np.isfinite(half), half / np.where(alone, np.abs(slopes.diagonal()), 1.0), 0.0)
-    ends = [np.asarray(values_of(parameters, x + jnp.asarray(sign * in_x, x.dtype))) for sign in (-1, 1)]
-    low, high = (np.where(in_x > 0, end, values + s * half) for s, end in zip((-1, 1), ends, strict=True))
-    return [(float(min(a, b)), float(max(a, b))) for a, b in zip(low, high, strict=True)]
+CORRELATED = 0.2
+"""Neighbouring residuals that correlate by more are no independent measurements."""
 
 
 def check_level(level: float) -> None:
@@ -195,29 +25,10 @@ def check_level(level: float) -> None:
         raise ValueError(f"`level` is a probability between 0 and 1, such as 0.95 or 0.05; got {level}.")
 
 
-def t_quantile(level: float, freedom: float) -> float:
+def t_quantile(level: float, degrees_of_freedom: float) -> float:
     """Two-sided, of Student's distribution; NaN without a degree of freedom."""
     check_level(level)
-    return float(stats.t.ppf(0.5 * (1 + level), freedom)) if freedom > 0 else float("nan")
-
-
-@compiled
-def values_of(parameters: Parameters, x: Any) -> Any:
-    """`parameters.values(x)`, as one program."""
-    return parameters.values(x)
-
-
-@compiled
-def slopes_of(parameters: Parameters, x: Any) -> Any:
-    """`parameters.slopes(x)`, as one program."""
-    return parameters.slopes(x)
-
-
-ByTrial = dict[str, dict[str, np.ndarray]]
-"""By the names of trial and channel, samples (n_t,)."""
-
-CORRELATED = 0.2
-"""Neighbouring residuals that correlate by more are no independent measurements."""
+    return float(stats.t.ppf(0.5 * (1 + level), degrees_of_freedom)) if degrees_of_freedom > 0 else float("nan")
 
 
 def trial_names(problem: Problem) -> tuple[str, ...]:
@@ -227,10 +38,10 @@ def trial_names(problem: Problem) -> tuple[str, ...]:
 
 
 def by_trial(problem: Problem, simulated: np.ndarray) -> ByTrial:
-    """What was simulated (W, n_c, n_t) in windows, put together; NaN where no window is."""
-    found = {}
+    """Simulated measurements of windows (W, n_c, n_t), joined by trial and channel; NaN where no window is."""
+    joined = {}
     for k, name in enumerate(trial_names(problem)):
-        trial, found[name] = problem.trials[k], {}
+        trial, joined[name] = problem.trials[k], {}
         for c, channel in enumerate(problem.channels):
             if channel not in trial.measured:
                 continue
@@ -238,30 +49,15 @@ def by_trial(problem: Problem, simulated: np.ndarray) -> ByTrial:
             for i, (owner, first, n) in enumerate(problem.slices):
                 if owner == k:
                     y[first : first + n] = simulated[i, c, :n]
-            found[name][channel] = y
-    return found
+            joined[name][channel] = y
+    return joined
 
 
-def scaled_residuals(problem: Problem, fitted: ByTrial, deviation: ByTrial | None = None) -> ByTrial:
-    """(fitted - measured) / deviation, by default sigma; NaN in gaps."""
-    found = {}
-    for (name, channels), trial in zip(fitted.items(), problem.trials, strict=True):
-        known = trial.sigma if deviation is None else deviation[name]
-        found[name] = {channel: (y - trial.measured[channel]) / known[channel] for channel, y in channels.items()}
-    return found
-
-
-def variance_accounted_for(problem: Problem, fitted: ByTrial) -> dict[str, float]:
-    """1 - sum (y - fit)^2 / sum (y - mean y)^2 of every channel, over all trials."""
-    found = {}
-    for channel in problem.channels:
-        left = total = 0.0
-        for channels, trial in zip(fitted.values(), problem.trials, strict=True):
-            if channel in trial.measured:
-                y, f = trial.measured[channel], channels[channel]
-                left, total = left + np.nansum((f - y) ** 2), total + np.nansum((y - np.nanmean(y)) ** 2)
-        found[channel] = float(1 - left / total) if total > 0 else float("nan")
-    return found
+def variance_accounted_for(measured: Sequence[np.ndarray], fitted: Sequence[np.ndarray]) -> float:
+    """1 - sum (y - fit)^2 / sum (y - mean y)^2, the mean of each series by itself; NaN of what does not vary."""
+    left = sum(np.nansum((f - y) ** 2) for y, f in zip(measured, fitted, strict=True))
+    total = sum(np.nansum((y - np.nanmean(y)) ** 2) for y in measured)
+    return float(1 - left / total) if total > 0 else float("nan")
 
 
 def autocorrelations(series: Iterable[np.ndarray], n: int) -> np.ndarray:
@@ -283,8 +79,7 @@ class ResidualTest:
     """One channel of one trial.
 
     - `n`: samples; `mean`, `rms`: of the residuals, in their standard deviation `sigma`.
-    - `accounted`: the variance accounted for, 1 - sum (y - fit)^2 / sum (y - mean y)^2; below zero is worse than a
-        constant.
+    - `variance_accounted_for`: 1 - sum (y - fit)^2 / sum (y - mean y)^2; below zero is worse than a constant.
     - `autocorrelation`: of neighbours. `ljung_box`: the probability that white noise has autocorrelations as large
         (Ljung and Box 1978, ten lags, or a fifth of the samples). `runs`: that it changes sign so seldom or so often
         (Wald and Wolfowitz 1940).
@@ -293,7 +88,7 @@ class ResidualTest:
     n: int
     mean: float
     rms: float
-    accounted: float
+    variance_accounted_for: float
     autocorrelation: float
     ljung_box: float
     runs: float
@@ -306,13 +101,10 @@ class ResidualTest:
 
 def residual_test(measured: np.ndarray, fitted: np.ndarray, residual: np.ndarray) -> ResidualTest:
     """Tests of one channel (n_t,); NaN is a gap."""
-    seen = np.isfinite(residual)
-    r, y = residual[seen], measured[seen]
-    nothing = float("nan")
+    finite = np.isfinite(residual)
+    r = residual[finite]
     if r.size < 2:
-        return ResidualTest(int(r.size), nothing, nothing, nothing, nothing, nothing, nothing)
-    spread = float(np.sum((y - y.mean()) ** 2))
-    accounted = 1 - float(np.sum((fitted[seen] - y) ** 2)) / spread if spread > 0 else nothing
+        return ResidualTest(int(r.size), *[float("nan")] * 6)
     lags = autocorrelations([r], max(1, min(10, r.size // 5)))
     # Ljung and Box divide by the number of samples, not by that of the pairs.
     box = (r.size + 2) / r.size * np.sum(lags**2 * (r.size - np.arange(1, lags.size + 1)))
@@ -320,15 +112,15 @@ def residual_test(measured: np.ndarray, fitted: np.ndarray, residual: np.ndarray
         n=int(r.size),
         mean=float(r.mean()),
         rms=float(np.sqrt(np.mean(r**2))),
-        accounted=accounted,
+        variance_accounted_for=variance_accounted_for([measured[finite]], [fitted[finite]]),
         autocorrelation=float(lags[0]),
         ljung_box=float(stats.chi2.sf(box, lags.size)),
-        runs=_runs(r),
+        runs=runs_test(r),
     )
 
 
-def _runs(r: np.ndarray) -> float:
-    """Probability, two-sided, of as few or as many runs of one sign."""
+def runs_test(r: np.ndarray) -> float:
+    """Probability, two-sided, of as few or as many runs of one sign (Wald and Wolfowitz 1940)."""
     up = r > 0
     n1, n2 = int(up.sum()), int((~up).sum())
     if min(n1, n2) == 0:
@@ -337,3 +129,151 @@ def _runs(r: np.ndarray) -> float:
     mean = 1 + 2 * n1 * n2 / n
     variance = (mean - 1) * (mean - 2) / (n - 1)
     return float(2 * stats.norm.sf(abs(runs - mean) / np.sqrt(variance))) if variance > 0 else 1.0
+
+
+def effective_sample_fraction(correlation: float) -> float:
+    """(1 - c) / (1 + c), as in an autoregression: as how much of an independent residual one counts whose neighbours
+    correlate by c."""
+    c = correlation if correlation > CORRELATED else 0.0
+    return (1 - c) / (1 + c)
+
+
+def f_test(drop: float, k: int, cost: float, degrees_of_freedom: float, correlation: float) -> float:
+    """The probability that k parameters which are zero lower a sum of squares by `drop` to `cost` (Fisher's F)."""
+    if degrees_of_freedom <= 0 or k == 0 or not drop > 0:
+        return 1.0
+    share = effective_sample_fraction(correlation)
+    ratio = share * drop / k / max(cost / degrees_of_freedom, 1e-300)
+    return float(stats.f.sf(ratio, k, max(share * degrees_of_freedom, 1.0)))
+
+
+def wald_test(step: np.ndarray, covariance: np.ndarray, trials: int) -> float:
+    """The probability that one of some parameters (q,) which are all zero is estimated as far from it, with a
+    covariance from so many trials: Student's t of each, and Bonferroni's bound over them.
+
+    Hotelling's test of all of them together rejects too often, up to 12 % at 5 %, where few trials tell most.
+    """
+    p = 2 * stats.t.sf(np.abs(step) / np.sqrt(np.diagonal(covariance)), trials - 1)
+    return float(min(1.0, len(step) * p.min()))
+
+
+def bic_change(before: float, after: float, more: int, n: int, correlation: float) -> float:
+    """By how much a model with `more` unknowns changes the Bayesian information criterion (Schwarz 1978) of n residuals
+    of unknown variance, nested or not: below zero it is the better one."""
+    n_effective = max(effective_sample_fraction(correlation) * n, 1.0)
+    return float(n_effective * np.log(max(after, 1e-300) / max(before, 1e-300)) + more * np.log(n_effective))
+
+
+@dataclasses.dataclass(frozen=True)
+class LinearizedProblem:
+    """Least squares in x, in rows by trial: residuals A_t x + r_t, and priors of which each belongs to one x.
+
+    - `data` (T, m, n + 1): A_t beside r_t. `priors` (n, n + 1): of each x its own.
+    - `norms` (n,): of the columns, before other unknowns were eliminated from them.
+    """
+
+    data: np.ndarray
+    priors: np.ndarray
+    norms: np.ndarray
+
+    def of(self, places: Sequence[int]) -> tuple[np.ndarray, np.ndarray]:
+        """Sensitivity (M, k) and residuals (M,) where only these may move, with their priors."""
+        places = list(places)
+        rows = np.concatenate([self.data.reshape(-1, self.data.shape[-1]), self.priors[places]])
+        return rows[:, places], rows[:, -1]
+
+    def minimum(self, places: Sequence[int]) -> tuple[np.ndarray, float]:
+        """The step (k,) of these to the minimal sum of squares, and that sum."""
+        A, r = self.of(places)
+        x = solved(A, r)
+        return x, float(np.sum((A @ x + r) ** 2))
+
+    def cost_left_out(self, places: Sequence[int], folds: Sequence[Sequence[int]]) -> float:
+        """Cross validation: the sum of squares of trials left out in turn, with these estimated from the others."""
+        places, total = list(places), 0.0
+        for fold in folds:
+            x, _ = dataclasses.replace(self, data=np.delete(self.data, list(fold), axis=0)).minimum(places)
+            out = self.data[list(fold)]
+            total += float(np.sum((out[:, :, places] @ x + out[:, :, -1]) ** 2))
+        return total
+
+
+def solved(A: np.ndarray, r: np.ndarray) -> np.ndarray:
+    """The shortest x (n,) that minimizes |A x + r|, or (n, k) for r (m, k); columns are scaled: units do not matter."""
+    size = np.linalg.norm(A, axis=0)
+    size = np.where(size > 0, size, 1.0)
+    return (np.linalg.lstsq(A / size, -r, rcond=1e-11)[0].T / size).T
+
+
+@dataclasses.dataclass(frozen=True)
+class Score:
+    """The score test of some parameters.
+
+    - `step` (q,) of them, and its `covariance` (q, q). `drop`: by how much the sum of squares falls, to `minimal_cost`.
+    - `p`: the probability of such a drop by chance.
+    - `sensitive`, `distinguishable` (q,): whether the data depend on a parameter at all, and whether it can be told
+        from those that are free already.
+    """
+
+    step: np.ndarray
+    covariance: np.ndarray
+    drop: float
+    minimal_cost: float
+    p: float
+    sensitive: np.ndarray
+    distinguishable: np.ndarray
+
+
+def score_test(
+    rows: LinearizedProblem,
+    base: Sequence[int],
+    new: Sequence[int],
+    *,
+    degrees_of_freedom: int,
+    more: int = 0,
+    correlation: float = 0.0,
+    without: float | None = None,
+) -> Score:
+    """Rao's score test of `new` parameters beside `base` ones, by one linearization at the minimum without them.
+
+        drop = g^T H^-1 g,   g = A'^T r,   H = A'^T A',   A' = A_new less what A_base can stand for
+
+    **Arguments:** `degrees_of_freedom`: residuals less unknowns without them; `more`: unknowns of trials that come with
+    them. `correlation`: of neighbouring residuals. Where it exceeds 0.2, a residual counts as (1 - c) / (1 + c) of one,
+    as in an autoregression; the covariance is clustered by trial, where there are enough of them. `without`: the sum of
+    squares without all that is new, where unknowns of trials come with it, which the rows have lost already.
+    """
+    base, new, q = list(base), list(new), len(new)
+    A, r = rows.of([*base, *new])
+    A0, A1 = A[:, : len(base)], A[:, len(base) :]
+    rest = A1 + A0 @ solved(A0, A1)  # (M, q)
+    sensitive = rows.norms[new] > 1e-11 * rows.norms.max(initial=0.0)
+    # Less than 1e-7 of a column, once those of the others are taken out of it, is a rounding error.
+    distinguishable = sensitive & (np.linalg.norm(rest, axis=0) > 1e-7 * rows.norms[new])
+    before = r + A0 @ solved(A0, r)
+    step = solved(rest, before) if q and np.all(distinguishable) else np.zeros(q)
+    after = before + rest @ step
+    minimal_cost, k = float(after @ after), q + more
+    drop = float(before @ before if without is None else without) - minimal_cost
+    covariance, p = np.full((q, q), np.nan), 1.0
+    if np.all(distinguishable):
+        p = f_test(drop, k, minimal_cost, degrees_of_freedom - k, correlation)
+    if q and np.all(distinguishable):
+        T, m, n = *rows.data.shape[:2], A.shape[1]
+        of_priors = A[T * m :].T @ A[T * m :]
+        if use_clusters(rows, n, correlation):
+            A_t = rows.data[:, :, [*base, *new]]
+            scores = np.einsum("tmi,tm->ti", A_t, after[: T * m].reshape(T, m))
+            covariance = jackknife_covariance(A_t.mT @ A_t, scores, np.tile(np.arange(n), (T, 1)), of_priors)[-q:, -q:]
+        elif degrees_of_freedom > k:
+            variance = minimal_cost / (degrees_of_freedom - k) / effective_sample_fraction(correlation)
+            size = np.linalg.norm(A, axis=0)
+            inverse = np.linalg.pinv((A / size).T @ (A / size), rcond=1e-14) / np.outer(size, size)
+            covariance = formal_covariance(inverse, of_priors, variance)[-q:, -q:]
+    return Score(step, covariance, drop, minimal_cost, p, sensitive, distinguishable)
+
+
+def use_clusters(rows: LinearizedProblem, parameters: int, correlation: float) -> bool:
+    """Whether errors of so many parameters are clustered by trial: the residuals are no noise, and the trials are
+    enough."""
+    return abs(correlation) > CORRELATED and enough_clusters(rows.data.shape[0], parameters)

@@ -199,7 +199,7 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
     values = np.array(sorted(found))
     costs = np.array([found[v][0] for v in values])
     # The cost rises by one at the error that `sigma` as it was given would leave.
-    limit = costs.min() + (fit.quantile(level) * fit.errors[name] / fit.identifiability.given_errors[i]) ** 2
+    limit = costs.min() + (fit.quantile(level) * fit.errors[name] / fit.identifiability.given_sigma_errors[i]) ** 2
     return Profile(name, values, costs, level, _crossings(values, costs, limit), tuple(found[v][1] for v in values))
 
 

@@ -19,10 +19,10 @@ from ._statistics import trial_names
 from ._trial import Trial
 
 
-def applied_to(fit: Fit, trials: Sequence[Trial] | Trial) -> Fit:
+def validate(fit: Fit, trials: Sequence[Trial] | Trial) -> Fit:
     """The parameters of a fit on other trials, of which only starts and biases are found (held-out data).
 
-        jk.fit.applied_to(result, others).variance_accounted_for
+        jk.fit.validate(result, others).variance_accounted_for
 
     **Returns:** a `Fit` of these trials, with the status "applied": its `cost`, `variance_accounted_for`, `tests` and
     report are those of these trials; its parameters were not fitted to them, and have no errors here (NaN). Trials that
@@ -30,7 +30,7 @@ def applied_to(fit: Fit, trials: Sequence[Trial] | Trial) -> Fit:
 
     **Raises:** `ValueError` as `fit` does, for trials that do not suit the system, and where none can be simulated.
     """
-    refuse_other(fit, Fit, "applied_to", "applied_to(fit(...), trials)")
+    refuse_other(fit, Fit, "validate", "validate(fit(...), trials)")
     problem, failed = fit.problem.with_trials(trials), {}
     names = trial_names(problem)
     while True:

@@ -106,7 +106,7 @@ def bicycle_problem(
 def bicycle_rides(rides: Sequence[Trial] | Trial, bicycle: WhippleBicycle) -> tuple[Trial, ...]:
     """Rides with the rear wheel's rate in the place of their speed, as a fit takes them.
 
-    held_back = applied_to(fit, bicycle_rides(other_rides, bicycle))
+    held_back = validate(fit, bicycle_rides(other_rides, bicycle))
     """
     rides = as_trials(rides)
     return tuple(_with_wheel_rate(ride, bicycle) for ride in rides)
