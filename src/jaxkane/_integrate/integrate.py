@@ -14,8 +14,7 @@ from jaxtyping import Array
 
 from .._common.lookup import not_there
 from .._kane.arguments import checked_inputs
-from .._kane.checks import configuration_is_met
-from .._kane.constraints import correction, has_configuration_constraints, projected
+from .._kane.constraints import configuration_is_met, correction, has_configuration_constraints, projected
 from .._kane.kane import KaneEquations
 from .._kane.rhs import outputs_at, rates_are_native, values_of, vector_field
 from .._scalarjit.cache_key import captured, compiled, reads_any

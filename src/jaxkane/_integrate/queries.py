@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._kane.equations import InputValues, _arrays, _dependent_accelerations, finite_or_explained
+from .._kane.equations import InputValues, _dependent_accelerations, checked_arrays, finite_or_explained
 from .._kane.kane import KaneEquations, motion_rates
 from .._kane.reactions import forces_now, multipliers_now
 from .._kane.rhs import outputs_at, rates
@@ -35,7 +35,7 @@ def along(f: Callable[..., Any], system: System, t: Any, q: Any, u: Any, inputs:
     make the result NaN; `TypeError` for a trajectory beside `q`, `u` or `inputs`.
     """
     if not isinstance(t, Trajectory):
-        arrays = _arrays(system, t, q, u, inputs)
+        arrays = checked_arrays(system, t, q, u, inputs)
         return finite_or_explained(f(*arrays), arrays)
     if not (q is None and u is None and inputs is None):
         raise TypeError("A Trajectory holds coordinates, speeds and inputs already: give the system and it alone.")

@@ -9,7 +9,10 @@ import diffrax
 import numpy as np
 from jax.core import Tracer
 
-from .._kane.checks import check_state, check_system, diagnosis, is_concrete, with_possible_bodies
+from .._kane.arguments import is_concrete
+from .._kane.checks import check_system, with_possible_bodies
+from .._kane.constraints import check_state
+from .._kane.equations import diagnosis
 from .._kane.rhs import values_of
 from .._scalarjit.cache_key import captured
 from .._scalarjit.compat import nothing_is_traced

@@ -51,6 +51,11 @@ def _is_real(array: Any) -> bool:
     return jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
 
 
+def is_concrete(*trees: Any) -> bool:
+    """Whether all arrays in these are numbers rather than traced."""
+    return not any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))
+
+
 def is_one_number(value: Any) -> bool:
     """Whether this is one real number, known or traced."""
     return is_numeric(value) and not isinstance(value, (list, tuple)) and np.shape(value) == ()

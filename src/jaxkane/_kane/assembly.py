@@ -18,9 +18,9 @@ from .._scalarjit.compat import concretely
 from .._scalarjit.components import Component
 from .._scalarjit.nan import nan_where
 from .._system.system import State, System
-from .arguments import as_array, check_is_system, check_time
-from .checks import check_system, configuration_tolerance, implied_residual, is_concrete
-from .constraints import configuration_residual
+from .arguments import as_array, check_is_system, check_time, is_concrete
+from .checks import check_system
+from .constraints import configuration_residual, configuration_tolerance, implied_residual
 from .equations import dependent_speeds
 from .evaluate import at_random_point, structure_of
 

@@ -1,9 +1,12 @@
-"""Checks of a description and of a state, and why Kane's equations have no solution, in words. Changes nothing."""
+"""Checks of a description: masses and inertias that no body can have, and statements that contradict each other.
+
+Whether velocities, frames and constraints contradict each other is judged by numbers, at random test points.
+"""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import jax
@@ -11,34 +14,30 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
-from .._scalarjit.backends.numpy import in_numbers
-from .._scalarjit.cache_key import compiled
+from .._common.lru_cache import LRUCache
+from .._scalarjit.backends.numpy import derivative_in_numbers, in_numbers
 from .._scalarjit.compat import concretely
+from .._scalarjit.components import Component, is_exact
 from .._scalarjit.function import fused
-from .._scalarjit.linear import as_vector, rounding_of_pivots, stack
-from .._scalarjit.nan import nan_where
-from .._system.bodies import Force
-from .._system.motion import flatten_residuals
+from .._scalarjit.linear import as_vector, stack
+from .._system.bodies import Force, Load
+from .._system.kinematics import Frame, Point
+from .._system.motion import Motion
 from .._system.parameters import in_batches
 from .._system.system import State, System
-from .arguments import Row
-from .consistency import check_description
-from .constraints import configuration_residual, constraint_rows, dependent_speeds_from
-from .evaluate import DescriptionEvaluator
-from .kane import KaneEquations, rates_and_equations
+from .arguments import is_concrete
+from .constraints import configuration_residual
+from .evaluate import DescriptionEvaluator, at_random_point, frames_of, structure_of, turning_bodies
 
 ROUNDING, MEASURED = 2e-3, 0.05
-
-
-def is_concrete(*trees: Any) -> bool:
-    """Whether all arrays in these are numbers rather than traced."""
-    return not any(isinstance(x, Tracer) for x in jax.tree.leaves(trees))
+ROTATION_ERROR = 1e-3
+"""The largest error of [R] [R]^T of a frame: measured and integrated Euler parameters are not of unit norm exactly."""
 
 
 def check_system(system: System, t: Any, q: Any, *, bodies: bool = True) -> None:
     """Refuse a description that contradicts itself, once for each structure, and `bodies` that cannot be.
 
-    What is traced is replaced by its value where it has one (in `jax.grad` alone), else by trial numbers, as are
+    What is traced is replaced by its value where it has one (in `jax.grad` alone), else by random numbers, as are
     coordinates that are None; bodies are checked where all numbers are known.
 
     **Raises:** `ValueError` as `check_description`; for a negative mass, and an inertia that no body can have, as
@@ -60,15 +59,14 @@ def _value(x: Any) -> Any:
     return jax.lax.stop_gradient(x) if isinstance(x, Tracer) else x
 
 
+# -- bodies
+
+
 @fused
 def _masses_and_inertias(system: System, t: Any, q: Any):
-    bodies = DescriptionEvaluator(system).read("bodies", t, *_at_rest(system, q))
+    u = (0.0,) * (len(system.speeds) + len(system.dependent_speeds))
+    bodies = DescriptionEvaluator(system).read("bodies", t, tuple(q[i] for i in range(len(system.coordinates))), u)
     return [(jnp.asarray(mass), stack(inertia)) for mass, inertia in bodies]
-
-
-def _at_rest(system: System, q: Any) -> tuple[Row, Row]:
-    still = (0.0,) * (len(system.speeds) + len(system.dependent_speeds))
-    return tuple(q[i] for i in range(len(system.coordinates))), still
 
 
 def check_bodies(system: System, t: Any, q: Any) -> None:
@@ -82,7 +80,8 @@ def check_bodies(system: System, t: Any, q: Any) -> None:
         mass, I = float(mass), np.asarray(I, dtype=float)  # [kg], (3,3) [kg m^2]
         fault = _fault(mass, I) or (_excess_in_words(I) if system.check_inertia else "")
         if fault:
-            body = DescriptionEvaluator(system).motion(t, *_at_rest(system, q)).bodies[i]
+            u = (0.0,) * (len(system.speeds) + len(system.dependent_speeds))
+            body = DescriptionEvaluator(system).motion(t, tuple(q), u).bodies[i]
             message = f"{type(system).__name__}, body {body.name!r}: {fault}"
             if why_no_body(mass, I, system.check_inertia):
                 raise ValueError(message)
@@ -161,159 +160,344 @@ def _minors(A: Any) -> list[Any]:
     return [A[i, i] * A[j, j] - A[i, j] * A[j, i] for i, j in ((0, 1), (0, 2), (1, 2))]
 
 
+# -- a description that contradicts itself
+
+
+Quantities = dict[tuple[Any, ...], Any]  # (number, kind, names ...) -> numbers; the number keeps the order
+Quantity = tuple[tuple[str, ...], list[tuple[Component, ...]]]
+
+
 @fused
-def _implied_residual(system: System, t: Any, q: Any):
-    residuals = system.implied_constraints(t, tuple(q[i] for i in range(len(q))))
-    return as_vector(flatten_residuals(residuals, f"{type(system).__name__}: the residuals of implied_constraints"), q)
-
-
-def implied_residual(system: System, t: Any, q: Any) -> Any:
-    """Residuals (h,) that follow from the configuration constraints."""
-    if type(system).implied_constraints is System.implied_constraints:
-        return np.zeros(0, q.dtype)
-    return _residual_of(_implied_residual, system, t, q)
-
-
-def _residual_of(f: Callable[..., Any], system: System, t: Any, q: Any) -> Any:
-    """Of numbers by NumPy, so that nothing is compiled."""
-    return in_numbers(f, system, t, q) if is_concrete(system, t, q) else f(system, t, q)
-
-
-def configuration_is_met(system: System, t: Any, q: Any) -> Any:
-    """Whether the configuration constraints are met, and what follows from them."""
-    residuals = [_residual_of(configuration_residual, system, t, q), implied_residual(system, t, q)]
-    xp = np if is_concrete(residuals) else jnp
-    h = xp.concatenate(residuals)
-    return xp.all(xp.abs(h) <= configuration_tolerance(h.dtype)) if h.size else np.array(True)
-
-
-def check_state(system: System, t: Any, q: Any) -> None:
-    """Refuse coordinates that violate a configuration constraint, with the residual."""
-    if not is_concrete(system, t, q):
-        return
-    residual = in_numbers(configuration_residual, system, t, q)
-    if residual.size and not np.max(np.abs(residual)) <= configuration_tolerance(residual.dtype):
-        adjust = ", ".join(system.dependent_coordinates) or "the coordinates"
+def consistency_quantities(system: System, t: Any, q: Any, u: Any, inputs: Any) -> Quantities:
+    evaluator = DescriptionEvaluator(system, inputs)
+    q, u, like = tuple(q[i] for i in range(len(q))), tuple(u[i] for i in range(len(u))), q
+    motion = evaluator.motion(t, q, u)
+    loads = evaluator.loads_at(t, q, u, motion)
+    twice = sorted({*motion.points, *motion.frames} & {*system.auxiliary_speeds})
+    if twice:
         raise ValueError(
-            f"{type(system).__name__}: the coordinates violate the configuration constraints by "
-            f"{np.array2string(residual, precision=3)}. Find {adjust} with jaxkane.assemble(system, q, u)."
+            f"{evaluator.name}: {', '.join(twice)} is the name of an auxiliary speed and of a point or a frame: "
+            "constraint_forces gives both a force by that name."
         )
-    implied = implied_residual(system, t, q)
-    if implied.size and not np.max(np.abs(implied)) <= configuration_tolerance(implied.dtype):
-        raise ValueError(
-            f"{type(system).__name__}: what follows from the configuration constraints is violated by "
-            f"{np.array2string(implied, precision=3)}: with these parameters the loop cannot be closed."
-        )
+    quantities = [
+        *_of_speeds(evaluator, t, q, u),
+        *_of_bodies(motion),
+        *_of_points(motion, loads),
+        *_of_frames(motion, loads),
+    ]
+    return {(i, *key): stack(rows).astype(like.dtype) for i, (key, rows) in enumerate(quantities)}
 
 
-def met_or_refused(system: System, t: Any, q: Any, left_out: Sequence[str]) -> Any:
-    """Coordinates of which some were left out and taken as zero, unless that violates a configuration constraint.
+def _of_speeds(evaluator: DescriptionEvaluator, t: Any, q: Any, u: Any) -> Iterator[Quantity]:
+    for name, rate in zip(evaluator.system.coordinates, evaluator.rates(t, q, u), strict=True):
+        yield ("rate", name), [(rate,)]
+    for i, residual in enumerate(evaluator.residuals(t, q, u)):
+        yield ("residual", str(i)), [(residual,)]
+    for i, h in enumerate(evaluator.configuration(t, q)):
+        yield ("constraint", str(i)), [(h,)]
 
-    **Raises:** `ValueError` that names them; under a trace the coordinates become NaN.
+
+def _of_bodies(motion: Motion) -> Iterator[Quantity]:
+    for body in motion.bodies:
+        center = body.center
+        yield ("velocity", f"the velocity of {body.name!r}"), [center.velocity.components]
+        yield ("velocity", f"the angular velocity of {body.name!r}"), [body.angular_velocity.components]
+        if body.about is not None:
+            r = body.about.position_from(center)
+            carried = center.velocity + body.frame.angular_velocity.cross(r)
+            velocities = [x.components_in(body.frame) for x in (body.about.velocity, carried)]
+            yield ("about", body.name, body.frame.name), velocities
+        if center.has_position and not all(_has_consistent_velocity(point) for point in center.chain()):
+            rows = [x.components_in(motion.N) for x in (center.position, center.velocity)]
+            yield ("center", f"the mass centre of {body.name!r}"), rows
+
+
+def _of_points(motion: Motion, loads: Iterable[Load]) -> Iterator[Quantity]:
+    """Named points, what loads act on, and what these and the bodies were made from."""
+    done: set[Point] = set()
+    centers = {body.center: f"the mass centre of {body.name!r}" for body in motion.bodies}
+    named = {point: f"the point {name!r}" for name, point in motion.points.items()}
+    acted_on = {load.point: f"the point {load.point.name!r} of a load" for load in loads if isinstance(load, Force)}
+    words = {**acted_on, **named, **centers}
+    for point in words:
+        if point not in centers:
+            yield ("velocity", f"the velocity of {words[point]}"), [point.velocity.components]
+        for link in point.chain():
+            if link in done or link._relative_motion is None or (link._base is None and link in centers):
+                continue
+            done.add(link)
+            frame, velocity = link._relative_motion
+            rows = [link._offset.components_in(frame), velocity.components_in(frame)]  # type: ignore[union-attr]
+            if not all(is_exact(x) for x in rows[0]) or not all(is_exact(x) and x == 0.0 for x in rows[1]):
+                # A point that `loads` made from a motion without speeds is at rest too, and is no point of contact.
+                at_rest = link._base is None and frame is motion.N
+                yield ("contact" if at_rest else "place", words.get(link, f"the point {link.name!r}"), frame.name), rows
+
+
+def _of_frames(motion: Motion, loads: Iterable[Load]) -> Iterator[Quantity]:
+    for frame in frames_of(motion, loads):
+        rows = [*frame._to_child, frame._spin]
+        if not all(is_exact(x) for row in rows for x in row) or any(frame._spin):
+            yield ("frame", frame.name, frame.parent.name), rows  # type: ignore[union-attr]
+
+
+def _has_consistent_velocity(point: Point) -> bool:
+    """Whether a point moves as its place does, if what it was made from does and its relative motion is right."""
+    if point._base is not None:
+        return point._relative_motion is not None
+    known = (*point.velocity.components, *(point._offset.components if point._offset is not None else ()))
+    return all(is_exact(x) and x == 0.0 for x in known)  # the origin
+
+
+_CHECKED = LRUCache()  # structures
+_SIZES = (-1.0, 1e-2, -20.0, 1e3, -1e3)  # multiples of test speeds of order 1
+
+
+def check_description(system: System, t: Any, q: Any) -> None:
+    """Refuse a description that contradicts itself, once for each class and structure; by numbers, where they are all
+    known, at every call.
+
+    **Arguments:** the system, time [s] and coordinates (n_q,), any of whose numbers may be traced; coordinates may be
+    None, where none are known.
+
+    **Raises:** `ValueError` for velocities or residuals that are not affine in the speeds, frames and points that do
+    not move as their coordinates' rates say, frames that are not turned by a rotation, configuration constraints that
+    the motion violates, a body whose inertia is not constant in its frame, a name that stands for two forces.
+    `TypeError` for methods that return something else than they should, or ask for the value of what is traced.
     """
-    concrete = is_concrete(system, t, q)
-    residual = _residual_of(configuration_residual, system, t, q)
-    if not residual.size:
-        return q
-    met = configuration_is_met(system, t, q)
-    if not concrete:
-        return nan_where(~met, q, (system, t, q))
-    if met:
-        return q
-    raise ValueError(
-        f"{type(system).__name__}: with {', '.join(left_out)} left out of q, and taken as zero, the configuration "
-        f"constraints are violated by {np.array2string(residual, precision=3)}. Find the state with "
-        "jaxkane.assemble(system, q, u), and give its state.q; or name them."
+    if q is not None and not isinstance(q, Tracer) and not np.all(np.isfinite(q)):
+        return
+    structure = structure_of(system)
+    if structure not in _CHECKED:
+        rng = np.random.default_rng(0)
+        if _Consistency(*at_random_point((system, t, q), rng), rng=rng).check():
+            _CHECKED[structure] = None
+    if q is not None and is_concrete(system, t, q):
+        _check_numbers(system, t, q)
+
+
+@fused
+def _rotations_and_residuals(system: System, t: Any, q: Any, u: Any) -> tuple[Any, Any, Any]:
+    """Orientations of frames in their parents (f, 3, 3); of bodies that turn in their frames, how, and their inertia
+    (b, 4, 3); and the velocity residuals (k,)."""
+    evaluator, like = DescriptionEvaluator(system), q
+    q, u = tuple(q[i] for i in range(len(q))), tuple(u[i] for i in range(len(u)))
+    orientations, spins = evaluator.read("orientations", t, q, u)
+    as_arrays = lambda xs: [stack(x).astype(like.dtype) for x in xs]  # noqa: E731
+    return as_arrays(orientations), as_arrays(spins), as_vector(evaluator.residuals(t, q, u), like)
+
+
+def _check_numbers(system: System, t: Any, q: Any) -> None:
+    """Refuse what depends on the numbers: frames that no rotation turns, and bodies that turn in their frames about an
+    axis about which they are not symmetric."""
+    read = lambda u: in_numbers(_rotations_and_residuals, system, t, q, u.astype(q.dtype))  # noqa: E731
+    u = np.linspace(0.7, 1.3, len(system.speeds) + len(system.dependent_speeds))
+    orientations, spins, _ = read(u)
+    wrong = [i for i, R in enumerate(orientations) if _rotation_error(R) > ROTATION_ERROR]  # NaN is another check's
+    if not wrong and all(map(_is_symmetric, spins)):
+        return
+    name, motion = type(system).__name__, DescriptionEvaluator(system).motion(t, tuple(q), tuple(u))
+    if wrong:
+        raise ValueError(f"{name}: " + _no_rotation(frames_of(motion)[wrong[0]], orientations[wrong[0]]))
+    _, spins, _ = read(_on_residuals(lambda u: read(u)[2], u))
+    for body, x in zip(turning_bodies(motion), spins, strict=True):
+        if not _is_symmetric(x):
+            raise ValueError(
+                f"{name}: the body {body.name!r} turns in its frame {body.frame.name!r}, but its inertia is not "
+                "symmetric about that axis, so it is not constant there. Give the body a frame that turns with it."
+            )
+
+
+def _rotation_error(R: np.ndarray) -> float:
+    return float(np.max(np.abs(R @ R.T - np.eye(3))))
+
+
+def _no_rotation(frame: Frame, R: np.ndarray) -> str:
+    square = R @ R.T
+    stretches = np.max(np.abs(square - np.eye(3) * square[0, 0])) <= 1e-6 * square[0, 0]
+    cause = (
+        f"its Euler parameters have the norm {np.trace(square / 3) ** 0.25:.6g} instead of 1"
+        if stretches
+        else f"[R] [R]^T differs from 1 by {_rotation_error(R):.3g}"
+    )
+    return (
+        f"the frame {frame.name!r} is not turned from {frame.parent.name!r} by a rotation: {cause} at the "  # type: ignore[union-attr]
+        "coordinates (or parameters) given. Give Euler parameters of unit norm, as jaxkane.assemble does "
+        "where the constraint rotations.euler_parameter_norm is among the configuration constraints."
     )
 
 
-def configuration_tolerance(dtype: Any) -> float:
-    """How far coordinates may be from the configuration constraints and still be taken as given."""
-    return 1e-6 if dtype == jnp.float64 else 1e-3
+def _is_symmetric(x: np.ndarray) -> bool:
+    """Whether an inertia is constant in a frame in which its body turns; also where it is not finite."""
+    s, I = x[0], x[1:]
+    turned = np.cross(s, I.T).T  # [s x] I
+    return not np.max(np.abs(turned + turned.T)) > 1e-6 * np.max(np.abs(I)) * max(1.0, np.max(np.abs(s)))
 
 
-SINGULAR_ROUNDING = 1e-12
+def _on_residuals(residual: Callable[[np.ndarray], np.ndarray], u: np.ndarray) -> np.ndarray:
+    """The nearest speeds that meet the velocity residuals; NaN where there are none."""
+    c, c0 = residual(u), residual(0.0 * u)
+    if not c.size:
+        return u
+    C = np.array([residual(e) - c0 for e in np.eye(len(u))]).T  # (k,n)
+    if np.all(np.isfinite(C)) and np.all(np.isfinite(c)):
+        nearest = u - np.linalg.pinv(C, rcond=1e-9) @ c
+        if not np.max(np.abs(residual(nearest))) > 1e-7 * max(1.0, np.abs(C).max(), np.abs(c).max()):
+            return nearest
+    return np.full_like(u, np.nan)
 
-_equations = compiled(rates_and_equations)
 
+class _Consistency:
+    """The description of a system as functions of numbers, and what must hold between them."""
 
-def diagnosis(system: System, t: Any, q: Any, u: Any, inputs: Any = None) -> str:
-    """What is wrong at a state where accelerations or rates are not finite, and what can be done; "" if nothing is.
+    def __init__(self, system: System, t: Any, q: np.ndarray, rng: np.random.Generator):
+        self.system, self.t, self.q, self.rng = system, np.asarray(t, q.dtype), q, rng
+        self.name = type(system).__name__
+        self.speeds = (*system.speeds, *system.dependent_speeds)
+        self.inputs = {name: np.asarray(0.7, q.dtype) for name in (*system.inputs, *system.states)}
+        self.tolerance = float(jnp.finfo(q.dtype).eps) ** 0.5
 
-    Looks, in this order, at the numbers given, the dependent speeds, the mass matrix, the rates of the coordinates and
-    the loads.
-    """
-    name = type(system).__name__
-    place = _joined(f"{c} = {float(x):.4g}" for c, x in zip(system.coordinates, q, strict=True))
-    given = [("q", system.coordinates, q), ("u", system.speeds, u)]
-    for label, names, values in given:
-        wrong = [n for n, x in zip(names, np.asarray(values), strict=True) if not np.isfinite(x)]
-        if wrong:
-            return f"{name}: {label} is not finite: {_joined(wrong)}."
-    if system.dependent_speeds:
-        C, c0 = (np.asarray(x, dtype=float) for x in constraint_rows(system, t, q))
-        found = dependent_speeds_from(C, c0, (*system.speeds, *system.dependent_speeds), system.dependent_speeds, name)
-        if not found.condition < 1 / SINGULAR_ROUNDING:
-            n = len(system.speeds)
-            absent = [speed for speed, column in zip(system.dependent_speeds, C.T[n:], strict=True) if not column.any()]
-            cause = f"no velocity residual depends on {_joined(absent)}" if absent else "det C_dep = 0"
-            return (
-                f"{name}: the constraints cannot be solved for {_joined(system.dependent_speeds)} at {place} "
-                f"({cause}): {found.advice()}"
+    def check(self) -> bool:
+        """Refuse what contradicts itself. **Returns:** whether there were finite numbers to judge by."""
+        self._check_affine(self.q)
+        judged = self._check_motion(self.q)
+        beside = self.q + self.rng.uniform(-0.1, 0.1, self.q.shape)
+        self.t = self.t + np.asarray(0.3, self.t.dtype)  # what is prescribed in time is often at rest where it begins
+        return self._check_motion(beside.astype(self.q.dtype)) or judged
+
+    def _read(self, q: np.ndarray, u: np.ndarray) -> Quantities:
+        return in_numbers(consistency_quantities, self.system, self.t, q, u.astype(q.dtype), self.inputs)
+
+    def _rates(self, q: np.ndarray, u: np.ndarray, quantities: Quantities) -> Quantities:
+        """How all quantities change along the motion [1/s]."""
+        q_dot = np.concatenate([x.ravel() for x in _of_kind(quantities, "rate").values()])
+        at = self.system, self.t, q, u.astype(q.dtype), self.inputs
+        along = None, np.ones((1,), q.dtype), q_dot[:, None], None, None
+        return jax.tree.map(lambda x: x[..., 0], derivative_in_numbers(consistency_quantities, at, along))
+
+    def _random_speeds(self) -> np.ndarray:
+        n = len(self.speeds)
+        return self.rng.uniform(0.5, 1.5, n) * self.rng.choice((-1.0, 1.0), n)
+
+    def _differs(self, difference: Any, *sizes: Any) -> bool:
+        size = max([1.0, *(np.max(np.abs(x), initial=0.0) for x in sizes)])
+        difference = np.max(np.abs(difference), initial=0.0)
+        return bool(np.isfinite(difference) and difference > self.tolerance * size)
+
+    # Velocities are affine in the speeds.
+
+    def _check_affine(self, q: np.ndarray) -> None:
+        a, b = self._random_speeds(), self._random_speeds()
+        zero, at_a, at_b, at_both = (self._read(q, u) for u in (0.0 * a, a, b, a + b))
+        scaled = {s: self._read(q, s * a) for s in _SIZES}
+        for key, z in zero.items():
+            x, y, both = at_a[key], at_b[key], at_both[key]
+            bent = self._differs(both - x - y + z, both, x, y, z)
+            if bent or any(self._differs(f[key] - z - s * (x - z), f[key], s * x, z) for s, f in scaled.items()):
+                curved = [name for i, name in enumerate(self.speeds) if self._is_curved(q, key, z, i)]
+                which = f"in {', '.join(curved)}" if curved else "in the speeds: it holds products of two speeds"
+                raise ValueError(
+                    f"{self.name}: {_in_words(key)} is not affine {which}. Kane's method needs velocities that are "
+                    "linear in the speeds, plus a term that may depend on time and coordinates: no squares, no abs() "
+                    "or maximum() of a speed."
+                )
+
+    def _is_curved(self, q: np.ndarray, key: tuple[Any, ...], zero: Any, i: int) -> bool:
+        direction = np.eye(len(self.speeds))[i]
+        one = self._read(q, direction)[key]
+        values = {s: self._read(q, s * direction)[key] for s in _SIZES}
+        return any(self._differs(x - zero - s * (one - zero), x, s * one, zero) for s, x in values.items())
+
+    # Places and orientations move as the rates of the coordinates say.
+
+    def _check_motion(self, q: np.ndarray) -> bool:
+        q, start = self._on_constraints(q), self._random_speeds()
+        residual = lambda u: np.array([x.item() for x in _of_kind(self._read(q, u), "residual").values()])  # noqa: E731
+        u = _on_residuals(residual, start)
+        quantities = self._read(q, u)
+        judged = all(np.all(np.isfinite(x)) for x in quantities.values())
+        if not judged or any(_rotation_error(x[:3]) > self.tolerance for x in _of_kind(quantities, "frame").values()):
+            return False  # coordinates with a relation that no constraint states: nearby states cannot be checked
+        rates = self._rates(q, u, quantities)
+        for key, x in quantities.items():
+            self._check_quantity(key, x, rates[key])
+        constraints = _of_kind(rates, "constraint")
+        if constraints:
+            # Along speeds that do not meet the residuals: their size.
+            sizes = self._rates(q, start, self._read(q, start))
+            for key, rate in constraints.items():
+                self._check_constraint(key, rate, sizes[key])
+        return True
+
+    def _on_constraints(self, q: np.ndarray) -> np.ndarray:
+        """The nearest coordinates that meet the configuration constraints; NaN where there are none nearby."""
+        residual = lambda q: in_numbers(configuration_residual, self.system, self.t, q).astype(float)  # noqa: E731
+        h, step = residual(q), self.tolerance
+        for _ in range(20):
+            if not h.size or np.max(np.abs(h)) <= 0.1 * self.tolerance:
+                return q
+            displaced = [residual(q + step * e.astype(q.dtype)) for e in np.eye(len(q))]
+            G = (np.array(displaced) - h).T / step  # (h,n_q)
+            if not np.all(np.isfinite(G)):
+                break
+            q = q - (np.linalg.pinv(G, rcond=1e-6) @ h).astype(q.dtype)
+            h = residual(q)
+        return np.full_like(q, np.nan)
+
+    def _check_quantity(self, key: Any, value: Any, rate: Any) -> None:
+        _, kind, part, *parent = key
+        if kind == "frame":
+            turning = rate[:3] @ value[:3].T  # -[omega x], for [R] from the parent's components to the frame's
+            by_orientation = np.array([turning[1, 2], turning[2, 0], turning[0, 1]])
+            relative_to = f"components in {part!r}, relative to {parent[0]!r}"
+            self._compare(f"the frame {part!r} turns", "rad/s", by_orientation, value[3], relative_to)
+        elif kind == "center":
+            self._compare(f"{part} moves", "m/s", rate[0], value[1], "components in N")
+        elif kind == "place" or (kind == "contact" and self._differs(value[1], 0.0)):
+            # A contact that is at rest may be a point of the ground, another one at every instant.
+            relative_to = f"as seen in {parent[0]!r} from the point it was made from"
+            self._compare(f"{part} moves", "m/s", rate[0], value[1], relative_to)
+        elif kind == "about" and self._differs(value[0] - value[1], value[1]):
+            raise ValueError(
+                f"{self.name}: the inertia of the body {part!r} is given about a point that moves in its frame "
+                f"{parent[0]!r}, so that it is not constant there. Give it about a point of the body, or about the "
+                "mass centre."
             )
-    q_dot, M, f = (np.asarray(x) for x in _equations(system, t, q, u, inputs or {}))
-    if np.all(np.isfinite(M)):
-        massless = _massless(M.astype(float), system.speeds, rounding_of_pivots(M.dtype))
-        if massless:
-            return (
-                f"{name}: {massless}, so Kane's equations have no solution. Give the bodies that it moves mass and "
-                "moments of inertia about every axis they turn about (a line has none about itself); or leave the "
-                "speed out of the description."
+
+    def _compare(self, what: str, unit: str, by_position: Any, stated: Any, relative_to: str) -> None:
+        if self._differs(by_position - stated, stated):
+            show = lambda x: "(" + ", ".join(f"{a:.4g}" for a in x) + ")"  # noqa: E731
+            raise ValueError(
+                f"{self.name}: {what} with {show(by_position)} {unit} by the rates of its coordinates, but with "
+                f"{show(stated)} {unit} by its description ({relative_to}, at a random test point). A rate that is "
+                "given to a frame or a point contradicts q_dot; or a point is called fixed in a frame in which it "
+                "moves; or `loads` reads self.motion(t, q, ...) with other speeds than its own. A point of a wheel "
+                "that is in contact now is `center.fixed(r, wheel_frame)`."
             )
-    else:
-        return f"{name}: the mass matrix is not finite at {place}."
-    wrong = [c for c, x in zip(system.coordinates, q_dot, strict=True) if not np.isfinite(x)]
-    if wrong:
-        return (
-            f"{name}: the rates of {_joined(wrong)} are not finite at {place}: angles of a sequence lock there (gimbal "
-            "lock). Start elsewhere; or describe the orientation with Euler parameters, or with another sequence."
-        )
-    if not np.all(np.isfinite(f)):
-        return f"{name}: {_loads_not_finite(system, t, q, u, inputs or {})} at {place}."
-    return ""
+
+    def _check_constraint(self, key: Any, rate: Any, size: Any) -> None:
+        if self._differs(rate, size):
+            raise ValueError(
+                f"{self.name}: the configuration constraint {key[2]} (counted from 0) changes at a rate of "
+                f"{rate.item():.4g} 1/s while all velocity residuals are zero: they, or q_dot, contradict it. "
+                "Where there are as many residuals as dependent speeds, the constraint must follow from them; "
+                "leave out the residual that is its rate, and that is derived."
+            )
 
 
-def _loads_not_finite(system: System, t: Any, q: Any, u: Any, inputs: Any) -> str:
-    now = KaneEquations(system, t, q, u, inputs)
-    motion = now.motion(now.t, now.q, now.u_all)
-    reason = system.why_not_finite(motion, now.inputs)
-    if reason:
-        return reason
-    loads = now.loads(motion)
-    wrong = [x for x in loads if not all(np.isfinite(float(c)) for c in x.vector.components)]
-    places = [f"the force at {x.point.name!r}" if isinstance(x, Force) else "a torque" for x in wrong]
-    if not places:
-        return "the loads are not finite"
-    opposite = len(places) > 1 and all(isinstance(x, Force) for x in wrong)
-    hint = " (between two points in one place there is no direction)" if opposite else ""
-    return f"{_joined(places)} {'is' if len(places) == 1 else 'are'} not finite{hint}"
+def _of_kind(quantities: Quantities, kind: str) -> Quantities:
+    return {key: x for key, x in quantities.items() if key[1] == kind}
 
 
-def _massless(M: np.ndarray, speeds: tuple[str, ...], rounding: float) -> str:
-    """The null directions of a mass matrix, by the names of their speeds."""
-    # Units apart: a speed is compared with the largest entry of its own row.
-    rows = np.abs(M).max(axis=1)
-    alone = [speed for speed, size in zip(speeds, rows, strict=True) if size <= rounding * rows.max()]
-    if alone:
-        return f"no mass moves with the speed{'s' * (len(alone) > 1)} {_joined(alone)}"
-    scale = 1 / np.sqrt(np.maximum(np.diag(M), 1e-300))
-    values, vectors = np.linalg.eigh(M * scale[:, None] * scale)
-    if values[0] > rounding:
-        return ""
-    vector = np.abs(vectors[:, 0])
-    together = [speed for speed, x in zip(speeds, vector, strict=True) if x > 1e-6 * vector.max()]
-    return f"the mass matrix is singular: a combination of {_joined(together)} moves no mass"
-
-
-def _joined(words: Iterable[str]) -> str:
-    return ", ".join(words)
+def _in_words(key: tuple[Any, ...]) -> str:
+    words = {
+        "rate": "the rate of the coordinate {0!r}",
+        "residual": "the velocity residual {0}",
+        "constraint": "the configuration constraint {0}",
+        "frame": "the angular velocity of the frame {0!r}",
+        "place": "the velocity of {0}",
+        "contact": "the velocity of {0}",
+        "center": "the velocity of {0}",
+        "about": "the velocity of the point about which the inertia of {0!r} is given",
+    }
+    return words.get(key[1], "{0}").format(key[2])

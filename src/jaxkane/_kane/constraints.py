@@ -1,11 +1,11 @@
-"""Constraints that drift: how coordinates are brought back. And constraints that cannot be solved: which, and why.
+"""Configuration constraints and velocity residuals: whether coordinates meet them, and the nearest that do.
 
-Knows the constraints of a description; knows no mechanism and no integrator.
+And for which speeds the residuals can be solved. Knows no mechanism and no integrator.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -14,19 +14,94 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from .._scalarjit.backends.numpy import in_numbers
 from .._scalarjit.components import Component
 from .._scalarjit.function import fused
 from .._scalarjit.linear import as_vector, solve, stack
+from .._scalarjit.nan import nan_where
+from .._system.motion import flatten_residuals
 from .._system.system import System
-from .arguments import as_array, check_is_system, check_time, refuse_incomplete
+from .arguments import as_array, check_is_system, check_time, is_concrete, refuse_incomplete
 from .evaluate import DescriptionEvaluator
 from .kane import KaneEquations
+
+SINGULAR_ROUNDING = 1e-12
+"""The reciprocal of the largest condition number with which residuals are solved for dependent speeds."""
 
 
 @fused
 def configuration_residual(system: System, t: Any, q: Any):
     """Residuals (h,) of the configuration constraints."""
     return as_vector(DescriptionEvaluator(system).configuration(t, tuple(q[i] for i in range(len(q)))), q)
+
+
+@fused
+def _implied_residual(system: System, t: Any, q: Any):
+    residuals = system.implied_constraints(t, tuple(q[i] for i in range(len(q))))
+    return as_vector(flatten_residuals(residuals, f"{type(system).__name__}: the residuals of implied_constraints"), q)
+
+
+def implied_residual(system: System, t: Any, q: Any) -> Any:
+    """Residuals (h,) that follow from the configuration constraints."""
+    if type(system).implied_constraints is System.implied_constraints:
+        return np.zeros(0, q.dtype)
+    return _residual_of(_implied_residual, system, t, q)
+
+
+def _residual_of(f: Callable[..., Any], system: System, t: Any, q: Any) -> Any:
+    """Of numbers by NumPy, so that nothing is compiled."""
+    return in_numbers(f, system, t, q) if is_concrete(system, t, q) else f(system, t, q)
+
+
+def configuration_tolerance(dtype: Any) -> float:
+    """The largest residual of coordinates that meet the configuration constraints."""
+    return 1e-6 if dtype == jnp.float64 else 1e-3
+
+
+def configuration_is_met(system: System, t: Any, q: Any) -> Any:
+    """Whether the configuration constraints are met, and what follows from them."""
+    residuals = [_residual_of(configuration_residual, system, t, q), implied_residual(system, t, q)]
+    xp = np if is_concrete(residuals) else jnp
+    h = xp.concatenate(residuals)
+    return xp.all(xp.abs(h) <= configuration_tolerance(h.dtype)) if h.size else np.array(True)
+
+
+def check_state(system: System, t: Any, q: Any) -> None:
+    """Refuse coordinates that violate a configuration constraint, with the residual."""
+    if not is_concrete(system, t, q) or configuration_is_met(system, t, q):
+        return
+    name, residual = type(system).__name__, in_numbers(configuration_residual, system, t, q)
+    if not np.max(np.abs(residual), initial=0.0) <= configuration_tolerance(q.dtype):
+        adjust = ", ".join(system.dependent_coordinates) or "the coordinates"
+        raise ValueError(
+            f"{name}: the coordinates violate the configuration constraints by "
+            f"{np.array2string(residual, precision=3)}. Find {adjust} with jaxkane.assemble(system, q, u)."
+        )
+    raise ValueError(
+        f"{name}: what follows from the configuration constraints is violated by "
+        f"{np.array2string(implied_residual(system, t, q), precision=3)}: with these parameters the loop cannot be "
+        "closed."
+    )
+
+
+def check_left_out(system: System, t: Any, q: Any, left_out: Sequence[str]) -> Any:
+    """Coordinates of which some were left out, so that they are zero: refused where that violates a constraint.
+
+    **Raises:** `ValueError` that names them; under a trace the coordinates become NaN.
+    """
+    residual = _residual_of(configuration_residual, system, t, q)
+    if not residual.size:
+        return q
+    is_met = configuration_is_met(system, t, q)
+    if not is_concrete(system, t, q):
+        return nan_where(~is_met, q, (system, t, q))
+    if is_met:
+        return q
+    raise ValueError(
+        f"{type(system).__name__}: with {', '.join(left_out)} left out of q, and taken as zero, the configuration "
+        f"constraints are violated by {np.array2string(residual, precision=3)}. Find the state with "
+        "jaxkane.assemble(system, q, u), and give its state.q; or name them."
+    )
 
 
 def correction(system: System, t: Component, q: Array) -> Float[Array, " n_q"]:

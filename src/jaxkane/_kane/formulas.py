@@ -20,8 +20,8 @@ from .._scalarjit.jaxpr import cse, jacobian
 from .._scalarjit.linear import as_vector, is_written_out
 from .._system.parameters import ANY, ParameterInfo, declared, in_batches, leaf_name
 from .._system.system import System
-from .arguments import as_row, check_is_system
-from .checks import check_system, is_concrete
+from .arguments import as_row, check_is_system, is_concrete
+from .checks import check_system
 from .equations import (
     constraint_jacobian,
     constraint_jacobian_rate,

@@ -49,9 +49,9 @@ def _multipliers(system, t, q, u, inputs, u_dot):
 
 @fused
 def _forces(system, t, q, u, inputs, u_dot):
-    now = Reactions(system, t, q, u, inputs, u_dot)
-    vectors = {name: as_vector(row, q) for name, row in now.forces_of_parts()}
-    return vectors | {name: jnp.asarray(x, dtype=q.dtype) for name, x in now.forces_of_auxiliary_speeds()}
+    kane = Reactions(system, t, q, u, inputs, u_dot)
+    vectors = {name: as_vector(row, q) for name, row in kane.forces_of_parts()}
+    return vectors | {name: jnp.asarray(x, dtype=q.dtype) for name, x in kane.forces_of_auxiliary_speeds()}
 
 
 class _Forces(NamedTuple):

@@ -16,8 +16,7 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._common.lookup import not_there, refuse_unknown
-from .._kane.arguments import as_row
-from .._kane.checks import is_concrete
+from .._kane.arguments import as_row, is_concrete
 from .._kane.rhs import named_row
 from .._scalarjit.components import Component, add, component, total
 from .._system.kinematics import Frame, Point, Vector

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._common.lookup import as_names, refuse_unknown
-from .._kane.checks import is_concrete
+from .._kane.arguments import is_concrete
 from .._scalarjit.components import Component, Scalar, mul, sub
 from .._system.parameters import Learned, learned, parameter, to_float
 from ..catalog.bicycle import TILT

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._kane.checks import is_concrete, why_no_body
+from .._kane.arguments import is_concrete
+from .._kane.checks import why_no_body
 from .._scalarjit.components import Component, Scalar, add
 from .._system.bodies import Body, Torque
 from .._system.kinematics import Frame, Point

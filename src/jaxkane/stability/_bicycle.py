@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._kane.arguments import is_one_number
-from .._kane.checks import is_concrete
+from .._kane.arguments import is_concrete, is_one_number
 from .._kane.equations import equations_of_motion
 from .._scalarjit.components import Component
 from .._scalarjit.nan import nan_where

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Complex, Float, Int
 
 from .._common.lookup import not_there
-from .._kane.checks import is_concrete
+from .._kane.arguments import is_concrete
 from .._scalarjit.cache_key import compiled
 from .._scalarjit.nan import nan_where
 from .._system.system import System

@@ -15,8 +15,7 @@ from jaxtyping import Array, Complex, Float
 from scipy.optimize import linear_sum_assignment
 
 from .._common.lookup import as_names, not_there
-from .._kane.arguments import check_is_system, is_numeric
-from .._kane.checks import is_concrete
+from .._kane.arguments import check_is_system, is_concrete, is_numeric
 from .._scalarjit.cache_key import compiled
 from .._scalarjit.nan import nan_where
 from .._system.parameters import parameter_info

@@ -15,10 +15,10 @@ from jaxtyping import Array, Float
 
 from .._common.lookup import as_names, hint, refuse_unknown
 from .._integrate.trajectory import refuse_other_system
-from .._kane.arguments import as_array, check_is_system, checked_inputs, is_one_number, refuse_incomplete
-from .._kane.checks import SINGULAR_ROUNDING, check_system, diagnosis, is_concrete
-from .._kane.constraints import configuration_residual
-from .._kane.equations import dependent_speeds
+from .._kane.arguments import as_array, check_is_system, checked_inputs, is_concrete, is_one_number, refuse_incomplete
+from .._kane.checks import check_system
+from .._kane.constraints import SINGULAR_ROUNDING, configuration_residual
+from .._kane.equations import dependent_speeds, diagnosis
 from .._kane.rhs import has_outputs, output_names, outputs_at, rates, values_of
 from .._scalarjit.cache_key import compiled
 from .._scalarjit.components import Component

@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._common.lookup import as_names, by_name, hint, refuse_unknown
-from .._kane.arguments import as_array, check_is_system, check_time, checked_values, is_one_number
-from .._kane.checks import check_system, diagnosis, is_concrete
+from .._kane.arguments import as_array, check_is_system, check_time, checked_values, is_concrete, is_one_number
+from .._kane.checks import check_system
 from .._kane.constraints import configuration_residual
-from .._kane.equations import dependent_speeds
+from .._kane.equations import dependent_speeds, diagnosis
 from .._kane.rhs import rates, values_of
 from .._kane.rhs import rates as rates_of
 from .._scalarjit.cache_key import compiled, on_forget, version_of

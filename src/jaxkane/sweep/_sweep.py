@@ -16,7 +16,7 @@ from tqdm import tqdm
 from .._integrate.integrate import refuse_captured
 from .._integrate.settings import as_state, checked_times, in_its_mode, settings_for
 from .._integrate.trajectory import Status, Trajectory
-from .._kane.checks import is_concrete
+from .._kane.arguments import is_concrete
 from .._scalarjit.cache_key import captured
 from .._scalarjit.components import Inputs
 from .._system.system import State, System
