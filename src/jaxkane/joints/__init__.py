@@ -1,6 +1,5 @@
 """Mechanisms as trees of links and joints, given as data: `mechanism([Link(...), ...])` is an ordinary `System`."""
 
-from ._build import mechanism as mechanism
 from ._joints import Joint as Joint
 from ._joints import ball as ball
 from ._joints import fixed as fixed
@@ -14,4 +13,5 @@ from ._links import Coupling as Coupling
 from ._links import Link as Link
 from ._links import Loop as Loop
 from ._links import Site as Site
+from ._links import mechanism as mechanism
 from ._mechanism import Mechanism as Mechanism

@@ -1,4 +1,4 @@
-"""Joints: their shapes with coordinates, rates, motion and loads, and how users write them."""
+"""Types of joints, with their coordinates, rates, kinematics and loads, and joints as users write them."""
 
 from __future__ import annotations
 
@@ -63,17 +63,17 @@ def components(name: str, values: Any) -> dict[str, Any]:
     return {f"{name}.{end}": x for end, x in zip("xyz", values, strict=True) if not is_structural_zero(x)}
 
 
-class Placed(NamedTuple):
-    """A joint in a motion: the frame and the point before it and behind it."""
+class JointKinematics(NamedTuple):
+    """Frame and point of a joint on its parent, and on the child that it carries."""
 
-    frame: Frame
-    point: Point
-    moved: Frame
-    end: Point
+    parent_frame: Frame
+    parent_point: Point
+    child_frame: Frame
+    child_point: Point
 
 
 @dataclasses.dataclass(frozen=True)
-class Shape:
+class JointType:
     """One joint's static part. `axis` is a unit vector in the link's frame, where the joint has one."""
 
     name: str
@@ -86,7 +86,9 @@ class Shape:
     def names(self, endings: tuple[tuple[str, str], ...]) -> tuple[str, ...]:
         return tuple(self.name + ending for ending, _ in endings)
 
-    def move(self, F: Frame, P: Point, q: Sequence[Component], u: Sequence[Component], anchor: Triple) -> Placed:
+    def kinematics(
+        self, F: Frame, P: Point, q: Sequence[Component], u: Sequence[Component], anchor: Triple
+    ) -> JointKinematics:
         raise NotImplementedError
 
     def rates(self, q: Sequence[Component], u: Sequence[Component]) -> Sequence[Component]:
@@ -96,11 +98,11 @@ class Shape:
         """Residuals of the coordinates' own: of Euler parameters, their norm."""
         return ()
 
-    def stretch(self, q: Sequence[Component], rest: Sequence[Component]) -> tuple[Component, ...]:
+    def displacement(self, q: Sequence[Component], rest: Sequence[Component]) -> tuple[Component, ...]:
         """How far the joint is from where its spring rests, along each speed."""
         raise NotImplementedError
 
-    def loads(self, placed: Placed, forces: Sequence[Component]) -> tuple[Load, ...]:
+    def loads(self, at: JointKinematics, forces: Sequence[Component]) -> tuple[Load, ...]:
         """Forces along each speed [N or N m], with their reactions on what is before the joint."""
         raise NotImplementedError
 
@@ -124,50 +126,52 @@ class Shape:
         )
 
 
-class Hinge(Shape):
+class Hinge(JointType):
     coordinates = (("", "rad"),)
     speeds = (("_rate", "rad/s"),)
 
-    def move(self, F, P, q, u, anchor):
+    def kinematics(self, F, P, q, u, anchor):
         angle = sub(q[0], self.reference)
         G = F.rotate(F.vector(*self.axis), angle, u[0], f"{self.name} joint")
-        return Placed(F, P, G, _about(P, F, G, anchor))
+        return JointKinematics(F, P, G, _about(P, F, G, anchor))
 
-    def stretch(self, q, rest):
+    def displacement(self, q, rest):
         return (sub(q[0], rest[0]),)
 
-    def loads(self, placed, forces):
-        return (Torque(forces[0] * placed.moved.vector(*self.axis), placed.moved, placed.frame),)
+    def loads(self, at, forces):
+        return (Torque(forces[0] * at.child_frame.vector(*self.axis), at.child_frame, at.parent_frame),)
 
 
-class Slide(Shape):
+class Slide(JointType):
     coordinates = (("", "m"),)
     speeds = (("_rate", "m/s"),)
 
-    def move(self, F, P, q, u, anchor):
+    def kinematics(self, F, P, q, u, anchor):
         axis = F.vector(*self.axis)
-        return Placed(F, P, F, P.moving(sub(q[0], self.reference) * axis, u[0] * axis, F))
+        return JointKinematics(F, P, F, P.moving(sub(q[0], self.reference) * axis, u[0] * axis, F))
 
-    def stretch(self, q, rest):
+    def displacement(self, q, rest):
         return (sub(q[0], rest[0]),)
 
-    def loads(self, placed, forces):
-        push = forces[0] * placed.frame.vector(*self.axis)
-        rail = placed.point.fixed(placed.end.position_from(placed.point), placed.frame)  # at the slider, not with it
-        return Force(push, placed.end), Force(-push, rail)
+    def loads(self, at, forces):
+        push = forces[0] * at.parent_frame.vector(*self.axis)
+        rail = at.parent_point.fixed(
+            at.child_point.position_from(at.parent_point), at.parent_frame
+        )  # at the slider, not with it
+        return Force(push, at.child_point), Force(-push, rail)
 
 
 _EULER = (("_e1", ""), ("_e2", ""), ("_e3", ""), ("_e4", ""))
 _OMEGA = (("_w1", "rad/s"), ("_w2", "rad/s"), ("_w3", "rad/s"))
 
 
-class Ball(Shape):
+class Ball(JointType):
     coordinates = _EULER
     speeds = _OMEGA
 
-    def move(self, F, P, q, u, anchor):
+    def kinematics(self, F, P, q, u, anchor):
         G = F.rotate_euler(q, u, f"{self.name} joint")
-        return Placed(F, P, G, _about(P, F, G, anchor))
+        return JointKinematics(F, P, G, _about(P, F, G, anchor))
 
     def rates(self, q, u):
         return rotations.euler_parameter_rates(q, u)
@@ -175,20 +179,20 @@ class Ball(Shape):
     def norm(self, q):
         return (rotations.euler_parameter_norm(q),)
 
-    def stretch(self, q, rest):
+    def displacement(self, q, rest):
         return _rotation_vector(q)
 
-    def loads(self, placed, forces):
-        return (Torque(placed.moved.vector(*forces), placed.moved, placed.frame),)
+    def loads(self, at, forces):
+        return (Torque(at.child_frame.vector(*forces), at.child_frame, at.parent_frame),)
 
 
-class Free(Shape):
+class Free(JointType):
     coordinates = (("_x", "m"), ("_y", "m"), ("_z", "m"), *_EULER)
     speeds = (("_vx", "m/s"), ("_vy", "m/s"), ("_vz", "m/s"), *_OMEGA)
 
-    def move(self, F, P, q, u, anchor):
+    def kinematics(self, F, P, q, u, anchor):
         G = F.rotate_euler(q[3:], u[3:], f"{self.name} joint")
-        return Placed(F, P, G, P.moving(F.vector(*q[:3]), F.vector(*u[:3]), F))
+        return JointKinematics(F, P, G, P.moving(F.vector(*q[:3]), F.vector(*u[:3]), F))
 
     def rates(self, q, u):
         return (*u[:3], *rotations.euler_parameter_rates(q[3:], u[3:]))
@@ -196,13 +200,13 @@ class Free(Shape):
     def norm(self, q):
         return (rotations.euler_parameter_norm(q[3:]),)
 
-    def stretch(self, q, rest):
+    def displacement(self, q, rest):
         return (*(sub(x, r) for x, r in zip(q[:3], rest, strict=True)), *_rotation_vector(q[3:]))
 
-    def loads(self, placed, forces):
+    def loads(self, at, forces):
         return (
-            Force(placed.frame.vector(*forces[:3]), placed.end),
-            Torque(placed.moved.vector(*forces[3:]), placed.moved),
+            Force(at.parent_frame.vector(*forces[:3]), at.child_point),
+            Torque(at.child_frame.vector(*forces[3:]), at.child_frame),
         )
 
 
@@ -232,9 +236,9 @@ def _rotation_vector(e: Sequence[Component]) -> tuple[Component, ...]:
 
 
 class Joint(NamedTuple):
-    """What a link is joined by: shapes that follow each other, and numbers by the name of their parameter."""
+    """What joins a link to its parent: joint types that follow each other, and numbers by the names of parameters."""
 
-    shapes: tuple[Shape, ...]
+    types: tuple[JointType, ...]
     values: Mapping[str, Any]
 
 
@@ -336,7 +340,7 @@ def planar(name: str, axes: Any = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), **more: An
 
 def _chain(joints: Sequence[Joint]) -> Joint:
     return Joint(
-        tuple(shape for joint in joints for shape in joint.shapes),
+        tuple(each for joint in joints for each in joint.types),
         {name: value for joint in joints for name, value in joint.values.items()},
     )
 

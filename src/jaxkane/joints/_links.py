@@ -1,17 +1,32 @@
-"""Links, sites, actuators and what closes loops, as users write them, and exact numbers of a structure."""
+"""Links, sites, actuators and loops as users write them, and the mechanism that is made of them."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import jax
 import numpy as np
+from jax.core import Tracer
 
 from .. import rotations
+from .._common.lookup import not_there
 from ..rotations import Matrix
-from ._joints import Joint, exact, exact_numbers
+from ._joints import Hinge, Joint, JointType, Slide, components, exact, exact_numbers, is_structural_zero
+from ._loops import with_dependent
+from ._mechanism import (
+    MOMENTS,
+    ActuatorStructure,
+    CouplingStructure,
+    Field,
+    LinkStructure,
+    LoopStructure,
+    Mechanism,
+    SiteStructure,
+    Structure,
+    class_of,
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -103,7 +118,240 @@ class Coupling:
     coefficients: Sequence[float] = (0.0, 1.0)
 
 
-def matrix_of(orientation: Any, name: str) -> Matrix | None:
+def mechanism(
+    links: Sequence[Link],
+    *,
+    gravity: Any = (0.0, 0.0, -9.81),
+    actuators: Sequence[Actuator] = (),
+    sites: Sequence[Site] = (),
+    loops: Sequence[Loop | Coupling] = (),
+    dependent: Sequence[str] | None = None,
+    name: str = "Mechanism",
+    left_out: Sequence[str] = (),
+) -> Mechanism:
+    """A `System` of links in a tree, joined as they say.
+
+        upper = Link("upper", joints=hinge("q1", (0, 1, 0)), mass=2.0, center=(0, 0, -0.2), inertia=(0.02, 0.02, 0))
+        arm = mechanism([upper], actuators=[Actuator("motor", "q1")])
+
+    **Arguments:**
+
+    - `links`: in any order, a parent before or behind its children.
+    - `gravity` [m/s^2] in the inertial frame N; parameters `gravity.x` and so on.
+    - `actuators`, `sites`: inputs that drive joints; named points.
+    - `loops`: what closes loops, `Loop` and `Coupling`. They are configuration constraints and velocity residuals.
+    - `dependent`: the hinges and sliders that are solved for, as many as there are residuals; by default those are
+        found by which the residuals can best be solved, at trial coordinates.
+    - `name`: of its class, for messages.
+
+    **Returns:** a `Mechanism`, of one class for each structure. Its coordinates and speeds are those of its joints, in
+    the order of the tree.
+
+    **Raises:** `ValueError` for names that stand for two things or hold a dot, a parent that is not there, links in a
+    circle, and whatever has not the numbers that it should.
+    """
+    for what, given, kind in (
+        ("links", links, "Link"),
+        ("actuators", actuators, "Actuator"),
+        ("sites", sites, "Site"),
+        ("loops", loops, "Loop"),
+    ):
+        if isinstance(given, str) or not isinstance(given, Iterable):
+            raise TypeError(
+                f"mechanism: `{what}` is a list, such as [{kind}(...), ...], of one thing too; got a "
+                f"{type(given).__name__}."
+            )
+    if isinstance(dependent, str):
+        raise TypeError(f"mechanism: `dependent` is a list of names, such as [{dependent!r}]; got {dependent!r}.")
+    if not isinstance(name, str):
+        raise TypeError(f"mechanism: `name` is a text, got {name!r}.")
+    values: dict[str, Any] = components("gravity", gravity)
+    links = _in_order([_checked(link, Link) for link in links])
+    link_structures = tuple(_link(link, values) for link in links)
+    joints = {joint.name: joint for link in link_structures for joint in link.joints}
+    names = [link.name for link in links]
+    structure = Structure(
+        name,
+        link_structures,
+        tuple(_site(_checked(site, Site), names, values) for site in sites),
+        tuple(_actuator(_checked(actuator, Actuator), joints, values) for actuator in actuators),
+        left_out=tuple(left_out),
+    )
+    if not joints:
+        raise ValueError(f"{name}: no link has a joint, so that nothing moves: Link(..., joints=hinge(...)).")
+    if not any(link.has_mass for link in link_structures):
+        raise ValueError(f"{name}: no link that could be moved by a force has a mass: Link(..., mass=1.0).")
+    _check_names(structure)
+    closures = [_loop(loop, structure, joints) for loop in loops]
+    structure = structure._replace(
+        loops=tuple(x for x in closures if isinstance(x, LoopStructure)),
+        couplings=tuple(x for x in closures if isinstance(x, CouplingStructure)),
+    )
+    fields = tuple(_field(name, joints) for name in values)
+    return class_of(with_dependent(structure, fields, values, dependent), fields)(**values)
+
+
+def _checked(part: Any, kind: type) -> Any:
+    if not isinstance(part, kind):
+        raise TypeError(f"mechanism: this is no {kind.__name__}: {part!r}.")
+    return part
+
+
+def _in_order(links: list[Link]) -> list[Link]:
+    """Parents before their children, otherwise as they were given."""
+    names = [link.name for link in links]
+    for link in links:
+        _check_name(link.name, "link")
+        if names.count(link.name) > 1:
+            raise ValueError(f"Two links have the name {link.name!r}.")
+        if link.parent is not None:
+            _check_known(f"The parent of the link {link.name!r}", link.parent, names, "the links")
+    ordered: dict[str, Link] = {}
+    while len(ordered) < len(links):
+        waiting = [link for link in links if link.name not in ordered]
+        ready = next((link for link in waiting if link.parent is None or link.parent in ordered), None)
+        if ready is None:
+            raise ValueError(f"Links carry each other in a circle: {', '.join(link.name for link in waiting)}.")
+        ordered[ready.name] = ready
+    return list(ordered.values())
+
+
+def _check_name(name: Any, what: str) -> None:
+    if not isinstance(name, str) or not name or "." in name:
+        raise ValueError(
+            f"The name of a {what} is a text without a dot, which stands between the parts of a parameter's name as in "
+            f"mass.forearm; got {name!r}."
+        )
+
+
+def _check_known(label: str, name: Any, known: Iterable[str], where: str) -> None:
+    if name not in known:
+        raise ValueError(f"{label}: {not_there(name, known, where).args[0]}")
+
+
+def _link(link: Link, values: dict[str, Any]) -> LinkStructure:
+    if not isinstance(link.joints, (Joint, list, tuple)):
+        raise TypeError(f"The joints of the link {link.name!r} are a Joint or a list of them, got {link.joints!r}.")
+    types: list[JointType] = []
+    for joint in [link.joints] if isinstance(link.joints, Joint) else link.joints:
+        types += _checked(joint, Joint).types
+        values |= joint.values
+    values |= components(f"position.{link.name}", link.position)
+    if any(len(joint.speeds) == 6 for joint in types) and (link.parent is not None or len(types) > 1):
+        raise ValueError(
+            f"The link {link.name!r} is free of its parent: a free joint is the only one of a link on the ground "
+            "(parent=None). To fly relative to a moving link, chain three sliders and a ball joint."
+        )
+    if link.mass is not None:
+        values[f"mass.{link.name}"] = link.mass
+        values |= components(f"center.{link.name}", link.center)
+        values |= _moments(link)
+    return LinkStructure(
+        link.name, link.parent, _matrix(link.orientation, link.name), tuple(types), link.mass is not None
+    )
+
+
+def _moments(link: Link) -> dict[str, Any]:
+    rows = link.inertia
+    lengths = [np.shape(row) for row in rows] if hasattr(rows, "__len__") else []
+    if lengths not in ([()] * 3, [(3,)] * 3):
+        raise ValueError(f"The inertia of {link.name!r} is three moments or a (3, 3) matrix, got {rows!r}.")
+    if lengths[0] == ():
+        entries = dict(zip(MOMENTS, (*rows, 0.0, 0.0, 0.0), strict=True))
+    else:
+        entries = {ij: rows["xyz".index(ij[0])]["xyz".index(ij[1])] for ij in MOMENTS}
+        for i, j in ((0, 1), (0, 2), (1, 2)):
+            a, b = rows[i][j], rows[j][i]
+            if isinstance(a, Tracer) or isinstance(b, Tracer):
+                continue
+            if np.any(np.abs(np.subtract(a, b)) > 1e-9 * (np.abs(a) + np.abs(b))):  # more than rounding errors
+                raise ValueError(f"The inertia matrix of {link.name!r} is not symmetric: {a} and {b}.")
+    return {f"inertia.{link.name}.{ij}": x for ij, x in entries.items() if not is_structural_zero(x)}
+
+
+def _site(site: Site, links: list[str], values: dict[str, Any]) -> SiteStructure:
+    _check_name(site.name, "site")
+    if site.link is not None:
+        _check_known(f"The site {site.name!r}", site.link, links, "the links")
+    values |= components(f"site.{site.name}", site.position)
+    return SiteStructure(site.name, site.link, _matrix(site.orientation, site.name))
+
+
+def _actuator(actuator: Actuator, joints: Mapping[str, JointType], values: dict[str, Any]) -> ActuatorStructure:
+    _check_name(actuator.name, "actuator")
+    _check_known(f"The actuator {actuator.name!r}", actuator.joint, joints, "the joints")
+    joint = joints[actuator.joint]
+    gear = tuple(float(x) for x in np.atleast_1d(exact_numbers(actuator.gear, f"The gear of {actuator.name!r}")))
+    if len(gear) != len(joint.speeds):
+        raise ValueError(
+            f"The gear of the actuator {actuator.name!r} is {len(joint.speeds)} numbers, one for each speed of "
+            f"{joint.name!r}; got {actuator.gear!r}."
+        )
+    for kind in ("gain", "offset", "position_gain", "velocity_gain"):
+        value = getattr(actuator, kind)
+        if not is_structural_zero(value):
+            values[f"{kind}.{actuator.name}"] = value
+    if f"position_gain.{actuator.name}" in values and len(gear) > 1:
+        raise ValueError(
+            f"The actuator {actuator.name!r}: {joint.name!r} has no length that a position gain could act on."
+        )
+    return ActuatorStructure(actuator.name, joint.name, gear)
+
+
+def _loop(loop: Any, structure: Structure, joints: Mapping[str, JointType]) -> LoopStructure | CouplingStructure:
+    if isinstance(loop, Loop):
+        sites = [site.name for site in structure.sites]
+        for end in (loop.first, loop.second):
+            _check_known("What closes a loop", end, sites, "the sites")
+        if loop.first == loop.second:
+            raise ValueError(f"Loop({loop.first!r}, {loop.second!r}): a site is always where it is; name two.")
+        return LoopStructure(loop.first, loop.second, bool(loop.rigid), tuple(range(6 if loop.rigid else 3)))
+    _checked(loop, Coupling)
+    for end in [loop.first, *([] if loop.second is None else [loop.second])]:
+        if not isinstance(joints.get(end), (Hinge, Slide)):
+            raise ValueError(f"A coupling is of hinges and sliders; {end!r} is none.")
+    if loop.first == loop.second:
+        raise ValueError(f"Coupling({loop.first!r}, {loop.second!r}): a joint cannot follow itself; name two.")
+    what = f"The coefficients of the coupling of {loop.first!r}"
+    coefficients = tuple(float(a) for a in np.atleast_1d(exact_numbers(loop.coefficients, what)))
+    if not coefficients:
+        raise ValueError(f"{what} are one number at least, got none.")
+    return CouplingStructure(loop.first, loop.second, coefficients, True)
+
+
+def _check_names(structure: Structure) -> None:
+    """Names are those of the parts of one motion, of its coordinates, speeds and inputs, and of parameters."""
+    for joint in structure.joints:
+        _check_name(joint.name, "joint")
+    for what, names in (
+        ("joints", [joint.name for joint in structure.joints]),
+        ("sites or links", [*(link.name for link in structure.links), *(site.name for site in structure.sites)]),
+        ("actuators", [actuator.name for actuator in structure.actuators]),
+    ):
+        twice = sorted({name for name in names if names.count(name) > 1})
+        if twice:
+            raise ValueError(f"Two {what} have the name {twice[0]!r}.")
+
+
+_UNITS = {"mass": "kg", "inertia": "kg m^2", "gravity": "m/s^2"} | dict.fromkeys(
+    ("center", "position", "anchor", "site"), "m"
+)
+_OF_HINGES = {"damping": "N m s/rad", "stiffness": "N m/rad", "rest": "rad", "armature": "kg m^2"}
+_OF_SLIDERS = {"damping": "N s/m", "stiffness": "N/m", "rest": "m", "armature": "kg"}
+
+
+def _field(name: str, joints: Mapping[str, JointType]) -> Field:
+    kind, *_, last = name.split(".")
+    positive = kind in ("mass", "armature") or (kind == "inertia" and last in MOMENTS[:3])
+    if kind not in _OF_HINGES:
+        return name, positive, _UNITS.get(kind, "")
+    joint = joints[name.split(".")[1]]
+    if len(joint.speeds) == 6:  # newtons and newton metres in one
+        return name, positive, "m" if kind == "rest" else ""
+    return name, positive, (_OF_SLIDERS if isinstance(joint, Slide) else _OF_HINGES)[kind]
+
+
+def _matrix(orientation: Any, name: str) -> Matrix | None:
     """[R] (components in the parent -> components here) as exact floats; None for no rotation.
 
     **Raises:** `ValueError` for what is no rotation.
@@ -119,11 +367,16 @@ def matrix_of(orientation: Any, name: str) -> Matrix | None:
             R = np.array(rotations.euler_parameters_matrix([float(x) for x in e / np.linalg.norm(e)]))
         else:
             R = np.asarray(orientation, float).T  # columns are the axes
+        if R.shape != (3, 3) or not (np.abs(R @ R.T - np.eye(3)).max() < 1e-6 and np.linalg.det(R) > 0):
+            raise ValueError("no rotation matrix")
     except (TypeError, ValueError) as error:
-        raise ValueError(_no_rotation(orientation, name)) from error
-    if R.shape != (3, 3) or not (np.abs(R @ R.T - np.eye(3)).max() < 1e-6 and np.linalg.det(R) > 0):
-        raise ValueError(_no_rotation(orientation, name))
-    R = np.array([[exact(x) for x in row] for row in _nearest_rotation(R)])
+        raise ValueError(
+            f"{name!r}: the orientation is four Euler parameters (scalar last), a sequence with its angles as "
+            f'("3-1-2", (a, b, c)), or a (3, 3) rotation matrix; got {orientation!r}.'
+        ) from error
+    U, _, Vt = np.linalg.svd(R)
+    R = R if np.abs(U @ Vt - R).max() < 1e-15 else U @ Vt
+    R = np.array([[exact(x) for x in row] for row in R])
     return None if np.array_equal(R, np.eye(3)) else tuple(tuple(float(x) for x in row) for row in R)  # type: ignore
 
 
@@ -136,16 +389,3 @@ def _numpy_sequence(sequence: str, angles: Sequence[float]) -> np.ndarray:
         turn[i, j], turn[j, i] = np.sin(angle), -np.sin(angle)
         R = turn @ R
     return R
-
-
-def _nearest_rotation(R: np.ndarray) -> np.ndarray:
-    U, _, Vt = np.linalg.svd(R)
-    nearest = U @ Vt
-    return R if np.abs(nearest - R).max() < 1e-15 else nearest
-
-
-def _no_rotation(given: Any, name: str) -> str:
-    return (
-        f"{name!r}: the orientation is four Euler parameters (scalar last), a sequence with its angles as "
-        f'("3-1-2", (a, b, c)), or a (3, 3) rotation matrix; got {given!r}.'
-    )
