@@ -79,7 +79,7 @@ def main():
     print(
         "\nWhat to believe: the damping. The other fits lower the sum of squares by moving the fork's inertia and\n"
         "the trail to where no such bicycle is: they make up for what the model lacks.\n"
-        "What that is, examples/select_model_extensions.py finds out."
+        "What that is, notebooks/13_model_extensions.ipynb finds out."
     )
 
 

@@ -105,7 +105,7 @@ OPTIONS = {"input_bias": ("roll_torque", "steer_torque"), "zero_order_hold": ("s
 @pytest.mark.slow
 def test_steer_damping_of_a_measured_bicycle_by_descent(measured):
     """By least squares, with more parameters and with what the model lacks: `examples/identify_measured_bicycle.py` and
-    `examples/select_model_extensions.py`, which assert what they show."""
+    notebook 13, which assert what they show."""
     rides, bicycle = measured
     result = fit_bicycle(rides, bicycle, "steer_damping", optimizer=GradientDescent(), **OPTIONS)
     assert result.ok, result.message

@@ -1,7 +1,7 @@
 """What measured bicycles say: the damping of a robot bicycle, beside that of a linear model.
 
 Where its IMU sits, what only a ratio tells, and whose clocks do not agree on a ride with a rider is asserted by those
-who show it: notebooks 12 and 14, `examples/find_an_imu.py`.
+who show it: notebooks 12 and 14.
 """
 
 import numpy as np
