@@ -16,7 +16,7 @@ from .._common.lookup import refuse_unknown
 from .._kane.arguments import is_numeric
 from .._scalarjit.compat import ClosedJaxpr, Jaxpr, Literal, bound
 from .._scalarjit.components import Component, Inputs
-from .._system.system import naming_what_has_no_value
+from .._system.system import explain_value_of_traced
 
 
 def real_array(value: Any, label: str, dtype: Any = None) -> Array:
@@ -362,5 +362,5 @@ def _label_of(name: str | None) -> str:
 
 
 def _asked(label: str, f: Any, t: Component, state: Any) -> Any:
-    with naming_what_has_no_value(label):
+    with explain_value_of_traced(label):
         return f(t, state)

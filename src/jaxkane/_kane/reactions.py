@@ -157,6 +157,6 @@ class Reactions(KaneEquations):
 
     def is_cut(self, point: Point) -> bool:
         """Whether bodies are built from a point, which is not itself held by a residual."""
-        if any(point.velocity is residual for residual in self.description.vanishing):
+        if any(point.velocity is residual for residual in self.description.residuals):
             return False
         return any(point in body.center.chain() for body in self.description.bodies)

@@ -16,30 +16,26 @@ from .bodies import UNNAMED, Body, Force
 from .kinematics import Frame, Point, Vector
 
 
-def flatten_residuals(given: Any, what: str) -> tuple[Component, ...]:
+def flatten_residuals(residuals: Any, label: str) -> tuple[Component, ...]:
     """Residuals out of numbers, arrays, Vectors (three components each) and nested tuples and lists of these."""
-    if isinstance(given, Vector):
-        return given.components
-    if isinstance(given, (jax.Array, np.ndarray)) and given.ndim:
-        return tuple(component(x) for x in given.reshape(-1))
-    if isinstance(given, Iterable) and not isinstance(given, (str, Mapping, jax.Array, np.ndarray)):
-        return tuple(x for item in given for x in flatten_residuals(item, what))
+    if isinstance(residuals, Vector):
+        return residuals.components
+    if isinstance(residuals, (jax.Array, np.ndarray)) and residuals.ndim:
+        return tuple(component(x) for x in residuals.reshape(-1))
+    if isinstance(residuals, Iterable) and not isinstance(residuals, (str, Mapping, jax.Array, np.ndarray)):
+        return tuple(x for item in residuals for x in flatten_residuals(item, label))
     try:
-        return (component(given),)
+        return (component(residuals),)
     except TypeError:
-        hint = " Does the method end without a `return`?" if given is None else ""
-        raise TypeError(f"{what} are numbers and Vectors in a list, got {given!r}.{hint}") from None
+        hint = " Does the method end without a `return`?" if residuals is None else ""
+        raise TypeError(f"{label} are numbers and Vectors in a list, got {residuals!r}.{hint}") from None
 
 
-_moments = itertools.count()
+motion_number = itertools.count().__next__
+"""A number that is larger at every call: it distinguishes a motion from one that was made before."""
 
 
-def now() -> int:
-    """A number that is larger each time, which distinguishes a motion from one that was made before."""
-    return next(_moments)
-
-
-class NameTaken(ValueError):
+class DuplicateName(ValueError):
     """A body, a point or a frame with the name of another."""
 
 
@@ -56,7 +52,7 @@ class Motion:
     **Raises:** `ValueError` where one name stands for two of these; `TypeError` for what is no body, point or frame.
     """
 
-    __slots__ = ("N", "_named", "bodies", "constraints", "frames", "made", "points", "vanishing")
+    __slots__ = ("N", "_named", "bodies", "constraints", "frames", "number", "points", "residuals")
 
     def __init__(
         self,
@@ -66,22 +62,21 @@ class Motion:
         points: Mapping[str, Point] | None = None,
         frames: Mapping[str, Frame] | None = None,
     ):
-        for what, given, kind in (("bodies", bodies, Body), ("constraints", constraints, (float, int, Vector))):
-            if not isinstance(given, (kind, Iterable)) or isinstance(given, str):
-                raise TypeError(f"Motion(bodies, constraints): the {what} are a list, got {given!r}.")
-        for what, given in (("points", points), ("frames", frames)):
-            if not isinstance(given, (Mapping, type(None))):
-                raise TypeError(f"Motion: the {what} are a dict by name, as {{'P': P}}; got {given!r}.")
-        self.bodies: tuple[Body, ...] = (bodies,) if isinstance(bodies, Body) else tuple(bodies)
+        for label, value, kind in (("bodies", bodies, Body), ("constraints", constraints, (float, int, Vector))):
+            if not isinstance(value, (kind, Iterable)) or isinstance(value, str):
+                raise TypeError(f"Motion(bodies, constraints): the {label} are a list, got {value!r}.")
+        for label, value in (("points", points), ("frames", frames)):
+            if not isinstance(value, (Mapping, type(None))):
+                raise TypeError(f"Motion: the {label} are a dict by name, as {{'P': P}}; got {value!r}.")
+        self.bodies = _as_tuple(bodies, Body)
         if not self.bodies:
             raise ValueError("A Motion needs at least one Body.")
-        given = (constraints,) if isinstance(constraints, (Vector, float, int, jax.Array)) else tuple(constraints)
-        self.vanishing = given  # the residuals as they were given
-        self.constraints = flatten_residuals(given, "Motion(bodies, constraints): the velocity residuals")
+        self.residuals = _as_tuple(constraints, (Vector, float, int, jax.Array))  # Vectors among them
+        self.constraints = flatten_residuals(self.residuals, "Motion(bodies, constraints): the velocity residuals")
         self.points = dict(points or {})
         self.frames = dict(frames or {})
         self._named = self._by_name()
-        self.made = now()
+        self.number = motion_number()
         self.N: Frame = self.bodies[0].center.velocity.frame.root
         for name, part in (*self.points.items(), *self.frames.items()):
             part.name = name
@@ -103,41 +98,36 @@ class Motion:
 
         **Arguments:** as of `Motion`: what comes behind the bodies and residuals that there are, and under other names.
         """
-        more = copy.copy(self)  # with what a class that inherits from this one knows besides
-        bodies = (bodies,) if isinstance(bodies, Body) else tuple(bodies)
-        given = (constraints,) if isinstance(constraints, (Vector, float, int, jax.Array)) else tuple(constraints)
-        for kind, there, new in (("point", self.points, points), ("frame", self.frames, frames)):
-            twice = [name for name in new or {} if name in there]
+        for kind, old, new in (("point", self.points, points), ("frame", self.frames, frames)):
+            twice = [name for name in new or {} if name in old]
             if twice:
-                raise NameTaken(f"Motion.extended: there is a {kind} of the name {twice[0]!r} already.")
+                raise DuplicateName(f"Motion.extended: there is a {kind} of the name {twice[0]!r} already.")
+        extended = copy.copy(self)  # with the attributes that a subclass adds
         Motion.__init__(
-            more,
-            (*self.bodies, *bodies),
-            (*self.vanishing, *given),
+            extended,
+            (*self.bodies, *_as_tuple(bodies, Body)),
+            (*self.residuals, *_as_tuple(constraints, (Vector, float, int, jax.Array))),
             points={**self.points, **(points or {})},
             frames={**self.frames, **(frames or {})},
         )
-        return more
+        return extended
 
     def _by_name(self) -> dict[str, Body | Point | Frame]:
         named: dict[str, Any] = {}
-        kinds = (
-            (Body, [(getattr(body, "name", None), body) for body in self.bodies]),
-            (Point, self.points.items()),
-            (Frame, self.frames.items()),
-        )
-        for kind, parts in kinds:
-            for name, part in parts:
-                if not isinstance(part, kind):
-                    raise TypeError(f"Motion: this is no {kind.__name__}, but stands among these: {part!r}.")
-                if not isinstance(name, str):
-                    raise TypeError(f"Motion: the name of {part!r} must be a string, got {name!r}.")
-                if name in named and not (name == UNNAMED and kind is Body):
-                    raise NameTaken(
-                        f"Motion: two parts have the name {name!r}, {_kind_of(named[name])} and {_kind_of(part)}: "
-                        f"motion[{name!r}] could be either. Give them different names."
-                    )
-                named[name] = part
+        parts = [(Body, getattr(body, "name", None), body) for body in self.bodies]
+        parts += [(Point, *item) for item in self.points.items()] + [(Frame, *item) for item in self.frames.items()]
+        for kind, name, part in parts:
+            if not isinstance(part, kind):
+                raise TypeError(f"Motion: this is no {kind.__name__}, but stands among these: {part!r}.")
+            if not isinstance(name, str):
+                raise TypeError(f"Motion: the name of {part!r} must be a string, got {name!r}.")
+            if name in named and not (name == UNNAMED and kind is Body):
+                kinds = " and ".join(f"a {type(each).__name__.lower()}" for each in (named[name], part))
+                raise DuplicateName(
+                    f"Motion: two parts have the name {name!r}, {kinds}: motion[{name!r}] could be either. Give them "
+                    "different names."
+                )
+            named[name] = part
         return named
 
     def __getitem__(self, name: str) -> Any:
@@ -148,8 +138,8 @@ class Motion:
         return self._named[name]
 
 
-def _kind_of(part: Body | Point | Frame) -> str:
-    return f"a {type(part).__name__.lower()}"
+def _as_tuple(values: Any, one: Any) -> tuple[Any, ...]:
+    return (values,) if isinstance(values, one) else tuple(values)
 
 
 def weight(motion: Motion, gravity: Vector) -> tuple[Force, ...]:

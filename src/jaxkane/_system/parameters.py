@@ -33,7 +33,7 @@ def parameter(
 
     - `default`: a number, or an array or nested lists of numbers; without one the parameter must be given.
     - `positive`: refuse zero and negative values, and let a fit move it on a logarithmic scale.
-    - `within`: the least and the largest value that can be, both allowed: a tilt in degrees, a mass centre below the
+    - `within`: lower and upper bound, both allowed: a tilt in degrees, a mass centre below the
         ground are refused. In a batch such a member is `invalid`.
     - `shape`: of the array, by default that of `default`, or `()` for a number. A value with leading axes more is a
         batch.
@@ -92,12 +92,12 @@ class Learned(eqx.Module):
 
     @property
     def function(self) -> Any:
-        """What was given, with the arrays of now."""
+        """The callable, with its present arrays."""
         leaves, structure = self.rest
         return eqx.combine(self.arrays, jax.tree.unflatten(structure, leaves))
 
-    def __call__(self, *args: Any, **more: Any) -> Any:
-        return self.function(*args, **more)
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        return self.function(*args, **kwargs)
 
     def __reduce__(self):
         return Learned, (self.function,)  # the structure of a module does not survive pickling, the module does
@@ -105,8 +105,7 @@ class Learned(eqx.Module):
 
 @dataclasses.dataclass(frozen=True)
 class ParameterInfo:
-    """What `parameter` was given: whether the value must be positive, the shape of one value, its unit, and the least
-    and the largest value."""
+    """What `parameter` declares: whether the value must be positive, the shape of one value, its unit, its bounds."""
 
     positive: bool
     shape: tuple[int, ...]
@@ -115,16 +114,16 @@ class ParameterInfo:
 
     @property
     def is_limited(self) -> bool:
-        """Whether some finite number cannot be."""
+        """Whether some finite number is refused."""
         return self.positive or self.within != (-math.inf, math.inf)
 
     def allows(self, x: Any) -> Any:
-        """Which numbers of an array can be; what is not finite cannot."""
-        least, most = self.within
-        facts = [x > 0] if self.positive else []
-        facts += [x >= least] if least > -math.inf else []
-        facts += [x <= most] if most < math.inf else []
-        return functools.reduce(operator.and_, facts, abs(x) < math.inf)
+        """Which numbers of an array are allowed; what is not finite is not."""
+        lower, upper = self.within
+        conditions = [x > 0] if self.positive else []
+        conditions += [x >= lower] if lower > -math.inf else []
+        conditions += [x <= upper] if upper < math.inf else []
+        return functools.reduce(operator.and_, conditions, abs(x) < math.inf)
 
 
 ANY = ParameterInfo(False, ())
@@ -137,51 +136,80 @@ def parameter_info(system: eqx.Module | type[eqx.Module]) -> dict[str, Parameter
     return {f.name: f.metadata["jaxkane"] for f in fields if "jaxkane" in f.metadata}
 
 
-def parameters_in(part: Any, prefix: str = "") -> Iterator[tuple[str, Any, ParameterInfo]]:
-    """Name, value and what was declared of every parameter, those of parts that the system holds too: "mass",
-    "frame.mass", "links[2].mass". A parameter that is None is not there."""
-    for field in dataclasses.fields(part):
-        value, info = getattr(part, field.name), field.metadata.get("jaxkane")
-        if value is None:
-            continue
-        if info is not None:
-            yield prefix + field.name, value, info
-        elif isinstance(value, (list, tuple)):
-            for i, each in enumerate(value):
-                if isinstance(each, eqx.Module):
-                    yield from parameters_in(each, f"{prefix}{field.name}[{i}].")
-        elif isinstance(value, eqx.Module):
-            yield from parameters_in(value, f"{prefix}{field.name}.")
+def leaf_name(path: tuple[Any, ...]) -> str:
+    """A leaf's name as it is written in Python: "mass", "frame.mass", "links[2].mass"."""
+    return jax.tree_util.keystr(path).lstrip(".")
+
+
+def names_of_leaf(path: tuple[Any, ...]) -> tuple[str, ...]:
+    """The names by which a leaf is meant: its own, and those of the parts that hold it."""
+    return tuple(leaf_name(path[:n]) for n in range(1, len(path) + 1))
+
+
+def _steps(part: Any, path: tuple[Any, ...]) -> Iterator[tuple[Any, ParameterInfo]]:
+    """What stands at every step of the path to a leaf, and what was declared of the field that holds it."""
+    info = ANY
+    for key in path:
+        if isinstance(key, jax.tree_util.GetAttrKey):
+            field = getattr(part, "__dataclass_fields__", {}).get(key.name)
+            info = field.metadata.get("jaxkane", ANY) if field else ANY
+            part = getattr(part, key.name)
+        elif isinstance(key, (jax.tree_util.SequenceKey, jax.tree_util.DictKey)):
+            part = part[key.idx if isinstance(key, jax.tree_util.SequenceKey) else key.key]
+        else:
+            return
+        yield part, info
+
+
+def declared(system: Any, path: tuple[Any, ...]) -> ParameterInfo:
+    """What `parameter` was given of the field that holds this leaf."""
+    return [ANY, *(info for _, info in _steps(system, path))][-1]
+
+
+def learned_part(system: Any, path: tuple[Any, ...]) -> str:
+    """The name of the learned function that holds this leaf, or ""."""
+    lengths = [n for n, (part, _) in enumerate(_steps(system, path), 1) if isinstance(part, Learned)]
+    return leaf_name(path[: lengths[0]]) if lengths else ""
+
+
+def parameters_in(system: Any) -> list[tuple[str, Any, ParameterInfo]]:
+    """Name, value and what was declared of every parameter, those of parts that the system holds too. A parameter that
+    is None is not there."""
+    leaves = [(path, x, declared(system, path)) for path, x in jax.tree_util.tree_leaves_with_path(system)]
+    return [(leaf_name(path), x, info) for path, x, info in leaves if info is not ANY]
 
 
 def in_batches(system: Any) -> list[str]:
     """Parameters of a system, or of a part of one, that have leading axes more than they were declared with."""
-    return [name for name, value, info in parameters_in(system) if np.ndim(value) > len(info.shape)]
+    arrays = [(path, x) for path, x in jax.tree_util.tree_leaves_with_path(system) if np.ndim(x)]
+    declarations = [declared(system, path) for path, _ in arrays]
+    return [
+        leaf_name(path)
+        for (path, x), info in zip(arrays, declarations, strict=True)
+        if info is not ANY and np.ndim(x) > len(info.shape)
+    ]
 
 
 def with_parameters(system: Any, values: Mapping[str, Any]) -> Any:
     """The system with other values of some parameters, by the names of `parameters_in`; each part is made anew, and
     checked as any other."""
-    return _remade(system, values, "") if values else system
+    paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(system)] if values else []
+    return _replaced(system, {path: values[name] for path in paths if (name := leaf_name(path)) in values})
 
 
-def _remade(part: Any, values: Mapping[str, Any], prefix: str) -> Any:
-    others: dict[str, Any] = {}
-    for field in dataclasses.fields(part):
-        name, value = prefix + field.name, getattr(part, field.name)
-        other = value
-        if name in values:
-            other = values[name]
-        elif isinstance(value, eqx.Module) and not isinstance(value, Learned):
-            other = _remade(value, values, f"{name}.")
-        elif isinstance(value, (list, tuple)):
-            each = [
-                _remade(x, values, f"{name}[{i}].") if isinstance(x, eqx.Module) else x for i, x in enumerate(value)
-            ]
-            other = value if all(x is y for x, y in zip(each, value, strict=True)) else type(value)(each)
-        if other is not value:
-            others[field.name] = other
-    return dataclasses.replace(part, **others) if others else part
+def _replaced(part: Any, values: Mapping[tuple[Any, ...], Any]) -> Any:
+    if not values or () in values:
+        return values.get((), part)
+    inner: dict[Any, dict[tuple[Any, ...], Any]] = {}
+    for (key, *rest), value in values.items():
+        inner.setdefault(key, {})[tuple(rest)] = value
+    if isinstance(part, eqx.Module):
+        return dataclasses.replace(part, **{k.name: _replaced(getattr(part, k.name), v) for k, v in inner.items()})  # type: ignore[arg-type]
+    items: Any = dict(part) if isinstance(part, Mapping) else list(part)
+    for key, each in inner.items():
+        place = key.idx if isinstance(key, jax.tree_util.SequenceKey) else key.key
+        items[place] = _replaced(items[place], each)
+    return type(part)(items)
 
 
 def to_float(value: Any) -> Any:
@@ -240,13 +268,13 @@ def check_parameter(label: str, value: Any, info: ParameterInfo) -> None:
     if info.positive and not np.all(array > 0):
         raise ValueError(f"{label} = {array} must be positive.")
     if not np.all(info.allows(array)):
-        least, most = info.within
+        lower, upper = info.within
         hint = " With the other sign?" if np.all(info.allows(-array)) else ""
-        if np.abs(array).max() > 2.0 * max(abs(least), abs(most)):
+        if np.abs(array).max() > 2.0 * max(abs(lower), abs(upper)):
             hint = _LIKELY.get(info.unit, "")
         number = f"{array:.6g}" if array.ndim == 0 else f"{array}"
         unit = f" {info.unit}" if info.unit else ""
-        raise ValueError(f"{label} = {number}{unit} must lie between {least:g} and {most:g}{unit}.{hint}")
+        raise ValueError(f"{label} = {number}{unit} must lie between {lower:g} and {upper:g}{unit}.{hint}")
 
 
 _LIKELY = {
@@ -257,42 +285,3 @@ _LIKELY = {
     "s": " In milliseconds?",
 }
 """What a number that is too large for its unit probably is in."""
-
-
-def leaf_name(path: tuple[Any, ...]) -> str:
-    """A leaf's name as it is written in Python: "mass", "frame.mass", "links[2].mass"."""
-    return jax.tree_util.keystr(path).lstrip(".")
-
-
-def names_of_leaf(path: tuple[Any, ...]) -> tuple[str, ...]:
-    """The names by which a leaf is meant: its own, and those of the parts that hold it."""
-    return tuple(leaf_name(path[:n]) for n in range(1, len(path) + 1))
-
-
-def learned_part(system: Any, path: tuple[Any, ...]) -> str:
-    """The name of the learned function that holds this leaf, or ""."""
-    for i, key in enumerate(path):
-        if isinstance(key, jax.tree_util.GetAttrKey):
-            system = getattr(system, key.name)
-        elif isinstance(key, jax.tree_util.SequenceKey):
-            system = system[key.idx]
-        else:
-            system = system[key.key] if isinstance(key, jax.tree_util.DictKey) else None
-        if isinstance(system, Learned):
-            return leaf_name(path[: i + 1])
-    return ""
-
-
-def declared(system: Any, path: tuple[Any, ...]) -> ParameterInfo:
-    """What `parameter` was given of the field that holds this leaf."""
-    found = ANY
-    for key in path:
-        if isinstance(key, jax.tree_util.GetAttrKey):
-            field = {f.name: f for f in dataclasses.fields(system)}.get(key.name)
-            found = field.metadata.get("jaxkane", ANY) if field else ANY
-            system = getattr(system, key.name)
-        elif isinstance(key, jax.tree_util.SequenceKey):
-            system = system[key.idx]
-        elif isinstance(key, jax.tree_util.DictKey):
-            system = system[key.key]
-    return found

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from .._common.lookup import not_there, refuse_unknown
 from .._scalarjit.cache_key import kept_from_a_trace
 from .._scalarjit.components import Component
-from .motion import Motion, now
+from .motion import Motion, motion_number
 from .parameters import check_fields, check_parameter, parameter_info, to_float
 
 
@@ -118,27 +118,27 @@ def _prepared(system: str, name: str, value: Any) -> Any:
     if hasattr(value, "__get__") and not callable(value):  # a property is read of an instance
         return value
     if name in NAMES:
-        return checked_names(system, name, value)
+        return _checked_names(system, name, value)
     if name == "units":
-        return checked_units(system, value)
+        return _checked_units(system, value)
     return _named(value, name) if name in METHODS and callable(value) else value
 
 
-def checked_units(system: str, given: Any) -> Mapping[str, str]:
-    if not isinstance(given, Mapping):
-        raise TypeError(f'{system}.units is a dict of texts by name, as {{"angle": "rad"}}; got {given!r}.')
-    for name, unit in given.items():
+def _checked_units(system: str, units: Any) -> Mapping[str, str]:
+    if not isinstance(units, Mapping):
+        raise TypeError(f'{system}.units is a dict of texts by name, as {{"angle": "rad"}}; got {units!r}.')
+    for name, unit in units.items():
         if not (isinstance(name, str) and isinstance(unit, str)):
             raise TypeError(f'{system}.units has texts by name, as {{"angle": "rad"}}; got {name!r}: {unit!r}.')
-    return given
+    return units
 
 
-def checked_names(system: str, kind: str, given: Any) -> tuple[str, ...]:
-    if isinstance(given, str):
-        raise TypeError(f"{system}.{kind} is a tuple of names; {given!r} is a string. One name is ({given!r},).")
-    if not isinstance(given, (tuple, list)) or not all(isinstance(name, str) and name for name in given):
-        raise TypeError(f"{system}.{kind} is a tuple of names, such as ('angle',); got {given!r}.")
-    return tuple(given)
+def _checked_names(system: str, kind: str, names: Any) -> tuple[str, ...]:
+    if isinstance(names, str):
+        raise TypeError(f"{system}.{kind} is a tuple of names; {names!r} is a string. One name is ({names!r},).")
+    if not isinstance(names, (tuple, list)) or not all(isinstance(name, str) and name for name in names):
+        raise TypeError(f"{system}.{kind} is a tuple of names, such as ('angle',); got {names!r}.")
+    return tuple(names)
 
 
 class SystemMeta(type(eqx.Module)):
@@ -157,30 +157,28 @@ class SystemMeta(type(eqx.Module)):
         super().__setattr__(name, _prepared(cls.__name__, name, value))
 
 
-_ASKED_FOR_A_VALUE = (
+_VALUE_OF_TRACED = (
     jax.errors.TracerArrayConversionError,
     jax.errors.TracerIntegerConversionError,
     jax.errors.ConcretizationTypeError,
 )
-
-
-_COUNTS = (
+_STATIC_FIELD = (
     " A number that a description counts with, as that of its links, is a static field: "
     "`links: int = equinox.field(static=True)`."
 )
 
 
 @contextlib.contextmanager
-def naming_what_has_no_value(label: str, more: str = "") -> Iterator[None]:
+def explain_value_of_traced(label: str, hint: str = "") -> Iterator[None]:
     """Where a function of the user asks a traced number for its value, the error says which and what to write."""
     try:
         yield
-    except _ASKED_FOR_A_VALUE as error:
+    except _VALUE_OF_TRACED as error:
         raise TypeError(
             f"{label} asks for the value of a number that has none while it is traced: time, coordinates, speeds, "
             "parameters, and what follows from them. Write jnp.sin for np.sin and math.sin (jnp.polyval for "
             "np.polyval), jnp.where(a > b, x, y) for `if`, jnp.maximum and jnp.minimum for max and min, and neither "
-            f"float() nor .item().{more}"
+            f"float() nor .item().{hint}"
         ) from error
 
 
@@ -192,7 +190,7 @@ def _named(method: Callable[..., Any], name: str) -> Callable[..., Any]:
         return method
 
     @functools.wraps(method)
-    def call(self: System, t: Component, q: Any, *rest: Any, **more: Any) -> Any:
+    def call(self: System, t: Component, q: Any, *rest: Any, **kwargs: Any) -> Any:
         method = vars(call)["__wrapped__"]  # IPython's autoreload replaces this attribute, and no closure
         q = _values(q, self.coordinates, f"{type(self).__name__}: q")
         if rest:
@@ -200,12 +198,12 @@ def _named(method: Callable[..., Any], name: str) -> Callable[..., Any]:
             rest = (_values(rest[0], names, f"{type(self).__name__}: u", len(self.auxiliary_speeds)), *rest[1:])
         if name == "state_rates" and len(rest) > 1:
             rest = (rest[0], _values(rest[1], self.states, f"{type(self).__name__}: x"), *rest[2:])
-        began = now()
-        with naming_what_has_no_value(f"{type(self).__name__}.{name}", _COUNTS):
-            found = method(self, t, q, *rest, **more)
-        if isinstance(found, Motion) and found.made < began:
+        number = motion_number()
+        with explain_value_of_traced(f"{type(self).__name__}.{name}", _STATIC_FIELD):
+            result = method(self, t, q, *rest, **kwargs)
+        if isinstance(result, Motion) and result.number < number:
             raise kept_from_a_trace(type(self).__name__)
-        return found
+        return result
 
     vars(call)["reads_by_name"] = call
     return call
@@ -275,7 +273,7 @@ class System(eqx.Module, metaclass=SystemMeta):
     auxiliary_speeds: ClassVar[tuple[str, ...]] = ()
     """Names of speeds that are zero in the motion, for the forces that do no work."""
     dependent_coordinates: ClassVar[tuple[str, ...]] = ()
-    """Names of the coordinates that `assemble` finds from the configuration constraints; the others are held."""
+    """Names of the coordinates that `assemble` solves the configuration constraints for; the others are fixed."""
     inputs: ClassVar[tuple[str, ...]] = ()
     """Names of the inputs that `loads` reads."""
     states: ClassVar[tuple[str, ...]] = ()
@@ -327,8 +325,8 @@ class System(eqx.Module, metaclass=SystemMeta):
             def state_rates(self, t, q, u, x, motion, now):
                 return ((now["command"] - x["motor_torque"]) / self.lag,)
 
-        `now` is a `Now`: inputs and states by name, and accelerations, for the filter of an accelerometer. Of a class
-        without states there are none: `super().state_rates(...)` gives an empty dict.
+        `now` is a `MeasurementContext`: inputs and states by name, and accelerations, for the filter of an
+        accelerometer. Of a class without states there are none: `super().state_rates(...)` gives an empty dict.
         """
         if inspect.unwrap(type(self).state_rates) is not System.state_rates or not self.states:
             return {}
@@ -338,13 +336,13 @@ class System(eqx.Module, metaclass=SystemMeta):
         )
 
     def outputs(self, t: Component, q: Any, u: Any, motion: Motion, now: Any) -> Mapping[str, Any]:
-        """What the sensors say, by name: numbers, or dicts of such, whose names are joined by a dot.
+        """What the sensors measure, by name: numbers, or dicts of such, whose names are joined by a dot.
 
             def outputs(self, t, q, u, motion, now):
                 box = motion.frames["box"]
                 return {"gyro": jk.sensors.gyroscope(box), "strain": self.stiffness * q["bend"]}
 
-        `now` is a `Now`: inputs and states by name, accelerations, and the forces of constraints.
+        `now` is a `MeasurementContext`: inputs and states by name, accelerations, and the forces of constraints.
         """
         return {}
 
@@ -371,14 +369,11 @@ def names_of(system: System) -> tuple[tuple[str, ...], ...]:
     return tuple(map(tuple, (system.coordinates, system.speeds, system.dependent_speeds, system.states)))
 
 
-_FOUND_BY_NAME = tuple(kind for kind in NAMES if kind != "dependent_coordinates")  # these are coordinates
-
-
 def _check_names(system: System) -> None:
     """Refuse names that stand for two things."""
     name = type(system).__name__
-    names = {kind: checked_names(name, kind, getattr(system, kind)) for kind in NAMES}
-    units = checked_units(name, system.units)
+    names = {kind: _checked_names(name, kind, getattr(system, kind)) for kind in NAMES}
+    units = _checked_units(name, system.units)
     has_outputs = type(system).outputs is not System.outputs  # whose names are known when they are read
     if "units" in vars(type(system)) and not has_outputs:  # inherited units may name what this class lacks
         refuse_unknown(
@@ -387,19 +382,18 @@ def _check_names(system: System) -> None:
             f"{name}.units names what is no coordinate, speed, input or state:",
         )
     owners: dict[str, str] = {}
-    for kind in _FOUND_BY_NAME:
-        for each in names[kind]:
+    for kind in NAMES:
+        for each in names[kind] if kind != "dependent_coordinates" else ():  # these are coordinates
             if each in owners:
                 places = f"twice in `{kind}`" if owners[each] == kind else f"in `{owners[each]}` and in `{kind}`"
                 raise ValueError(f"{name}: the name {each!r} stands {places}: q, u and trajectories are read by name.")
             owners[each] = kind
     dependent = names["dependent_coordinates"]
-    strange = [each for i, each in enumerate(dependent) if each not in names["coordinates"] or each in dependent[:i]]
-    if strange:
-        have = ", ".join(names["coordinates"]) or "none"
+    wrong = [each for i, each in enumerate(dependent) if each not in names["coordinates"] or each in dependent[:i]]
+    if wrong:
         raise ValueError(
-            f"{name}.dependent_coordinates names coordinates, each once: {', '.join(strange)} is none, or stands there "
-            f"twice. The coordinates are: {have}."
+            f"{name}.dependent_coordinates names coordinates, each once: {', '.join(wrong)} is none, or stands there "
+            f"twice. The coordinates are: {', '.join(names['coordinates']) or 'none'}."
         )
 
 

@@ -20,7 +20,7 @@ from .._kane.arguments import as_row, is_concrete
 from .._kane.rhs import named_row
 from .._scalarjit.components import Component, add, component, total
 from .._system.kinematics import Frame, Point, Vector
-from .._system.motion import Motion, NameTaken
+from .._system.motion import DuplicateName, Motion
 from .._system.parameters import parameters_in, with_parameters
 from ..catalog.bicycle import WhippleBicycle
 from ._files import as_meijaard, read_yaml
@@ -396,7 +396,7 @@ def _refuse_equal_names(bicycle: Bicycle) -> None:
 def _motion_with(bicycle: Bicycle, part: Part, motion: BicycleMotion, t: Component, q: Any, u: Any) -> BicycleMotion:
     try:
         extended = part.motion(bicycle, motion, t, q, u)
-    except NameTaken as error:
+    except DuplicateName as error:
         places = zip(bicycle.parts, _places(bicycle), strict=True)
         place = next((place for each, place in places if each is part), called(part))
         raise ValueError(f"{type(bicycle).__name__}: {place}: {error} {_SECOND_OF_A_KIND}") from None
