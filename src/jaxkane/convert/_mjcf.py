@@ -4,17 +4,109 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
-from ..joints import Coupling, Loop, Mechanism
-from ._mujoco_model import Reader
+from ..joints import Actuator, Coupling, Joint, Link, Loop, Mechanism, Site, ball, free, hinge, mechanism, slide
+
+Path = str | os.PathLike[str]
 
 
-def robot_of(text: str) -> ElementTree.Element:
+def from_mjcf(
+    model: Path, *, strict: bool = False, dependent: Sequence[str] | None = None, name: str | None = None
+) -> Mechanism:
+    """The mechanism of an MJCF file.
+
+        arm = jk.convert.from_mjcf("arm.xml")
+        jk.fit.fit(arm, trials, free=["mass.forearm", "damping.elbow"])
+
+    **Arguments:**
+
+    - `model`: a path, or the text of a file, which begins with "<".
+    - `strict`: refuse what has no counterpart, instead of leaving it out with a warning.
+    - `dependent`: hinges and sliders that are solved for where loops are closed, as of `jaxkane.joints.mechanism`.
+    - `name`: of the class; by default the model's.
+
+    **Returns:** a `jaxkane.joints.Mechanism` with the names of the file. `qpos` are its coordinates but for the order
+    of the Euler parameters, scalar last here; `qvel` its speeds; `ctrl` its inputs. A dot in a name becomes an
+    underscore; an actuator or a site that has the name of something else gets `_input` or `_site` behind its own.
+    Masses and inertias are those that MuJoCo compiles, of geoms and meshes too.
+
+    Taken: bodies, hinge, slide, ball and free joints with damping, stiffness, springref, armature and ref; gravity;
+    sites; actuators on joints whose force is affine in control, length and velocity; `connect`, `weld` and `joint`
+    equalities, as rigid constraints. What is not is listed in `left_out`: contacts, limits, friction, tendons, ...
+
+    **Raises:** `ImportError` without MuJoCo; `ValueError` for a file that MuJoCo does not read, one without a moving
+    body, two names that differ by a dot alone, and with `strict` for what would be left out.
+    """
+    mujoco = _mujoco()
+    return _ModelReader(mujoco, _compiled(mujoco, model), name).mechanism(strict, dependent)
+
+
+def from_urdf(
+    model: Path,
+    *,
+    floating: bool = False,
+    strict: bool = False,
+    gravity: Any = (0.0, 0.0, -9.81),
+    dependent: Sequence[str] | None = None,
+    name: str | None = None,
+) -> Mechanism:
+    """The mechanism of a URDF file; links and joints have its names.
+
+    `floating`: the root link flies, by a free joint named `root`; by default it is part of the ground. A link without
+    an `inertial` has no mass, whatever its shapes. `mimic` becomes a coupling, joint damping is taken; the rest, the
+    other arguments and the errors are those of `from_mjcf`.
+    """
+    mujoco = _mujoco()
+    text = _text(model)
+    couplings = _mimics(text)
+    compiled = _compiled(mujoco, _for_mujoco(text, floating))
+    reader = _ModelReader(mujoco, compiled, name or _robot_of(text).get("name"))
+    reader.gravity = gravity
+    reader.left_out += ["friction of joints"] * _has_friction(text)
+    reader.loops += couplings
+    return reader.mechanism(strict, dependent)
+
+
+def _mujoco() -> Any:
+    try:
+        import mujoco  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise ImportError(
+            "Reading MJCF and URDF files needs MuJoCo: `pip install mujoco`, or `pip install 'jaxkane[mujoco]'`."
+        ) from error
+    return mujoco
+
+
+def _is_text(model: Path) -> bool:
+    return isinstance(model, str) and model.lstrip().startswith("<")
+
+
+def _text(model: Path) -> str:
+    if _is_text(model):
+        return str(model)
+    with open(model, encoding="utf-8") as file:
+        return file.read()
+
+
+def _compiled(mujoco: Any, model: Path) -> Any:
+    if not _is_text(model) and not os.path.exists(model):
+        raise FileNotFoundError(f"There is no file {os.fspath(model)!r}. The text of a model begins with '<'.")
+    try:
+        spec = mujoco.MjSpec.from_string(model) if _is_text(model) else mujoco.MjSpec.from_file(os.fspath(model))
+        spec.compiler.fusestatic = False
+        return spec.compile()
+    except ValueError as error:
+        where = "the text" if _is_text(model) else repr(os.fspath(model))
+        raise ValueError(f"MuJoCo does not read {where}: {error}") from error
+
+
+def _robot_of(text: str) -> ElementTree.Element:
     try:
         robot = ElementTree.fromstring(re.sub(r"<(/?)\w+:", r"<\1", text))  # extensions with an undeclared prefix
     except ElementTree.ParseError as error:
@@ -24,9 +116,9 @@ def robot_of(text: str) -> ElementTree.Element:
     return robot
 
 
-def for_mujoco(text: str, floating: bool) -> str:
+def _for_mujoco(text: str, floating: bool) -> str:
     """Shapes go, since URDF's masses do not come from them; the root link gets a joint on the ground."""
-    robot = robot_of(text)
+    robot = _robot_of(text)
     links = [link.get("name", "") for link in robot.findall("link")]
     children = [child.get("link") for child in robot.findall("joint/child")]
     roots = [name for name in links if name not in children]
@@ -72,13 +164,13 @@ def _turn_back(inertial: ElementTree.Element) -> None:
     origin.set("rpy", "0 0 0")
 
 
-def has_friction(text: str) -> bool:
-    return any(float(dynamics.get("friction", 0.0)) for dynamics in robot_of(text).findall("joint/dynamics"))
+def _has_friction(text: str) -> bool:
+    return any(float(dynamics.get("friction", 0.0)) for dynamics in _robot_of(text).findall("joint/dynamics"))
 
 
-def mimics(text: str) -> list[Loop | Coupling]:
+def _mimics(text: str) -> list[Loop | Coupling]:
     found: list[Loop | Coupling] = []
-    for joint in robot_of(text).findall("joint"):
+    for joint in _robot_of(text).findall("joint"):
         mimic = joint.find("mimic")
         if mimic is not None:
             numbers = float(mimic.get("offset", 0.0)), float(mimic.get("multiplier", 1.0))
@@ -87,94 +179,274 @@ def mimics(text: str) -> list[Loop | Coupling]:
     return found
 
 
-Path = str | os.PathLike[str]
+class _ModelReader:
+    """What a compiled model says, as parts of a mechanism."""
+
+    def __init__(self, mujoco: Any, model: Any, name: str | None):
+        self.m, self.kinds = model, mujoco
+        self.name = name or _model_name(model) or "Mechanism"
+        self.left_out: list[str] = []
+        self.gravity: Any = [float(x) for x in model.opt.gravity]
+        if self._is_off("GRAVITY"):
+            self.gravity = (0.0, 0.0, 0.0)
+        self.bodies = self._names("body", model.nbody)
+        self.joints = self._names("joint", model.njnt)
+        self.sites: list[Site] = []
+        self.loops: list[Loop | Coupling] = []
+
+    def _is_off(self, *flags: str) -> bool:
+        """Whether the model disables one of these; not every version has each."""
+        bits = [int(getattr(self.kinds.mjtDisableBit, f"mjDSBL_{flag}", 0)) for flag in flags]
+        return any(int(self.m.opt.disableflags) & bit for bit in bits)
+
+    def _names(self, kind: str, n: int) -> list[str]:
+        """The file's names; what has none is numbered, past these.
+
+        **Raises:** `ValueError` for two names that become one, since either could then stand for the other's part.
+        """
+        given = [getattr(self.m, kind)(i).name for i in range(n)]
+        names = [name.replace(".", "_") for name in given]
+        for i, name in enumerate(names):
+            if name and name in names[:i]:
+                raise ValueError(
+                    f"{self.name}: the {_PLURALS.get(kind, kind + 's')} {given[names.index(name)]!r} and {given[i]!r} "
+                    f"would both be {name!r}, since a dot becomes an underscore: rename one in the file."
+                )
+        for i, name in enumerate(names):
+            if not name:
+                names[i] = _other(f"{kind}{i}", names, "_")
+        return names
+
+    def mechanism(self, strict: bool, dependent: Sequence[str] | None) -> Mechanism:
+        m = self.m
+        if not m.nv:
+            raise ValueError(f"{self.name}: the file has no joint, so that nothing moves.")
+        links = [self._link(i) for i in range(1, m.nbody)]
+        taken = {*self.bodies, *(f"{j} joint" for j in self.joints)}
+        for i, name in enumerate(_others(self._names("site", m.nsite), taken, "_site")):
+            self.sites.append(
+                Site(name, self._carrier(m.site_bodyid[i]), _floats(m.site_pos[i]), _euler(m.site_quat[i]))
+            )
+        self._read_equalities({*taken, *(site.name for site in self.sites)})
+        actuators = list(self._actuators())
+        self.left_out += self._not_taken()
+        left_out = tuple(dict.fromkeys(self.left_out))
+        if left_out:
+            listed = "; ".join(left_out)
+            if strict:
+                raise ValueError(
+                    f"{self.name}: these have no counterpart: {listed}. With strict=False they are left out."
+                )
+            warnings.warn(f"{self.name}: left out, having no counterpart: {listed}.", UserWarning, stacklevel=3)
+        return mechanism(
+            links,
+            gravity=self.gravity,
+            actuators=actuators,
+            sites=self.sites,
+            loops=self.loops,
+            dependent=dependent,
+            name=self.name,
+            left_out=left_out,
+        )
+
+    def _carrier(self, body: int) -> str | None:
+        return None if body == 0 else self.bodies[body]
+
+    def _link(self, i: int) -> Link:
+        m = self.m
+        first, count = int(m.body_jntadr[i]), int(m.body_jntnum[i])
+        joints = [self._joint(j) for j in range(first, first + count)]
+        is_free = count and m.jnt_type[first] == int(self.kinds.mjtJoint.mjJNT_FREE)  # placed by its coordinates alone
+        moves = m.body_weldid[i] != 0
+        mass = float(m.body_mass[i])
+        has_mass = moves and (mass > 0.0 or bool(np.any(m.body_inertia[i] > 0.0)))
+        return Link(
+            self.bodies[i],
+            self._carrier(m.body_parentid[i]),
+            joints,
+            position=(0.0, 0.0, 0.0) if is_free else _floats(m.body_pos[i]),
+            orientation=None if is_free else _euler(m.body_quat[i]),
+            mass=mass if has_mass else None,
+            center=_floats(m.body_ipos[i]),
+            inertia=_inertia(m.body_inertia[i], m.body_iquat[i]),
+        )
+
+    def _joint(self, j: int) -> Joint:
+        m, kind, name = self.m, self.m.jnt_type[j], self.joints[j]
+        dof, place = int(m.jnt_dofadr[j]), int(m.jnt_qposadr[j])
+        common = {
+            "damping": 0.0 if self._is_off("DAMPER", "PASSIVE") else float(m.dof_damping[dof]),
+            "armature": float(m.dof_armature[dof]),
+            "stiffness": 0.0 if self._is_off("SPRING", "PASSIVE") else float(m.jnt_stiffness[j]),
+        }
+        types = self.kinds.mjtJoint
+        if kind in (int(types.mjJNT_HINGE), int(types.mjJNT_SLIDE)):
+            common |= {"reference": float(m.qpos0[place])}
+            common |= {"rest": float(m.qpos_spring[place])} if common["stiffness"] else {}
+            if kind == int(types.mjJNT_SLIDE):
+                return slide(name, _floats(m.jnt_axis[j]), **common)
+            return hinge(name, _floats(m.jnt_axis[j]), anchor=_floats(m.jnt_pos[j]), **common)
+        start = place + (3 if kind == int(types.mjJNT_FREE) else 0)
+        if common["stiffness"] and not np.allclose(m.qpos_spring[start : start + 4], (1, 0, 0, 0), atol=1e-12):
+            self.left_out.append(f"the stiffness of the joint {name!r}, which rests turned")
+            common["stiffness"] = 0.0
+        if kind == int(types.mjJNT_BALL):
+            return ball(name, anchor=_floats(m.jnt_pos[j]), **common)
+        rest = _floats(m.qpos_spring[place : place + 3]) if common["stiffness"] else (0.0, 0.0, 0.0)
+        return free(name, rest=rest, **common)
+
+    def _actuators(self) -> Iterator[Actuator]:
+        m, kinds = self.m, self.kinds
+        taken = {*self.joints}
+        for j, name in enumerate(self.joints):
+            if m.jnt_type[j] in (int(kinds.mjtJoint.mjJNT_HINGE), int(kinds.mjtJoint.mjJNT_SLIDE)):
+                taken.add(f"{name}_rate")
+        names = self._names("actuator", int(m.nu))
+        for i, name in enumerate([] if self._is_off("ACTUATION") else _others(names, taken, "_input")):
+            group = int(m.actuator_group[i])
+            if 0 <= group <= 30 and int(m.opt.disableactuator) >> group & 1:
+                continue
+            why = self._why_not(i)
+            if why:
+                self.left_out.append(f"the actuator {names[i]!r}, {why}")
+                continue
+            j = int(m.actuator_trnid[i, 0])
+            size = 3 if m.jnt_type[j] == int(kinds.mjtJoint.mjJNT_BALL) else 1
+            bias = m.actuator_biasprm[i] * (m.actuator_biastype[i] == int(kinds.mjtBias.mjBIAS_AFFINE))
+            if m.actuator_ctrllimited[i] or m.actuator_forcelimited[i]:
+                self.left_out.append("limits of controls and forces")
+            yield Actuator(
+                name,
+                self.joints[j],
+                _floats(m.actuator_gear[i, :size]),
+                gain=float(m.actuator_gainprm[i, 0]),
+                offset=float(bias[0]),
+                position_gain=-float(bias[1]),
+                velocity_gain=-float(bias[2]),
+            )
+
+    def _why_not(self, i: int) -> str:
+        """Why an actuator has no counterpart."""
+        m, kinds = self.m, self.kinds
+        joint = int(m.actuator_trnid[i, 0])
+        if m.actuator_trntype[i] not in (int(kinds.mjtTrn.mjTRN_JOINT), int(kinds.mjtTrn.mjTRN_JOINTINPARENT)):
+            return "which does not act on a joint"
+        of_ball = m.jnt_type[joint] == int(kinds.mjtJoint.mjJNT_BALL)
+        if m.jnt_type[joint] == int(kinds.mjtJoint.mjJNT_FREE):
+            return "which acts on a free joint"
+        if of_ball and m.actuator_trntype[i] == int(kinds.mjtTrn.mjTRN_JOINTINPARENT):
+            return "which acts on a ball joint along its parent's axes"
+        if m.actuator_dyntype[i] != int(kinds.mjtDyn.mjDYN_NONE) or m.actuator_actnum[i]:
+            return "which has a state of its own"
+        if m.actuator_gaintype[i] != int(kinds.mjtGain.mjGAIN_FIXED):
+            return "whose gain is not constant"
+        if m.actuator_biastype[i] not in (int(kinds.mjtBias.mjBIAS_NONE), int(kinds.mjtBias.mjBIAS_AFFINE)):
+            return "whose bias is not affine"
+        affine = m.actuator_biastype[i] == int(kinds.mjtBias.mjBIAS_AFFINE)
+        if of_ball and affine and m.actuator_biasprm[i, 1]:
+            return "which feeds back the rotation of a ball joint"
+        more = [getattr(m, f"actuator_{what}", None) for what in ("damping", "dampingpoly", "armature", "delay")]
+        if any(x is not None and np.any(x[i]) for x in more):
+            return "which has damping, armature or delay of its own"
+        return ""
+
+    def _read_equalities(self, taken: set[str]) -> None:
+        m, kinds = self.m, self.kinds.mjtEq
+        for i in range(0 if self._is_off("EQUALITY", "CONSTRAINT") else m.neq):
+            kind, data = m.eq_type[i], m.eq_data[i]
+            name = m.eq(i).name.replace(".", "_") or f"equality{i}"  # of sites that are made for it
+            if not m.eq_active0[i]:
+                continue
+            first, second = int(m.eq_obj1id[i]), int(m.eq_obj2id[i])
+            if kind == int(kinds.mjEQ_JOINT):
+                self.loops.append(self._coupling(first, second, data))
+                continue
+            if kind not in (int(kinds.mjEQ_CONNECT), int(kinds.mjEQ_WELD)):
+                self.left_out.append(f"the equality {name!r}, which is no connect, weld or joint")
+                continue
+            rigid = kind == int(kinds.mjEQ_WELD)
+            if m.eq_objtype[i] == int(self.kinds.mjtObj.mjOBJ_SITE):
+                self.loops.append(Loop(self.sites[first].name, self.sites[second].name, rigid))
+                continue
+            # connect: anchors in both bodies; weld: the anchor in the second, the pose of it seen from the first
+            ends = (data[3:6], data[0:3]) if rigid else (data[0:3], data[3:6])
+            turned = (_euler(data[6:10]), None) if rigid else (None, None)
+            names = []
+            for k, (body, place, orientation) in enumerate(zip((first, second), ends, turned, strict=True)):
+                end = _other(f"{name}_{k + 1}", taken, "_end")
+                taken.add(end)
+                names.append(end)
+                self.sites.append(Site(end, self._carrier(body), _floats(place), orientation))
+            self.loops.append(Loop(names[0], names[1], rigid))
+
+    def _coupling(self, first: int, second: int, data: np.ndarray) -> Coupling:
+        m = self.m
+        zero = lambda j: float(m.qpos0[m.jnt_qposadr[j]])  # noqa: E731
+        if second < 0:
+            return Coupling(self.joints[first], None, (zero(first) + float(data[0]),))
+        # q1 - zero1 = p(q2 - zero2)
+        polynomial = np.polynomial.Polynomial(data[:5])(np.polynomial.Polynomial([-zero(second), 1.0]))
+        coefficients = polynomial.coef + np.eye(1, len(polynomial.coef))[0] * zero(first)
+        return Coupling(self.joints[first], self.joints[second], _floats(coefficients))
+
+    def _not_taken(self) -> Iterator[str]:
+        """What else is in the model and changes its motion."""
+        m = self.m
+        collides = np.any(m.geom_contype != 0) and np.any(m.geom_conaffinity != 0)
+        off = lambda flag: self._is_off(flag, "CONSTRAINT")  # noqa: E731
+        has = lambda name: bool(np.any(getattr(m, name, 0)))  # noqa: E731 (older versions lack some)
+        found = {
+            "contacts": (collides or m.npair > 0) and not off("CONTACT"),
+            "limits of joints": has("jnt_limited") and not off("LIMIT"),
+            "friction of joints": has("dof_frictionloss") and not off("FRICTIONLOSS"),
+            "limits of controls and forces": has("jnt_actfrclimited") and m.nu > 0,
+            "tendons": m.ntendon > 0,
+            "damping or stiffness that is not linear": any(has(n) for n in ("dof_dampingpoly", "jnt_stiffnesspoly")),
+            "springs that yield": getattr(m, "nplastic", 0) > 0,
+            "drag and lift of a medium": m.opt.density > 0 or m.opt.viscosity > 0,
+            "gravity compensation": has("body_gravcomp"),
+            "flexible bodies": m.nflex > 0,
+            "plugins": m.nplugin > 0,
+            "bodies moved by hand (mocap), which rest": m.nmocap > 0,
+        }
+        return (what for what, there in found.items() if there)
 
 
-def from_mjcf(
-    model: Path, *, strict: bool = False, dependent: Sequence[str] | None = None, name: str | None = None
-) -> Mechanism:
-    """The mechanism of an MJCF file.
-
-        arm = jk.convert.from_mjcf("arm.xml")
-        jk.fit.fit(arm, trials, free=["mass.forearm", "damping.elbow"])
-
-    **Arguments:**
-
-    - `model`: a path, or the text of a file, which begins with "<".
-    - `strict`: refuse what has no counterpart, instead of leaving it out with a warning.
-    - `dependent`: hinges and sliders that are solved for where loops are closed, as of `jaxkane.joints.mechanism`.
-    - `name`: of the class; by default the model's.
-
-    **Returns:** a `jaxkane.joints.Mechanism` with the names of the file. `qpos` are its coordinates but for the order
-    of the Euler parameters, scalar last here; `qvel` its speeds; `ctrl` its inputs. A dot in a name becomes an
-    underscore; an actuator or a site that has the name of something else gets `_input` or `_site` behind its own.
-    Masses and inertias are those that MuJoCo compiles, of geoms and meshes too.
-
-    Taken: bodies, hinge, slide, ball and free joints with damping, stiffness, springref, armature and ref; gravity;
-    sites; actuators on joints whose force is affine in control, length and velocity; `connect`, `weld` and `joint`
-    equalities, as rigid constraints. What is not is listed in `left_out`: contacts, limits, friction, tendons, ...
-
-    **Raises:** `ImportError` without MuJoCo; `ValueError` for a file that MuJoCo does not read, one without a moving
-    body, two names that differ by a dot alone, and with `strict` for what would be left out.
-    """
-    mujoco = _mujoco()
-    return Reader(mujoco, _compiled(mujoco, model), name).mechanism(strict, dependent)
+def _model_name(model: Any) -> str:
+    name = bytes(model.names[:200]).split(b"\0", 1)[0].decode("utf-8", "replace")
+    return "" if name == "MuJoCo Model" else name  # which is that of a file without one
 
 
-def from_urdf(
-    model: Path,
-    *,
-    floating: bool = False,
-    strict: bool = False,
-    gravity: Any = (0.0, 0.0, -9.81),
-    dependent: Sequence[str] | None = None,
-    name: str | None = None,
-) -> Mechanism:
-    """The mechanism of a URDF file; links and joints have its names.
-
-    `floating`: the root link flies, by a free joint named `root`; by default it is part of the ground. A link without
-    an `inertial` has no mass, whatever its shapes. `mimic` becomes a coupling, joint damping is taken; the rest, the
-    other arguments and the errors are those of `from_mjcf`.
-    """
-    mujoco = _mujoco()
-    text = _text(model)
-    couplings = mimics(text)
-    compiled = _compiled(mujoco, for_mujoco(text, floating))
-    reader = Reader(mujoco, compiled, name or robot_of(text).get("name"))
-    reader.gravity = gravity
-    reader.left_out += ["friction of joints"] * has_friction(text)
-    reader.loops += couplings
-    return reader.mechanism(strict, dependent)
+def _other(name: str, taken: Any, ending: str) -> str:
+    while name in taken:
+        name += ending
+    return name
 
 
-def _mujoco() -> Any:
-    try:
-        import mujoco  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ImportError(
-            "Reading MJCF and URDF files needs MuJoCo: `pip install mujoco`, or `pip install 'jaxkane[mujoco]'`."
-        ) from error
-    return mujoco
+def _others(names: Sequence[str], taken: Any, ending: str) -> list[str]:
+    """The names, those of something else with an ending that makes them names of nothing."""
+    return [_other(name + ending, {*taken, *names}, ending) if name in taken else name for name in names]
 
 
-def _is_text(model: Path) -> bool:
-    return isinstance(model, str) and model.lstrip().startswith("<")
+_PLURALS = {"body": "bodies"}
 
 
-def _text(model: Path) -> str:
-    if _is_text(model):
-        return str(model)
-    with open(model, encoding="utf-8") as file:
-        return file.read()
+def _floats(values: Any) -> tuple[float, ...]:
+    return tuple(float(x) for x in values)
 
 
-def _compiled(mujoco: Any, model: Path) -> Any:
-    if not _is_text(model) and not os.path.exists(model):
-        raise FileNotFoundError(f"There is no file {os.fspath(model)!r}. The text of a model begins with '<'.")
-    try:
-        spec = mujoco.MjSpec.from_string(model) if _is_text(model) else mujoco.MjSpec.from_file(os.fspath(model))
-        spec.compiler.fusestatic = False
-        return spec.compile()
-    except ValueError as error:
-        where = "the text" if _is_text(model) else repr(os.fspath(model))
-        raise ValueError(f"MuJoCo does not read {where}: {error}") from error
+def _euler(quaternion: Any) -> tuple[float, ...]:
+    """Scalar last, as everywhere here; MuJoCo has it first."""
+    w, x, y, z = _floats(quaternion)
+    return (x, y, z, w)
+
+
+def _inertia(moments: Any, quaternion: Any) -> list[list[float]]:
+    """Principal moments in turned axes, along the body's; what is zero but for rounding is zero."""
+    w, v = float(quaternion[0]), np.asarray(quaternion[1:], float)
+    cross = np.array([[0, -v[2], v[1]], [v[2], 0, -v[0]], [-v[1], v[0], 0]])
+    R = np.eye(3) + 2.0 * w * cross + 2.0 * cross @ cross
+    I = R @ np.diag(np.asarray(moments, float)) @ R.T
+    I = 0.5 * (I + I.T)
+    I[np.abs(I) < 1e-15 * np.trace(I)] = 0.0
+    return I.tolist()

@@ -1,132 +1,29 @@
-"""What a model of SymPy says, and its expressions as functions of components."""
+"""What a KanesMethod, a System or a LagrangesMethod of SymPy holds, as one set of model data. Makes no system.
+
+Of a Lagrangian without bodies these are Lagrange's equations in momentum form, with L = 1/2 u.M u + b.u + L0 for the
+rates u of the coordinates:
+
+    d/dt (M u)_r = dL/dq_r + Q_r - db_r/dt
+"""
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
-
-from .._scalarjit.components import Component, add, mul
-from ._lagrangian import Inertia, inertia_of
+Triangle = Sequence[Sequence[Any]]  # row i has i + 1 entries
 
 
-def imported() -> Any:
-    try:
-        import sympy  # pyright: ignore[reportMissingImports]
-        import sympy.physics.mechanics  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise ImportError(
-            "Models of SymPy need SymPy: `pip install sympy`, or `pip install 'jaxkane[symbolic]'`."
-        ) from error
-    return sympy
+class Inertia(NamedTuple):
+    """SymPy's expressions in the order of the speeds: M, dM/dt, and the forces of the momentum form."""
+
+    M: Triangle = ()
+    M_dot: Triangle = ()
+    forces: Sequence[Any] = ()
 
 
-FUNCTIONS = {
-    "Abs": jnp.abs,
-    "Max": lambda *xs: functools.reduce(jnp.maximum, xs),
-    "Min": lambda *xs: functools.reduce(jnp.minimum, xs),
-    "acos": jnp.arccos,
-    "acosh": jnp.arccosh,
-    "asin": jnp.arcsin,
-    "asinh": jnp.arcsinh,
-    "atan": jnp.arctan,
-    "atan2": jnp.arctan2,
-    "atanh": jnp.arctanh,
-    "cos": jnp.cos,
-    "cosh": jnp.cosh,
-    "exp": jnp.exp,
-    "log": jnp.log,
-    "sign": jnp.sign,
-    "sin": jnp.sin,
-    "sinh": jnp.sinh,
-    "sqrt": jnp.sqrt,
-    "tan": jnp.tan,
-    "tanh": jnp.tanh,
-}
-
-
-def function(arguments: Sequence[Any], expressions: Sequence[Any]) -> Any:
-    """The expressions as one function of components, with common subexpressions."""
-    modules = [FUNCTIONS | _ARITHMETIC, "math"]
-    return imported().lambdify(arguments, list(expressions), modules=modules, printer=_printer(), cse=True)
-
-
-@functools.cache
-def _printer() -> Any:
-    """Expressions as Python. Sums and products are functions that drop exact zeros: the method asks for velocities
-    along one speed, where all others are exactly zero. Integer powers stay integer."""
-    from sympy.printing.pycode import PythonCodePrinter  # pyright: ignore[reportMissingImports]
-
-    class Printer(PythonCodePrinter):
-        def call(self, name: str, expr: Any) -> str:
-            return f"{name}({', '.join(self._print(x) for x in expr.args)})"
-
-        def _print_Add(self, expr: Any, order: Any = None) -> str:
-            return self.call("_sum", expr)
-
-        def _print_Mul(self, expr: Any) -> str:
-            return self.call("_product", expr)
-
-        def _print_Integer(self, expr: Any) -> str:
-            return repr(float(expr))  # exact ones and zeros are dropped where they are floats
-
-        _print_One = _print_Zero = _print_NegativeOne = _print_Integer
-
-        def _print_Pow(self, expr: Any, rational: bool = False) -> str:
-            base, exponent = (self._print(x) for x in expr.args)
-            if expr.exp.is_Integer:
-                return f"({base})**({int(expr.exp)})"
-            return f"sqrt({base})" if expr.exp == imported().S.Half else f"({base})**({exponent})"
-
-        def _print_And(self, expr: Any) -> str:
-            return self.call("_both", expr)
-
-        def _print_Or(self, expr: Any) -> str:
-            return self.call("_either", expr)
-
-        def _print_Not(self, expr: Any) -> str:
-            return self.call("_not", expr)
-
-        def _print_Piecewise(self, expr: Any) -> str:
-            value = "nan"
-            for x, condition in reversed(expr.args):
-                if condition is imported().true:
-                    value = self._print(x)
-                else:
-                    value = f"_where({self._print(condition)}, {self._print(x)}, {value})"
-            return value
-
-        def _print_known(self, expr: Any) -> str:
-            return self.call(expr.func.__name__, expr)
-
-    for name in FUNCTIONS:
-        setattr(Printer, f"_print_{name}", Printer._print_known)
-    return Printer({"fully_qualified_modules": False, "inline": True, "allow_unknown_functions": True})
-
-
-def _sum(*terms: Component) -> Component:
-    return functools.reduce(add, terms)
-
-
-def _product(*factors: Component) -> Component:
-    return functools.reduce(mul, factors)
-
-
-_ARITHMETIC = {
-    "_sum": _sum,
-    "_product": _product,
-    "_where": jnp.where,
-    "_both": lambda *conditions: functools.reduce(jnp.logical_and, conditions),
-    "_either": lambda *conditions: functools.reduce(jnp.logical_or, conditions),
-    "_not": jnp.logical_not,
-    "nan": float("nan"),
-}
-
-
-class Words(NamedTuple):
-    """What a model says, in SymPy's own terms."""
+class ModelData(NamedTuple):
+    """A model in SymPy's own terms."""
 
     name: str
     N: Any
@@ -145,7 +42,7 @@ class Words(NamedTuple):
     origin: Any = None
 
 
-def words_of(sympy: Any, model: Any, dependent: tuple[str, ...], name: str) -> Words:
+def model_data(sympy: Any, model: Any, dependent: tuple[str, ...], name: str) -> ModelData:
     mechanics = sympy.physics.mechanics
     kinds = [getattr(mechanics, kind, ()) for kind in ("KanesMethod", "System", "LagrangesMethod")]
     if isinstance(model, kinds[0]):
@@ -157,7 +54,7 @@ def words_of(sympy: Any, model: Any, dependent: tuple[str, ...], name: str) -> W
     raise TypeError(f"from_sympy takes a KanesMethod, a System or a LagrangesMethod of SymPy, got {model!r}.")
 
 
-def _of_kane(kane: Any, name: str, origin: Any = None) -> Words:
+def _of_kane(kane: Any, name: str, origin: Any = None) -> ModelData:
     if not kane.bodies:
         raise ValueError(
             f"{name}: this KanesMethod knows no bodies. Give them, KanesMethod(..., bodies=bodies, forcelist=loads), "
@@ -165,7 +62,7 @@ def _of_kane(kane: Any, name: str, origin: Any = None) -> Words:
         )
     u, u_dep, u_aux = list(kane.u), list(kane._udep), list(kane._uaux)
     residuals = list(kane._k_nh * kane.u + kane._f_nh) if u_dep else []
-    return Words(
+    return ModelData(
         name,
         kane._inertial,
         list(kane.q),
@@ -182,7 +79,7 @@ def _of_kane(kane: Any, name: str, origin: Any = None) -> Words:
     )
 
 
-def _of_system(mechanics: Any, system: Any, name: str) -> Words:
+def _of_system(mechanics: Any, system: Any, name: str) -> ModelData:
     loads = (*system.loads, *(load for actuator in system.actuators for load in actuator.to_loads()))
     kane = mechanics.KanesMethod(
         system.frame,
@@ -201,7 +98,7 @@ def _of_system(mechanics: Any, system: Any, name: str) -> Words:
     return _of_kane(kane, name, system.fixed_point)
 
 
-def _of_lagrange(sympy: Any, lagrange: Any, dependent: tuple[str, ...], name: str) -> Words:
+def _of_lagrange(sympy: Any, lagrange: Any, dependent: tuple[str, ...], name: str) -> ModelData:
     bodies = list(lagrange._bodies or ())
     if bodies and lagrange.inertial is None:
         raise ValueError(f"{name}: the inertial frame of the bodies is not known. Give LagrangesMethod(..., frame=N).")
@@ -224,7 +121,7 @@ def _of_lagrange(sympy: Any, lagrange: Any, dependent: tuple[str, ...], name: st
     else:
         inertia = inertia_of(sympy, lagrange, of_speeds, name)
     holonomic = list(lagrange._hol_coneqs)
-    return Words(
+    return ModelData(
         name,
         N,
         q,
@@ -250,3 +147,65 @@ def _forces_of_potential(
     if potential.has(*of_speeds.values()):
         raise ValueError(f"{name}: the Lagrangian is not the kinetic energy of the bodies less a potential of q alone.")
     return [-potential.diff(c) for c in of_speeds]
+
+
+def inertia_of(sympy: Any, lagrange: Any, speeds: dict[Any, Any], name: str) -> Inertia:
+    """Inertia and forces of a `LagrangesMethod` without bodies.
+
+    **Arguments:** `speeds`: the coordinates with their speeds, in the order of the speeds.
+
+    **Raises:** `ValueError` where L is no quadratic function of the rates; for a load without a frame to measure its
+    velocity in, and for one whose velocity does not follow from the rates of the coordinates. `TypeError` for a load
+    that acts neither at a point nor on a frame.
+    """
+    t = sympy.physics.mechanics.dynamicsymbols._t
+    to_speeds = {c.diff(t): u for c, u in speeds.items()}
+    rate = lambda x: x.diff(t).xreplace(to_speeds)  # noqa: E731
+    L, u = lagrange._L[0].xreplace(to_speeds), list(speeds.values())
+    strange = sorted(map(str, L.atoms(sympy.Derivative)))
+    if strange:
+        raise ValueError(
+            f"{name}: the Lagrangian holds {strange[0]}; of derivatives it may hold the first of the coordinates. What "
+            "is prescribed in time is written as an expression of time."
+        )
+    M = [[_without(sympy, L.diff(x, y), u, name) for y in u[: i + 1]] for i, x in enumerate(u)]
+    # The momenta beside M u: L may hold terms of the first order in the rates, as of a moving frame.
+    at_rest = dict.fromkeys(u, sympy.S.Zero)
+    forces = []
+    for c, x in speeds.items():
+        b = L.diff(x).xreplace(at_rest)
+        forces.append(L.diff(c) - rate(b) + _of_loads(sympy, lagrange, c.diff(t), name))
+    return Inertia(M, [[rate(entry) for entry in row] for row in M], forces)
+
+
+def _without(sympy: Any, entry: Any, speeds: list[Any], name: str) -> Any:
+    entry = sympy.simplify(entry)
+    if entry.has(*speeds):
+        raise ValueError(
+            f"{name}: the Lagrangian is no quadratic function of the rates of the coordinates: a second derivative by "
+            f"them is {entry}. A mass matrix depends on time and coordinates alone."
+        )
+    return entry
+
+
+def _of_loads(sympy: Any, lagrange: Any, rate: Any, name: str) -> Any:
+    """The generalized force along one rate: F . dv/du + T . domega/du, summed."""
+    mechanics, N, total = sympy.physics.mechanics, lagrange.inertial, sympy.S.Zero
+    known = {*lagrange.q, *lagrange._qdots}
+    for part, vector in lagrange.forcelist:
+        if N is None:
+            raise ValueError(f"{name}: a load at {part} needs the inertial frame: LagrangesMethod(..., frame=N).")
+        if not isinstance(part, (mechanics.Point, mechanics.ReferenceFrame)):
+            raise TypeError(f"{name}: a load of LagrangesMethod acts at a Point or on a ReferenceFrame, got {part!r}.")
+        try:
+            v = part.ang_vel_in(N) if isinstance(part, mechanics.ReferenceFrame) else part.vel(N)
+        except ValueError as error:
+            raise ValueError(f"{name}: {part}, at which a load acts, has no velocity in {N}: {error}") from error
+        foreign = sorted(mechanics.find_dynamicsymbols(v, reference_frame=N) - known, key=str) if v != 0 else []
+        if foreign:
+            raise ValueError(
+                f"{name}: the velocity of {part}, at which a load acts, holds {foreign[0]}, which is neither "
+                f"coordinate nor rate of one: write it by {rate} and the like."
+            )
+        total += v.diff(rate, N).dot(vector) if v != 0 else 0
+    return total

@@ -1,0 +1,332 @@
+"""Expressions of a SymPy model, each once, and how they are put together; and expressions as functions of numbers."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+
+from .._scalarjit.components import Component, add, mul
+from ._sympy_model import ModelData
+
+ExtractedVector = tuple[tuple[int, tuple[int, int, int]], ...]  # (frame, places of three expressions), summed
+
+
+class ExtractedPoint(NamedTuple):
+    name: str
+    velocity: ExtractedVector
+    position: ExtractedVector | None
+
+
+class ExtractedBody(NamedTuple):
+    name: str
+    mass: int
+    inertia: tuple[int, ...]  # nine, or none for a particle
+    frame: int  # in which the inertia stands
+    point: int
+    angular_velocity: ExtractedVector
+
+
+class ExtractedLoad(NamedTuple):
+    point: int | None  # None: a torque
+    angular_velocity: ExtractedVector
+    vector: ExtractedVector
+
+
+class ExtractedModel(NamedTuple):
+    """All of a model: hashable, so that one model has one class. Expressions are referred to by their place."""
+
+    name: str
+    q: tuple[Any, ...]
+    u: tuple[Any, ...]
+    u_dep: tuple[Any, ...]
+    u_aux: tuple[Any, ...]
+    q_dep: tuple[str, ...]
+    inputs: tuple[Any, ...]
+    constants: tuple[Any, ...]
+    t: Any
+    of_motion: tuple[Any, ...]
+    of_loads: tuple[Any, ...]
+    rates: tuple[int, ...]
+    residuals: tuple[int, ...]
+    configuration: tuple[int, ...]
+    frames: tuple[tuple[str, tuple[int, ...], ExtractedVector], ...]
+    points: tuple[ExtractedPoint, ...]
+    bodies: tuple[ExtractedBody, ...]
+    loads: tuple[ExtractedLoad, ...]
+    forces: tuple[int, ...]
+    inertia: tuple[tuple[int, ...], ...]  # rows of M, of a model without bodies
+    inertia_rates: tuple[tuple[int, ...], ...]
+
+
+class Extractor:
+    """Extracts the expressions of a model, each once."""
+
+    def __init__(self, sympy: Any, data: ModelData, origin: Any):
+        self.sympy, self.data, self.origin = sympy, data, origin
+        self.t = sympy.physics.mechanics.dynamicsymbols._t
+        self.of_motion: dict[Any, int] = {}
+        self.of_loads: dict[Any, int] = {}
+        self.frames: dict[Any, int] = {data.N: 0}
+        self.extracted_frames: list[tuple[str, tuple[int, ...], ExtractedVector]] = []
+        self.points: dict[Any, int] = {}
+        self.extracted_points: list[ExtractedPoint] = []
+
+    def model(self) -> ExtractedModel:
+        data, place = self.data, self._place
+        in_loads = lambda x: place(x, self.of_loads)  # noqa: E731
+        parts = {
+            # What rests in the inertial frame, as the ground that carries the joints, has no part in the motion.
+            "bodies": tuple(self._body(body) for body in data.bodies if not self._rests(body)),
+            "loads": tuple(self._load(load) for load in data.loads if not self._rests(load[0])),
+            "rates": tuple(place(data.rates[c.diff(self.t)]) for c in data.q),
+            "residuals": tuple(map(place, data.residuals)),
+            "configuration": tuple(map(place, data.configuration)),
+            "forces": tuple(map(in_loads, data.forces)),
+            "inertia": tuple(tuple(map(place, row)) for row in data.inertia.M),
+            "inertia_rates": tuple(tuple(map(in_loads, row)) for row in data.inertia.M_dot),
+        }
+        inputs, constants = self._symbols()
+        return ExtractedModel(
+            name=data.name,
+            q=tuple(data.q),
+            u=tuple(data.u),
+            u_dep=tuple(data.u_dep),
+            u_aux=tuple(data.u_aux),
+            q_dep=tuple(name_of(c) for c in data.q_dep),
+            inputs=inputs,
+            constants=constants,
+            t=self.t,
+            of_motion=tuple(self.of_motion),
+            of_loads=tuple(self.of_loads),
+            frames=tuple(self.extracted_frames),
+            points=tuple(self.extracted_points),
+            **parts,
+        )
+
+    def _place(self, expression: Any, among: dict[Any, int] | None = None) -> int:
+        """The place of an expression, with the rates of coordinates in terms of the speeds."""
+        among = self.of_motion if among is None else among
+        expression = self.sympy.physics.mechanics.msubs(self.sympy.sympify(expression), self.data.rates)
+        return among.setdefault(expression, len(among))
+
+    def _vector(self, vector: Any, among: dict[Any, int] | None = None) -> ExtractedVector:
+        parts = [] if vector == 0 else vector.args
+        return tuple((self._frame(frame), tuple(self._place(x, among) for x in column)) for column, frame in parts)  # type: ignore
+
+    def _frame(self, frame: Any) -> int:
+        if frame not in self.frames:
+            self.frames[frame] = len(self.frames)
+            self.extracted_frames.append(("", (), ()))  # keeps its place while its angular velocity is extracted
+            matrix = self._evaluated(lambda: frame.dcm(self.data.N), frame, "no orientation in the inertial frame")
+            extracted = frame.name, tuple(self._place(x) for x in matrix), self._vector(self._omega(frame))
+            self.extracted_frames[self.frames[frame] - 1] = extracted
+        return self.frames[frame]
+
+    def _omega(self, frame: Any) -> Any:
+        fault = "no angular velocity in the inertial frame"
+        return self._evaluated(lambda: frame.ang_vel_in(self.data.N), frame, fault)
+
+    def _velocity(self, point: Any) -> Any:
+        return self._evaluated(lambda: point.vel(self.data.N), point, "no velocity in the inertial frame")
+
+    def _evaluated(self, quantity: Any, part: Any, fault: str) -> Any:
+        try:
+            return quantity()
+        except ValueError as error:
+            raise ValueError(f"{self.data.name}: {part} has {fault}: {error}") from error
+
+    def _rests(self, part: Any) -> bool:
+        point, frame = (getattr(part, name, None) for name in ("masscenter", "frame"))
+        if hasattr(part, "pos_from"):
+            point = part
+        elif hasattr(part, "dcm"):
+            frame = part
+        return (point is None or self._velocity(point) == 0) and (frame is None or self._omega(frame) == 0)
+
+    def _point(self, point: Any) -> int:
+        if point not in self.points:
+            self.points[point] = len(self.points)
+            velocity, position = self._velocity(point), None
+            if self.origin is not None:
+                fault = f"no position from the origin {self.origin}"
+                position = self._vector(self._evaluated(lambda: point.pos_from(self.origin), point, fault))
+            self.extracted_points.append(ExtractedPoint(point.name, self._vector(velocity), position))
+        return self.points[point]
+
+    def _body(self, body: Any) -> ExtractedBody:
+        if not hasattr(body, "central_inertia"):  # a Particle
+            return ExtractedBody(body.name, self._place(body.mass), (), 0, self._point(body.point), ())
+        inertia = body.central_inertia
+        frames = {unit.args[0][1] for _, *units in inertia.args for unit in units} if inertia != 0 else set()
+        # where it stands as written it is constant, as of a disk in a frame that does not spin with it
+        frame = frames.pop() if len(frames) == 1 else body.frame
+        matrix = inertia.to_matrix(frame) if inertia != 0 else self.sympy.zeros(3)
+        places = tuple(self._place(x) for x in matrix)
+        point, mass = self._point(body.masscenter), self._place(body.mass)
+        return ExtractedBody(body.name, mass, places, self._frame(frame), point, self._vector(self._omega(body.frame)))
+
+    def _load(self, load: Any) -> ExtractedLoad:
+        part, vector = load
+        part = getattr(part, "masscenter", part) if hasattr(part, "central_inertia") else part
+        if isinstance(part, self.sympy.physics.mechanics.ReferenceFrame):
+            return ExtractedLoad(None, self._vector(self._omega(part)), self._vector(vector, self.of_loads))
+        return ExtractedLoad(self._point(part), (), self._vector(vector, self.of_loads))
+
+    def _symbols(self) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        """Inputs, and constants, in the order of their names."""
+        data, name = self.data, self.data.name
+        known = {*data.q, *data.u, *data.u_dep, *data.u_aux}
+        atoms = lambda kind, among: {x for e in among for x in e.atoms(*kind)}  # noqa: E731
+        derivatives = atoms([self.sympy.Derivative], (*self.of_motion, *self.of_loads))
+        if derivatives:
+            raise ValueError(f"{name}: {_listed(derivatives)} follows from no kinematic equation of the model.")
+        applied = self.sympy.core.function.AppliedUndef
+        unknown = {
+            x.func.__name__
+            for x in atoms([self.sympy.Function, self.sympy.Integral], (*self.of_motion, *self.of_loads))
+            if not isinstance(x, applied) and x.func.__name__ not in (*FUNCTIONS, "Piecewise")
+        }
+        if unknown:
+            raise ValueError(f"{name}: {_listed(unknown)} has no counterpart here: write it by other functions.")
+        foreign = atoms([applied], self.of_motion) - known
+        if foreign:
+            raise ValueError(
+                f"{name}: {_listed(foreign)} in the motion is neither coordinate nor speed. What is prescribed in time "
+                "is written as an expression of time; an input stands in loads alone."
+            )
+        inputs = sorted(atoms([applied], self.of_loads) - known, key=str)
+        odd = [x for x in inputs if tuple(x.args) != (self.t,)]
+        if odd:
+            raise ValueError(f"{name}: {_listed(odd)} is a function of something else than time.")
+        symbols = {x for e in (*self.of_motion, *self.of_loads) for x in e.free_symbols} - {self.t}
+        names = [str(x) for x in symbols]
+        twice = {name for name in names if names.count(name) > 1}
+        if twice:
+            raise ValueError(
+                f"{name}: two symbols are called {_listed(twice)}, with other assumptions (as positive=True): make one."
+            )
+        return tuple(inputs), tuple(sorted(symbols, key=str))
+
+
+def name_of(x: Any) -> str:
+    return str(getattr(x, "func", x)) if getattr(x, "args", ()) else str(x)
+
+
+def _listed(things: Any) -> str:
+    return ", ".join(sorted(map(str, things)))
+
+
+def imported() -> Any:
+    try:
+        import sympy  # pyright: ignore[reportMissingImports]
+        import sympy.physics.mechanics  # pyright: ignore[reportMissingImports]
+    except ImportError as error:
+        raise ImportError(
+            "Models of SymPy need SymPy: `pip install sympy`, or `pip install 'jaxkane[symbolic]'`."
+        ) from error
+    return sympy
+
+
+FUNCTIONS = {
+    "Abs": jnp.abs,
+    "Max": lambda *xs: functools.reduce(jnp.maximum, xs),
+    "Min": lambda *xs: functools.reduce(jnp.minimum, xs),
+    "acos": jnp.arccos,
+    "acosh": jnp.arccosh,
+    "asin": jnp.arcsin,
+    "asinh": jnp.arcsinh,
+    "atan": jnp.arctan,
+    "atan2": jnp.arctan2,
+    "atanh": jnp.arctanh,
+    "cos": jnp.cos,
+    "cosh": jnp.cosh,
+    "exp": jnp.exp,
+    "log": jnp.log,
+    "sign": jnp.sign,
+    "sin": jnp.sin,
+    "sinh": jnp.sinh,
+    "sqrt": jnp.sqrt,
+    "tan": jnp.tan,
+    "tanh": jnp.tanh,
+}
+
+
+def function(arguments: Sequence[Any], expressions: Sequence[Any]) -> Any:
+    """The expressions as one function of components, with common subexpressions."""
+    modules = [FUNCTIONS | _ARITHMETIC, "math"]
+    return imported().lambdify(arguments, list(expressions), modules=modules, printer=_printer(), cse=True)
+
+
+@functools.cache
+def _printer() -> Any:
+    """Expressions as Python. Sums and products are functions that drop exact zeros: the method asks for velocities
+    along one speed, where all others are exactly zero. Integer powers stay integer."""
+    from sympy.printing.pycode import PythonCodePrinter  # pyright: ignore[reportMissingImports]
+
+    class Printer(PythonCodePrinter):
+        def call(self, name: str, expr: Any) -> str:
+            return f"{name}({', '.join(self._print(x) for x in expr.args)})"
+
+        def _print_Add(self, expr: Any, order: Any = None) -> str:
+            return self.call("_sum", expr)
+
+        def _print_Mul(self, expr: Any) -> str:
+            return self.call("_product", expr)
+
+        def _print_Integer(self, expr: Any) -> str:
+            return repr(float(expr))  # exact ones and zeros are dropped where they are floats
+
+        _print_One = _print_Zero = _print_NegativeOne = _print_Integer
+
+        def _print_Pow(self, expr: Any, rational: bool = False) -> str:
+            base, exponent = (self._print(x) for x in expr.args)
+            if expr.exp.is_Integer:
+                return f"({base})**({int(expr.exp)})"
+            return f"sqrt({base})" if expr.exp == imported().S.Half else f"({base})**({exponent})"
+
+        def _print_And(self, expr: Any) -> str:
+            return self.call("_both", expr)
+
+        def _print_Or(self, expr: Any) -> str:
+            return self.call("_either", expr)
+
+        def _print_Not(self, expr: Any) -> str:
+            return self.call("_not", expr)
+
+        def _print_Piecewise(self, expr: Any) -> str:
+            value = "nan"
+            for x, condition in reversed(expr.args):
+                if condition is imported().true:
+                    value = self._print(x)
+                else:
+                    value = f"_where({self._print(condition)}, {self._print(x)}, {value})"
+            return value
+
+        def _print_known(self, expr: Any) -> str:
+            return self.call(expr.func.__name__, expr)
+
+    for name in FUNCTIONS:
+        setattr(Printer, f"_print_{name}", Printer._print_known)
+    return Printer({"fully_qualified_modules": False, "inline": True, "allow_unknown_functions": True})
+
+
+def _sum(*terms: Component) -> Component:
+    return functools.reduce(add, terms)
+
+
+def _product(*factors: Component) -> Component:
+    return functools.reduce(mul, factors)
+
+
+_ARITHMETIC = {
+    "_sum": _sum,
+    "_product": _product,
+    "_where": jnp.where,
+    "_both": lambda *conditions: functools.reduce(jnp.logical_and, conditions),
+    "_either": lambda *conditions: functools.reduce(jnp.logical_or, conditions),
+    "_not": jnp.logical_not,
+    "nan": float("nan"),
+}
