@@ -85,15 +85,18 @@ def test_what_stands_in_the_house_itself():
 
 
 # What JAX and equinox do not promise: the one file that uses it says what happens where it is gone.
-NOT_PROMISED = r"jax\.(extend|interpreters|experimental|_src)|equinox\._|jaxlib\.(?!__version__)|compiler_options"
+NOT_PROMISED = r"jax\.(core|extend|interpreters|experimental|_src)|equinox\._|jaxlib\.(?!__version__)|compiler_options"
+OF_JAXPRS = r"(?<!_scalarjit)\.(eqns|invars|outvars|constvars|consts|jaxpr|primitive)\b"
 
 
 def test_one_file_uses_what_is_not_promised():
     the_file = SOURCE / "_scalarjit" / "compat.py"
     assert [path for path in SOURCE.rglob("*.py") if re.search(NOT_PROMISED, path.read_text())] == [the_file]
-    others = [path for path in SOURCE.rglob("*.py") if path != the_file]
-    of_core = {line for path in others for line in re.findall(r".*jax\.core.*", path.read_text())}
-    assert of_core <= {"from jax.core import Tracer"}  # the rest of jax.core comes and goes
+
+
+def test_one_room_reads_jaxprs():
+    readers = {path for path in SOURCE.rglob("*.py") if re.search(OF_JAXPRS, path.read_text())}
+    assert {room_of(path) for path in readers} == {"_scalarjit"}
 
 
 def test_few_files_see_the_integrator():

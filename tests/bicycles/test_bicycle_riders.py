@@ -13,7 +13,7 @@ import jaxkane as jk
 from jaxkane import Status
 from jaxkane._animate._figures import Sketch, figure_of
 from jaxkane._kane.kane import _motion_rates
-from jaxkane._scalarjit.function import _Program
+from jaxkane._scalarjit.function import Program
 from jaxkane._system.parameters import with_parameters
 from jaxkane.bicycles import (
     Arms,
@@ -386,6 +386,6 @@ def test_a_bicycle_with_arms_is_one_program_of_scalars():
     q, u = jnp.full(len(bicycle.coordinates), 0.01), jnp.zeros(len(bicycle.speeds))
     args = (bicycle, jnp.array(0.0), q, u, dict.fromkeys(bicycle.inputs, jnp.array(0.0)))
     leaves, treedef = jax.tree.flatten(args)
-    program = _Program(jax.make_jaxpr(lambda *x: _motion_rates.__wrapped__(*jax.tree.unflatten(treedef, x)))(*leaves))
+    program = Program(jax.make_jaxpr(lambda *x: _motion_rates.__wrapped__(*jax.tree.unflatten(treedef, x)))(*leaves))
     assert program.is_fusable
     assert len(program.program.jaxpr.eqns) <= 6600

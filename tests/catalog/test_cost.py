@@ -9,7 +9,7 @@ import jaxkane as jk
 from jaxkane._kane.kane import _motion_rates
 from jaxkane._scalarjit import function as fuse
 from jaxkane._scalarjit.backends.native import Scalars
-from jaxkane._scalarjit.function import _Program
+from jaxkane._scalarjit.function import Program
 from jaxkane.catalog import CATALOG
 
 
@@ -26,7 +26,7 @@ def test_the_programs_do_not_grow(name):
     )
     leaves, treedef = jax.tree.flatten(args)
     plain = _motion_rates.__wrapped__
-    program = _Program(jax.make_jaxpr(lambda *x: plain(*jax.tree.unflatten(treedef, x)))(*leaves))
+    program = Program(jax.make_jaxpr(lambda *x: plain(*jax.tree.unflatten(treedef, x)))(*leaves))
     size = lambda program: len(program.program.jaxpr.eqns)  # noqa: E731
     tangent = program.tangent((True,) * len(leaves))
     assert size(program) <= entry.operations
@@ -48,8 +48,8 @@ def test_every_public_function_is_one_program_of_scalars(name, monkeypatch):
     """Traced, and not compiled: what cannot be part of one function is told of, and is an error here."""
     entry, programs = CATALOG[name], []
     system, q, u = entry.example(), jnp.array(entry.q), jnp.array(entry.u)
-    prepared = fuse._Program.__init__
-    monkeypatch.setattr(fuse._Program, "__init__", lambda self, *args: prepared(self, *args) or programs.append(self))
+    prepared = fuse.Program.__init__
+    monkeypatch.setattr(fuse.Program, "__init__", lambda self, *args: prepared(self, *args) or programs.append(self))
     jk.forget()
     names = f"{OF_STATES} {OF_CONSTRAINTS if system.dependent_speeds else ''}".split()
     for f in (getattr(jk, name) for name in names):

@@ -356,7 +356,7 @@ def graph_of(f, x):
     program, out = jax.make_jaxpr(f, return_shape=True)(x)
     graph = Graph()
     nodes = np.array([graph.add("input", (0, i, x.size), str(x.dtype)) for i in range(x.size)]).reshape(x.shape)
-    outputs = unrolled(program.jaxpr, program.consts, [nodes], graph)
+    outputs = unrolled(program, [nodes], graph)
     return graph, nodes, outputs, jax.tree.structure(out)
 
 

@@ -150,11 +150,11 @@ def test_delays_gains_rates_and_gaps(result):
 def test_other_data_and_guesses_compile_nothing(result, runs, problem):
     import jaxkane.fit._linearize as programs
 
-    before = programs.blocks_of.compiled._cached._cache_size()
+    before = programs.blocks_of.jitted._cached._cache_size()
     again = [Trial(r.t, r.measured, r.inputs, sigma=0.02, name="again") for r in runs]
     other = Problem.of(TRUTH, again, FREE, sensor_gain={"x": 0.2}, **UNKNOWN)
     near(minimize(other, LeastSquares()))
-    assert programs.blocks_of.compiled._cached._cache_size() == before
+    assert programs.blocks_of.jitted._cached._cache_size() == before
 
 
 @pytest.mark.parametrize("method", [LeastSquares(damping=0.0), BFGS()], ids=lambda m: m.name)
@@ -178,9 +178,9 @@ def test_an_interrupted_fit_goes_on_from_its_file(problem, method, tmp_path):
 
     path = tmp_path / "fit.npz"
     assert minimize(problem, method, steps=6, checkpoint=path, callback=interrupt).status == "interrupted"
-    traced = _step.compiled._cached._cache_size()
+    traced = _step.jitted._cached._cache_size()
     resumed = minimize(problem, method, steps=6, checkpoint=path)
-    assert _step.compiled._cached._cache_size() == traced  # nothing is compiled anew
+    assert _step.jitted._cached._cache_size() == traced  # nothing is compiled anew
     assert resumed.history == pytest.approx(whole.history, rel=1e-12)
     np.testing.assert_allclose(resumed.point.x, whole.point.x, rtol=1e-12)
     with pytest.raises(ValueError, match="is the state of another fit"):

@@ -10,7 +10,7 @@ import jaxkane as jk
 from jaxkane._integrate import audit as balance
 from jaxkane._kane import kane as rates
 from jaxkane._scalarjit import linear
-from jaxkane._scalarjit.function import _Program
+from jaxkane._scalarjit.function import Program
 
 TILTS = ((0.3, 0.5, 0.81), (0.7, -0.2, 0.4), (-0.4, 0.6, 0.5))
 
@@ -57,7 +57,7 @@ def operations(f, system, *more):
     n, m = len(system.coordinates), len(system.speeds)
     args = (system, jnp.array(0.4), jnp.full(n, 0.3), jnp.full(m, 0.2), {}, *more)
     leaves, treedef = jax.tree.flatten(args)
-    program = _Program(jax.make_jaxpr(lambda *x: f.__wrapped__(*jax.tree.unflatten(treedef, x)))(*leaves))
+    program = Program(jax.make_jaxpr(lambda *x: f.__wrapped__(*jax.tree.unflatten(treedef, x)))(*leaves))
     return len(program.program.jaxpr.eqns), program.is_fusable
 
 

@@ -12,7 +12,7 @@ import jaxkane as jk
 from jaxkane._integrate import integrate as ride
 from jaxkane._integrate.settings import settings_for
 from jaxkane._scalarjit.compat import nothing_is_traced
-from jaxkane._scalarjit.function import recorded
+from jaxkane._scalarjit.function import ScalarFunction
 
 TS = jnp.linspace(0.0, 1.0, 11)
 
@@ -138,7 +138,7 @@ def test_the_program_of_a_motion_without_events_is_small():
 # A record is the function that it was made from.
 
 
-@recorded
+@ScalarFunction
 def _two(scale, x):
     (a, b), t = x
     product = a * b
@@ -147,17 +147,17 @@ def _two(scale, x):
 
 def test_a_record_gives_what_was_asked_for_and_keeps_exact_values():
     scale, a, t = jnp.array(2.0), jnp.array(0.7), jnp.array(-1.3)
-    product = _two("product", scale, ((a, 0.0), t), {})
+    product = _two.replay("product", scale, ((a, 0.0), t), {})
     assert product == [0.0, 3.0] and all(type(x) is float for x in product)  # noqa: PT018
-    total, larger = _two("sum", scale, ((0.0, 1.0), t), {})
+    total, larger = _two.replay("sum", scale, ((0.0, 1.0), t), {})
     assert total is t
     assert float(larger) == 0.5
-    assert np.isnan(_two("zero", scale, ((a, a), jnp.array(jnp.nan)), {}))  # written so: not an exact zero
+    assert np.isnan(_two.replay("zero", scale, ((a, a), jnp.array(jnp.nan)), {}))  # written so: not an exact zero
 
 
 @pytest.mark.parametrize("derivative", [jax.jvp, jax.linearize])
 def test_a_record_has_the_derivatives_of_its_function(derivative):
-    f = lambda a, t: _two("sum", jnp.array(2.0), ((a, 0.5), t), {})[0]  # noqa: E731
+    f = lambda a, t: _two.replay("sum", jnp.array(2.0), ((a, 0.5), t), {})[0]  # noqa: E731
     at, along = (jnp.array(0.7), jnp.array(-1.3)), (jnp.array(1.0), jnp.array(3.0))
     found = jax.jvp(f, at, along)[1] if derivative is jax.jvp else jax.linearize(f, *at)[1](*along)
     assert float(found) == pytest.approx(1.0 + 0.5 * 3.0, rel=1e-15)
@@ -168,17 +168,17 @@ def test_a_record_has_the_derivatives_of_its_function(derivative):
 
 def test_a_memory_holds_what_no_direction_changes():
     scale, t, memory = jnp.array(2.0), jnp.array(-1.3), {}
-    _two("sum", scale, ((jnp.array(0.7), 0.5), t), memory)
+    _two.replay("sum", scale, ((jnp.array(0.7), 0.5), t), memory)
     n = len(memory)
-    _two("sum", scale, ((jnp.array(0.9), 0.5), t), memory)  # `b * t` is known
+    _two.replay("sum", scale, ((jnp.array(0.9), 0.5), t), memory)  # `b * t` is known
     assert n < len(memory) < 2 * n
 
 
 def test_what_reads_a_trace_that_is_under_way_is_not_recorded():
     @jax.jit
     def f(x):
-        g = recorded(lambda scale, y: {"all": scale * y[0] * x})
-        return g("all", jnp.array(2.0), (jnp.array(3.0),), {})
+        g = ScalarFunction(lambda scale, y: {"all": scale * y[0] * x})
+        return g.replay("all", jnp.array(2.0), (jnp.array(3.0),), {})
 
     assert float(f(jnp.array(5.0))) == 30.0
     assert float(f(jnp.array(7.0))) == 42.0

@@ -312,13 +312,13 @@ def test_float32_and_what_follows_from_it():
 
 def test_another_accuracy_compiles_nothing():
     coarse, fine = (jk.simulate(PENDULUM, START, TS, step=x) for x in (0.1, 0.05))
-    programs = solve.compiled._cached._cache_size()
+    programs = solve.jitted._cached._cache_size()
     finer = jk.simulate(PENDULUM, START, TS, step=0.025)
     assert [int(ride.stats["steps"]) for ride in (coarse, fine, finer)] == [10, 20, 40]
     jk.simulate(PENDULUM, START, TS)
     tolerant, strict = (jk.simulate(PENDULUM, START, TS, rtol=x, atol=x) for x in (1e-3, 1e-10))
     assert int(tolerant.stats["steps"]) < int(strict.stats["steps"])
-    assert solve.compiled._cached._cache_size() <= programs + 1
+    assert solve.jitted._cached._cache_size() <= programs + 1
 
 
 def test_under_jit_and_vmap():

@@ -12,7 +12,7 @@ from jaxkane._integrate import diffrax_compat as loops
 from jaxkane._integrate import integrate as ride
 from jaxkane._integrate.settings import settings_for
 from jaxkane._integrate.step_control import ErrorController
-from jaxkane._scalarjit.function import fused
+from jaxkane._scalarjit.function import ScalarFunction
 
 
 def van_der_pol(controller):
@@ -94,7 +94,7 @@ def test_the_loop_of_known_times_is_that_of_diffrax(adjoint, monkeypatch):
     assert motion.t_end == ts[-1]
 
 
-@fused
+@ScalarFunction
 def _of_the_first(x, y):
     return jnp.sin(x) + 1.0
 
@@ -112,7 +112,7 @@ def test_what_a_program_does_not_read_is_not_computed_for_it(native):
     np.testing.assert_allclose(slope, [np.cos(0.5), 0.0], rtol=1e-15)
 
 
-@fused
+@ScalarFunction
 def _doubled_if_positive(x):
     positive = x > 0
     return jnp.where(positive, 2.0 * x, x), positive

@@ -9,7 +9,7 @@ from benchmarks.chain import Chain
 import jaxkane as jk
 from jaxkane._kane import kane as rates
 from jaxkane._scalarjit import linear
-from jaxkane._scalarjit.function import _Program
+from jaxkane._scalarjit.function import Program
 
 
 class DampedChain(Chain):
@@ -79,7 +79,7 @@ def test_the_work_grows_with_the_number_of_links():
         leaves, treedef = jax.tree.flatten((*at(Chain(n=n), n), jnp.ones(n)))
         column = lambda *x: rates._mass_times.__wrapped__(*jax.tree.unflatten(treedef, x))  # noqa: E731
         traced = jax.make_jaxpr(column)(*leaves)
-        return len(traced.jaxpr.eqns), len(_Program(traced).program.jaxpr.eqns)
+        return len(traced.jaxpr.eqns), len(Program(traced).program.jaxpr.eqns)
 
     (traced_10, kept_10), (traced_40, kept_40) = operations(10), operations(40)
     assert traced_40 < 4.6 * traced_10

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from jaxkane._scalarjit import compat as internals
-from jaxkane._scalarjit.function import fused
+from jaxkane._scalarjit.function import ScalarFunction
 
 USED = {
-    "jax.extend.core": "ClosedJaxpr Jaxpr JaxprEqn Literal Primitive jaxpr_as_fun",
+    "jax.extend.core": "ClosedJaxpr Jaxpr JaxprEqn Primitive jaxpr_as_fun get_opaque_trace_state",
     "jax.interpreters.ad": "Zero instantiate_zeros is_undefined_primal primitive_jvps primitive_transposes",
     "jax.interpreters.batching": "primitive_batchers",
     "jax.interpreters.mlir": "lower_fun register_lowering",
@@ -34,9 +34,30 @@ def test_it_is_there(module):
     assert not missing, f"{module} lacks {', '.join(missing)}: see jaxkane/_scalarjit/compat.py for what is lost"
 
 
+def test_jaxprs_are_what_they_are_read_as():
+    """A program by its equations, in `interpret`; and what follows from which input."""
+    program = jax.make_jaxpr(lambda x, y: (jnp.sin(x) * 2.0 + np.arange(3.0), y))(1.0, 2.0)
+    names: list[str] = []
+
+    def rule(equation, xs):
+        operation = internals.operation_of(equation)
+        names.append(operation.name)
+        assert (operation.is_pure, operation.results) == (True, 1)
+        return internals.evaluated(equation, xs)
+
+    sums, y = internals.interpret(program, [0.5, 2.0], rule)
+    np.testing.assert_allclose(sums, 2.0 * np.sin(0.5) + np.arange(3.0), rtol=1e-15)
+    assert (names[:2], y) == (["sin", "mul"], 2.0)
+    assert internals.depends_on(program, [0]) == [True, False]
+    assert internals.depends_on(program, [1]) == [False, True]
+    inner = jax.make_jaxpr(jax.jit(jnp.sin))(1.0).jaxpr.eqns[0]
+    assert internals.operation_of(inner).function == "sin"
+    assert [len(internals.types_of(p)[0]) for p in internals.programs_in(inner)] == [1]
+
+
 def test_what_they_do(by_xla):
-    assert internals.FUSES is None
-    text = jax.jit(fused(lambda x: jnp.sin(x) * 2.0)).lower(0.5).as_text()
+    assert internals.MISSING is None
+    text = jax.jit(ScalarFunction(lambda x: jnp.sin(x) * 2.0)).lower(0.5).as_text()
     assert "xla_cpu_small_call" in text
     before = internals.settings()
     with jax.enable_x64(not jax.config.jax_enable_x64):
@@ -46,7 +67,7 @@ def test_what_they_do(by_xla):
 
 def test_without_the_frontend_attribute_only_speed_goes(by_xla, monkeypatch):
     monkeypatch.delattr("jax.experimental.xla_metadata.set_xla_metadata")
-    f = jax.jit(jax.grad(fused(lambda x: jnp.sin(x) * 1.5)))
+    f = jax.jit(jax.grad(ScalarFunction(lambda x: jnp.sin(x) * 1.5)))
     assert "xla_cpu_small_call" not in f.lower(0.5).as_text()
     np.testing.assert_allclose(f(0.5), 1.5 * np.cos(0.5), rtol=1e-14)
 
@@ -60,7 +81,7 @@ del jax.extend.core.jaxpr_as_fun, cache.reset_cache, errors.EQX_ON_ERROR
 import warnings
 import jaxkane as jk
 from jaxkane._scalarjit import compat
-assert "jaxpr_as_fun" in compat.FUSES
+assert "jaxpr_as_fun" in compat.MISSING
 class Rod(jk.System):
     length: jk.Scalar = jk.parameter(0.5)
     coordinates, speeds = ("angle",), ("rate",)

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from jaxkane._scalarjit import function as fuse
-from jaxkane._scalarjit import jaxpr as pieces
-from jaxkane._scalarjit.function import fused
+from jaxkane._scalarjit.backends import xla
+from jaxkane._scalarjit.function import ScalarFunction
 from jaxkane._scalarjit.jaxpr import cse
 from jaxkane._scalarjit.linear import determinant, solve
 
@@ -23,7 +23,7 @@ def plain(a, b, x):
     return jnp.stack([y * s, s * s + c, a + 0.0 * y]), y**3
 
 
-program = fused(plain)
+program = ScalarFunction(plain)
 ARGUMENTS = (jnp.array(0.7), jnp.array(-1.2), jnp.array([0.3, 0.9]))
 
 
@@ -72,8 +72,8 @@ def test_the_same_as_plain_jax(name, compiled, kernels):
 
 @pytest.mark.parametrize("name", ["jit", "reverse", "batch", "batch of gradients", "gradient of a loop"])
 def test_a_long_program_in_pieces(name, by_xla, monkeypatch):
-    monkeypatch.setattr(pieces, "_WHOLE_UP_TO", 4)
-    monkeypatch.setattr(pieces, "_PIECE", 3)
+    monkeypatch.setattr(xla, "_WHOLE_UP_TO", 4)
+    monkeypatch.setattr(xla, "_PIECE", 3)
 
     def chosen(a, b, x):
         left = x[0] < a  # what is not a float goes from piece to piece too
@@ -83,7 +83,7 @@ def test_a_long_program_in_pieces(name, by_xla, monkeypatch):
     transform = TRANSFORMATIONS[name]
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14),
-        jax.jit(transform(fused(chosen)))(*ARGUMENTS),
+        jax.jit(transform(ScalarFunction(chosen)))(*ARGUMENTS),
         jax.jit(transform(chosen))(*ARGUMENTS),
     )
 
@@ -97,7 +97,7 @@ def test_repetition_goes():
 def test_it_is_traced_once():
     calls = []
 
-    @fused
+    @ScalarFunction
     def counted(x):
         calls.append(1)
         return jnp.sin(x)
@@ -112,8 +112,8 @@ def test_it_is_traced_once():
 CRASHES = """
 import jax, jax.numpy as jnp
 jax.config.update("jax_enable_x64", True)
-from jaxkane._scalarjit.function import fused
-program = fused(lambda a, b, t, x: (jnp.sin(x[0]) * a + t + jnp.cos(x[1]), 0.0 * b))
+from jaxkane._scalarjit.function import ScalarFunction
+program = ScalarFunction(lambda a, b, t, x: (jnp.sin(x[0]) * a + t + jnp.cos(x[1]), 0.0 * b))
 x = jnp.ones(3)
 def loop(f, n=5):
     def body(c):
@@ -139,9 +139,9 @@ def test_the_process_stays_alive():
 
 
 def test_a_batch_without_jit_is_compiled_once(monkeypatch):
-    f = fused(lambda x, a: jnp.sin(a * x))
-    lowered, lower = [], fuse._Program.target
-    monkeypatch.setattr(fuse._Program, "target", lambda self, *batch: lowered.append(batch) or lower(self, *batch))
+    f = ScalarFunction(lambda x, a: jnp.sin(a * x))
+    lowered, lower = [], fuse.Program.target
+    monkeypatch.setattr(fuse.Program, "target", lambda self, *batch: lowered.append(batch) or lower(self, *batch))
     x = jnp.linspace(0.0, 1.0, 5)
     for a in (1.0, 2.0, 3.0):
         np.testing.assert_allclose(jax.vmap(f, (0, None))(x, a), np.sin(a * x), rtol=1e-14)
@@ -153,7 +153,7 @@ def test_a_batch_without_jit_is_compiled_once(monkeypatch):
 
 def test_a_value_of_the_trace_under_way_is_not_kept():
     box = {}
-    f = fused(lambda x: box["k"] * jnp.sin(x))
+    f = ScalarFunction(lambda x: box["k"] * jnp.sin(x))
 
     def g(k, x):
         box["k"] = k
@@ -178,7 +178,7 @@ FIRST_CALLS = {
 
 @pytest.mark.parametrize("name", FIRST_CALLS)
 def test_a_first_call_inside_a_trace_leaves_nothing_behind(name):
-    f = fused(lambda x: jnp.sin(x) * jnp.cos(0.5 * x))
+    f = ScalarFunction(lambda x: jnp.sin(x) * jnp.cos(0.5 * x))
     x = jnp.array(0.4)
     with jax.checking_leaks():
         FIRST_CALLS[name](f)(x)
@@ -187,7 +187,7 @@ def test_a_first_call_inside_a_trace_leaves_nothing_behind(name):
 
 
 def test_the_precision_may_be_switched_between_calls():
-    f = fused(lambda x: (2.0 * x, jnp.full(2, 0.5)))
+    f = ScalarFunction(lambda x: (2.0 * x, jnp.full(2, 0.5)))
     x = jnp.float32(0.4)
     assert [y.dtype for y in f(x)] == [jnp.float32, jnp.float64]
     with jax.enable_x64(False):
@@ -202,7 +202,7 @@ def test_numbers_that_print_alike_are_not_the_same():
     once = cse(jax.make_jaxpr(lambda x: [*f(x), *f(x)])(1.0))
     assert [e.primitive.name for e in once.jaxpr.eqns].count("mul") == 4
     assert [e.primitive.name for e in once.jaxpr.eqns].count("add") == 1
-    np.testing.assert_array_equal(jnp.stack(fused(f)(3.0)), [3 * near[0], 3 * near[1], np.pi, -np.pi, np.nan])
+    np.testing.assert_array_equal(jnp.stack(ScalarFunction(f)(3.0)), [3 * near[0], 3 * near[1], np.pi, -np.pi, np.nan])
 
 
 class Ball(eqx.Module):
@@ -223,7 +223,7 @@ SLOW = {
 @pytest.mark.parametrize("name", SLOW)
 def test_what_cannot_be_one_function_is_told_once_by_name(name, monkeypatch):
     monkeypatch.setattr(fuse, "_told", set())
-    f = fused(SLOW[name])
+    f = ScalarFunction(SLOW[name])
     ball, x = Ball(jnp.array(1.5)), jnp.array(0.4)
     with pytest.warns(UserWarning, match=rf"Ball: its description uses .*`{name}`.* cannot be part of one") as told:
         found = f(ball, x), jax.jit(f)(ball, x), jax.grad(lambda x: f(ball, x) if name != "while" else x)(x)
@@ -237,8 +237,8 @@ def test_products_of_small_matrices_are_written_out():
     f = lambda b, x: jnp.einsum("bij,jbk->bik", b.a * A, x * jnp.asarray(B))  # noqa: E731
     ball, x = Ball(jnp.array(1.5)), jnp.array(0.4)
     exact = np.einsum("bij,jbk->bik", 1.5 * A, 0.4 * B)
-    np.testing.assert_allclose(fused(f)(ball, x), exact, rtol=1e-13, atol=1e-14)
-    np.testing.assert_allclose(jax.jacfwd(lambda x: fused(f)(ball, x))(x), exact / 0.4, rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(ScalarFunction(f)(ball, x), exact, rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(jax.jacfwd(lambda x: ScalarFunction(f)(ball, x))(x), exact / 0.4, rtol=1e-13, atol=1e-14)
 
 
 @pytest.mark.filterwarnings("error")
@@ -248,14 +248,14 @@ def test_lapack_of_the_method_itself_is_not_told():
         return solve(rows, [x, 1.0, 2.0, 3.0])[0][0] + determinant(rows)
 
     f = lambda x: jax.jvp(solved, (x,), (jnp.ones(()),))[1]  # noqa: E731
-    np.testing.assert_allclose(fused(f)(jnp.array(0.4)), f(jnp.array(0.4)), rtol=1e-14)
-    np.testing.assert_allclose(jax.grad(fused(f))(jnp.array(0.4)), jax.grad(f)(jnp.array(0.4)), rtol=1e-14)
+    np.testing.assert_allclose(ScalarFunction(f)(jnp.array(0.4)), f(jnp.array(0.4)), rtol=1e-14)
+    np.testing.assert_allclose(jax.grad(ScalarFunction(f))(jnp.array(0.4)), jax.grad(f)(jnp.array(0.4)), rtol=1e-14)
 
 
 @pytest.mark.usefixtures("native")
 def test_what_kernels_cannot_do_is_told_once_by_name(monkeypatch):
     monkeypatch.setattr(fuse, "_told", set())
-    f = fused(lambda ball, x: ball.a * jnp.asarray(x).astype(jnp.int32).astype(float))
+    f = ScalarFunction(lambda ball, x: ball.a * jnp.asarray(x).astype(jnp.int32).astype(float))
     match = "Ball: its description uses convert_element_type of float64, which native"
     with pytest.warns(UserWarning, match=match) as told:
         found = [f(Ball(jnp.array(1.5)), jnp.array(x)) for x in (0.4, 2.7, 2.5)]
@@ -263,12 +263,12 @@ def test_what_kernels_cannot_do_is_told_once_by_name(monkeypatch):
     assert len(told) == 1
 
 
-@fused
+@ScalarFunction
 def of_two(a, b):
     return 2.0 * jnp.sin(a), a * b, b**2
 
 
-@fused
+@ScalarFunction
 def with_a_constant(b):
     return jnp.ones(()), 2.0 * b
 

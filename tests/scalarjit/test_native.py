@@ -9,7 +9,7 @@ import jaxkane as jk
 from jaxkane._kane.kane import _motion_rates, motion_rates
 from jaxkane._scalarjit import function as fuse
 from jaxkane._scalarjit.backends import native as native_kernels
-from jaxkane._scalarjit.function import _Program, fused
+from jaxkane._scalarjit.function import Program, ScalarFunction
 
 LARGEST = 19
 
@@ -73,7 +73,7 @@ def every_operation(x):
 @pytest.mark.parametrize("kernels", ["native", pytest.param("XLA", marks=pytest.mark.slow)], indirect=True)
 def test_every_operation(plainly, kernels):
     x, expected = plainly
-    program = fused(every_operation)
+    program = ScalarFunction(every_operation)
     assert native_kernels.Scalars(jax.make_jaxpr(every_operation)(x[0])).graph.nodes, "cannot be written as scalars"
     tolerance = 1e-14 if x.dtype == jnp.float64 else 1e-6
     check = lambda a, b: np.testing.assert_allclose(a, b, rtol=20 * tolerance, atol=tolerance)  # noqa: E731
@@ -119,8 +119,8 @@ def test_no_number_and_signed_zeros_as_by_xla(dtype, kernels):
     """Bit for bit, but for the sign of NaN."""
     x = jnp.array([0.0, -0.0, 1.0, -1.0, jnp.inf, -jnp.inf, jnp.nan], dtype)
     f = lambda x: {name: odd(x) for name, odd in ODD.items()}  # noqa: E731
-    expected, found = jax.jit(jax.vmap(f))(x), jax.jit(jax.vmap(fused(f)))(x)
-    one = jax.jit(fused(f))(x[1])
+    expected, found = jax.jit(jax.vmap(f))(x), jax.jit(jax.vmap(ScalarFunction(f)))(x)
+    one = jax.jit(ScalarFunction(f))(x[1])
     for name in ODD:
         want, got = np.asarray(expected[name]), np.asarray(found[name])
         np.testing.assert_array_equal(got, want, err_msg=name)
@@ -132,7 +132,7 @@ def test_no_number_and_signed_zeros_as_by_xla(dtype, kernels):
 
 @pytest.mark.usefixtures("native")
 def test_a_member_does_not_depend_on_its_place():
-    f = fused(lambda x, a: jnp.sin(a * x) / (1.0 + x * x))
+    f = ScalarFunction(lambda x, a: jnp.sin(a * x) / (1.0 + x * x))
     x = jnp.linspace(-1.0, 1.0, LARGEST)
     together = jax.jit(jax.vmap(f, (0, None)))(x, 0.3)
     for n in (9, 16):
@@ -144,7 +144,7 @@ def test_batches_of_batches():
     def plain(a, b, x):
         return jnp.stack([jnp.sin(a) * x[0], b * x[1] + a, a / b])
 
-    f = fused(plain)
+    f = ScalarFunction(plain)
     a, b = jnp.arange(1.0, 4.0), jnp.arange(1.0, 6.0)
     x = jnp.asarray(np.random.default_rng(1).normal(size=(3, 5, 2)))
     for axes in (((0, None, 0), (None, 0, 0)), ((None, 0, 1), (0, None, 0))):  # outer, inner
@@ -156,7 +156,7 @@ def test_batches_of_batches():
 
 
 @pytest.mark.usefixtures("native")
-@fused
+@ScalarFunction
 def spring(parameters, x):
     m, k, rest, signs = parameters
     return -k / m * (x - rest) * signs
@@ -184,7 +184,7 @@ def test_numbers_that_stay_are_one_argument_of_a_kernel():
 
 def test_what_cannot_be_written_is_left_to_xla():
     whole = lambda x: x.astype(jnp.int32).astype(x.dtype)  # noqa: E731
-    f = fused(lambda x: whole(x) + jnp.sin(x))
+    f = ScalarFunction(lambda x: whole(x) + jnp.sin(x))
     fuse._told.clear()
     with pytest.raises(native_kernels.NotScalarError, match="convert_element_type of float64"):
         native_kernels.Scalars(jax.make_jaxpr(whole)(jnp.array(1.0)))
@@ -229,10 +229,10 @@ def test_a_derivative_costs_a_few_values(bicycle):
     """Operations of the graphs; all directions of a derivative are lanes of one kernel, which share what they can."""
     leaves, treedef = jax.tree.flatten(bicycle)
     plain = _motion_rates.__wrapped__
-    program = _Program(jax.make_jaxpr(lambda *x: plain(*jax.tree.unflatten(treedef, x)))(*leaves))
+    program = Program(jax.make_jaxpr(lambda *x: plain(*jax.tree.unflatten(treedef, x)))(*leaves))
     work = lambda scalars: sum(n.operation not in ("input", "constant") for n in scalars.graph.nodes)  # noqa: E731
-    value = work(program.scalars())
-    tangent = program.tangent((True,) * len(leaves)).scalars()
+    value = work(program.scalars)
+    tangent = program.tangent((True,) * len(leaves)).scalars
     assert value < 1950
     assert work(tangent) < 5 * value
 
@@ -242,7 +242,7 @@ def test_kernels_are_kept_beside_the_cache_of_jax(tmp_path):
     was = jax.config.jax_compilation_cache_dir
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
     try:
-        f = fused(lambda x: jnp.sin(x) * 1.2345678)
+        f = ScalarFunction(lambda x: jnp.sin(x) * 1.2345678)
         np.testing.assert_allclose(jax.jit(f)(0.5), np.sin(0.5) * 1.2345678)
         kept = list((tmp_path / "jaxkane").glob("jaxkane_*.o"))
         assert len(kept) == 2  # the kernel, and the function that XLA calls

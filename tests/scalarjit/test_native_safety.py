@@ -18,7 +18,7 @@ from jaxkane._scalarjit.backends import ffi as handler
 from jaxkane._scalarjit.backends import native, probe
 from jaxkane._scalarjit.backends import native as available
 from jaxkane._scalarjit.backends.compiler import Machine
-from jaxkane._scalarjit.function import fused
+from jaxkane._scalarjit.function import ScalarFunction
 
 pytestmark = pytest.mark.usefixtures("native")
 
@@ -222,7 +222,7 @@ def unproven(tmp_path, monkeypatch):
 @pytest.mark.parametrize(("place", "number", "how"), [("list_items", 24, "signal"), ("list_size", 48, "another way")])
 def test_a_moved_structure_leaves_the_work_to_xla(place, number, how, unproven, monkeypatch):
     monkeypatch.setattr(handler, "LAYOUT", handler.LAYOUT._replace(**{place: number}))
-    f = fused(lambda x: jnp.sin(x) * number)
+    f = ScalarFunction(lambda x: jnp.sin(x) * number)
     with pytest.warns(UserWarning, match=f"no native kernels, XLA does their work: a first kernel.*{how}") as told:
         found = jax.jit(f)(0.5), *jax.jit(jax.vmap(f))(jnp.ones(3))
     np.testing.assert_allclose(found, np.sin([0.5, 1.0, 1.0, 1.0]) * number)
@@ -243,7 +243,7 @@ def test_a_handler_that_finds_a_moved_structure_makes_an_error(monkeypatch):
     assert native.is_on()
     monkeypatch.setattr(handler, "LAYOUT", handler.LAYOUT._replace(frame_size=4096))
     with pytest.raises(jax.errors.JaxRuntimeError, match=r"calls native kernels in another way .*native=False"):
-        jax.block_until_ready(jax.jit(fused(lambda x: jnp.cos(x) * 1.25))(0.5))
+        jax.block_until_ready(jax.jit(ScalarFunction(lambda x: jnp.cos(x) * 1.25))(0.5))
 
 
 def test_the_probe_is_not_run_again_nor_where_kernels_are_off(unproven, monkeypatch):
@@ -279,7 +279,7 @@ class Text:
 
 def test_an_error_of_llvm_leaves_the_work_to_xla(monkeypatch):
     monkeypatch.setattr(available, "_told", set())
-    f = fused(lambda x: jnp.sin(x) * 1.75)
+    f = ScalarFunction(lambda x: jnp.sin(x) * 1.75)
     with monkeypatch.context() as broken:
         broken.setattr(native, "Writer", Text)
         with pytest.warns(UserWarning, match="XLA does their work: LLVM fails at A function") as told:
@@ -293,4 +293,4 @@ def test_a_function_that_is_missing_leaves_the_work_to_xla(monkeypatch):
     """LLVM would end the process."""
     monkeypatch.setattr(Machine, "has", lambda self, function: function != "fmod")
     with pytest.warns(UserWarning, match=r"uses fmod \(not in the mathematical library here\)"):
-        np.testing.assert_allclose(jax.jit(fused(lambda x: jax.lax.rem(x, 0.7)))(2.0), 2.0 % 0.7)
+        np.testing.assert_allclose(jax.jit(ScalarFunction(lambda x: jax.lax.rem(x, 0.7)))(2.0), 2.0 % 0.7)

@@ -8,13 +8,12 @@ import pytest
 
 import jaxkane as jk
 from jaxkane._kane.assembly import newton, newton_in_numbers
-from jaxkane._scalarjit.backends.numpy import derivative_in_numbers, in_numbers, is_in_numbers
-from jaxkane._scalarjit.function import fused
+from jaxkane._scalarjit.function import ScalarFunction
 
 ARGUMENTS = ({"a": jnp.array(0.7)}, np.array(-1.2), np.array([0.3, 0.9, -0.4]))
 
 
-@fused
+@ScalarFunction
 def functions(given, b, x):
     a, (y, z, w) = given["a"], x
     waves = jnp.sin(a) + jnp.cos(b) * jnp.tan(y) - jnp.arctan2(z, b) + jnp.arcsin(y) * jnp.arccos(y) / jnp.arctan(b)
@@ -29,12 +28,12 @@ def functions(given, b, x):
     }
 
 
-@fused
+@ScalarFunction
 def error_function(x):
     return jax.scipy.special.erf(x)
 
 
-@fused
+@ScalarFunction
 def by_a_library(b, x):
     return jnp.linalg.det(jnp.diag(x)) * b
 
@@ -48,42 +47,40 @@ def the_same(found, right, **tolerance):
 
 
 def test_values_are_those_of_jax():
-    assert is_in_numbers(functions, *ARGUMENTS)
-    the_same(
-        in_numbers(functions, *ARGUMENTS), functions.__wrapped__(*jax.tree.map(jnp.asarray, ARGUMENTS)), rtol=1e-14
-    )
+    assert functions.is_numpy(*ARGUMENTS)
+    the_same(functions.numpy(*ARGUMENTS), functions.__wrapped__(*jax.tree.map(jnp.asarray, ARGUMENTS)), rtol=1e-14)
 
-    the_same(in_numbers(error_function, np.array(0.3)), np.array(0.3286267594591274), rtol=1e-15)  # math.erf
+    the_same(error_function.numpy(np.array(0.3)), np.array(0.3286267594591274), rtol=1e-15)  # math.erf
 
 
 def test_what_is_no_number_is_so_in_numpy_too_and_nothing_is_said(recwarn):
     arguments = ({"a": np.array(-1.0)}, np.array(0.0), np.array([2.0, -1.0, np.nan]))
     right = jax.jit(functions.__wrapped__)(*arguments)
-    the_same(in_numbers(functions, *arguments), right, rtol=1e-14, equal_nan=True)
+    the_same(functions.numpy(*arguments), right, rtol=1e-14, equal_nan=True)
     assert not recwarn
 
 
 def test_derivatives_along_several_directions_are_those_of_jax():
     directions = np.array([[1.0, 0.0], [0.5, 2.0], [0.0, -1.0]])  # (x,d)
     along_b = np.array([0.3, 0.0])
-    found = derivative_in_numbers(functions, ARGUMENTS, (None, along_b, directions))
+    found = functions.numpy_jvp(ARGUMENTS, (None, along_b, directions))
     f = lambda b, x: functions.__wrapped__(ARGUMENTS[0], b, x)  # noqa: E731
     slope = lambda b, x: jax.jvp(f, tuple(map(jnp.asarray, ARGUMENTS[1:])), (b, x))[1]  # noqa: E731
     the_same(found, jax.jit(jax.vmap(slope, in_axes=-1, out_axes=-1))(along_b, directions), rtol=1e-13, atol=1e-15)
-    assert derivative_in_numbers(functions, ARGUMENTS, (None, None, np.zeros((3, 0))))["both"].shape == (3, 0)
+    assert functions.numpy_jvp(ARGUMENTS, (None, None, np.zeros((3, 0))))["both"].shape == (3, 0)
 
 
 def test_what_is_no_program_of_scalars_is_left_to_jax():
     b, x = np.array(2.0), np.array([0.5, 3.0])
     with pytest.warns(UserWarning, match="its description uses"):
-        assert not is_in_numbers(by_a_library, b, x)
-    assert in_numbers(by_a_library, b, x) == pytest.approx(3.0, rel=1e-15)
-    np.testing.assert_allclose(derivative_in_numbers(by_a_library, (b, x), (None, np.eye(2))), [6.0, 1.0], rtol=1e-15)
+        assert not by_a_library.is_numpy(b, x)
+    assert by_a_library.numpy(b, x) == pytest.approx(3.0, rel=1e-15)
+    np.testing.assert_allclose(by_a_library.numpy_jvp((b, x), (None, np.eye(2))), [6.0, 1.0], rtol=1e-15)
 
 
 def test_single_precision_stays_single():
     arguments = jax.tree.map(lambda x: np.asarray(x, np.float32), ARGUMENTS)
-    found = in_numbers(functions, *arguments)
+    found = functions.numpy(*arguments)
     the_same(found, jax.jit(functions.__wrapped__)(*arguments), rtol=1e-5)
     assert found["both"].dtype == np.float32
 

@@ -23,9 +23,8 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._common.lru_cache import MOST_REMEMBERED, LRUCache
-from jaxkane._scalarjit.cache_key import version_of
-from jaxkane._scalarjit.function import fused
+from jaxkane._scalarjit.cache_key import Cache, version_of
+from jaxkane._scalarjit.function import ScalarFunction
 from jaxkane.fit._linearize import cost
 
 RTOL = 1e-12
@@ -562,7 +561,7 @@ def test_what_came_back_is_not_traced_again(monkeypatch):
 def test_values_that_come_back_find_their_program_again():
     seen = []
 
-    @fused
+    @ScalarFunction
     def program(x, f):
         seen.append(f())
         return x * f()
@@ -670,14 +669,14 @@ def test_threads_agree():
     assert len(set(found)) == 1
 
 
-def test_threads_share_a_memory_that_is_full():
-    memory, failed = LRUCache(), []
+def test_threads_share_a_cache_that_is_full():
+    cache, failed = Cache(1000), []
 
     def fill(start):
         try:
             for i in range(3000):
-                memory[start + i] = i
-                memory.get(start)
+                cache.keep(start + i, i)
+                cache.known(start)
         except RuntimeError as error:  # a dict that another thread is changing
             failed.append(error)
 
@@ -688,7 +687,7 @@ def test_threads_share_a_memory_that_is_full():
     [t.join() for t in threads]
     sys.setswitchinterval(before)
     assert not failed
-    assert len(memory) == MOST_REMEMBERED
+    assert len(cache) == 1000
 
 
 def test_a_look_walks_through_nothing(monkeypatch):
@@ -704,4 +703,4 @@ def test_every_compiled_function_of_the_library_follows():
     wrong = r"^@(eqx\.filter_jit|jax\.jit)\s+def (\w+)"
     found = {m[2] for path in source.rglob("*.py") for m in re.finditer(wrong, path.read_text(), re.MULTILINE)}
     of_numbers = {"_eliminate", "_solved_by_lapack", "_det_by_lapack"}
-    assert found <= of_numbers, f"compile {found} with `_reads.compiled`, or show that they read no description"
+    assert found <= of_numbers, f"compile {found} with `cache_key.jit`, or show that they read no description"

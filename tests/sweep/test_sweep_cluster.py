@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._common.files import digest
 from jaxkane._kane.checks import check_system
 from jaxkane._kane.constraints import configuration_residual
+from jaxkane._scalarjit.digest import digest
 
 distributed = pytest.importorskip("distributed")
 

@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._common.files import atomic_write, digest
+from jaxkane._common.files import atomic_write
+from jaxkane._scalarjit.digest import digest
 from jaxkane.sweep._chunks import digest_of
 from jaxkane.sweep._files import Folder
 
@@ -121,7 +122,7 @@ def test_numbers_in_the_closure_of_a_callback_belong_to_the_sweep(tmp_path):
 def test_a_digest_outlives_the_process_and_tells_programs_apart():
     code = """
 import jax, jax.numpy as jnp, numpy as np, dataclasses, jaxkane as jk
-from jaxkane._common.digest import digest
+from jaxkane._scalarjit.digest import digest
 jax.config.update("jax_enable_x64", True)
 
 class Bead(jk.System):  # on a ring, pushed

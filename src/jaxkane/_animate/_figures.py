@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from .._integrate.trajectory import Trajectory, reached_times
 from .._scalarjit.cache_key import version_of
 from .._scalarjit.captured_values import CapturedValues
-from .._scalarjit.function import fused
+from .._scalarjit.function import ScalarFunction
 from .._scalarjit.linear import stack
 from .._system.bodies import Body, Force, flatten_loads
 from .._system.kinematics import Frame, Point, Vector
@@ -215,7 +215,7 @@ def _along(numbers, rest, drawing, version, t, q, u):
     return jax.lax.map(lambda now: _instant(system, drawing, *now), (t, q, u))
 
 
-@fused
+@ScalarFunction
 def _instant(system: System, drawing: _Drawing | None, t, q, u) -> Any:
     figure = None if drawing is None else drawing.figure()
     motion = system.motion(t, q, u)

@@ -14,9 +14,9 @@ from .._kane.constraints import configuration_residual, relative_condition
 from .._kane.kane import accelerations_and_mass_matrix
 from .._kane.reactions import Reactions
 from .._kane.rhs import rates
-from .._scalarjit.cache_key import compiled
+from .._scalarjit.cache_key import jit
 from .._scalarjit.components import ZERO3, Triple, add3, cross, dot, matvec
-from .._scalarjit.function import fused
+from .._scalarjit.function import ScalarFunction
 from .._scalarjit.linear import as_vector, stack
 from .._system.bodies import Force
 from .._system.kinematics import Point, Vector
@@ -27,7 +27,7 @@ from .trajectory import Trajectory, reached_times
 ORDERS = (8, 6)  # points under the polynomials whose integrals are the work, and its estimated error
 
 
-@compiled
+@jit
 def measured_along(system, t, q, u, inputs):
     def measured(t, q, u, inputs):
         u_dot, M = accelerations_and_mass_matrix(system, t, q, u, inputs)
@@ -36,7 +36,7 @@ def measured_along(system, t, q, u, inputs):
     return jax.vmap(measured)(t, q, u, inputs)
 
 
-@fused
+@ScalarFunction
 def _measured(system, t, q, u, inputs, u_dot):
     now = Reactions(system, t, q, u, inputs, u_dot)
     motion, places = now.description, _Places()
@@ -58,7 +58,7 @@ def _measured(system, t, q, u, inputs, u_dot):
     }
 
 
-@compiled
+@jit
 def powers_along(system, t, q, u, values, input_rates):
     """Powers of the loads and of prescribed motions (n_t, l + 1), and their time derivatives along the motion, whose
     inputs have these rates by name."""

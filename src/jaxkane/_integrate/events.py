@@ -15,8 +15,9 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._kane.kane import KaneEquations
+from .._scalarjit.compat import depends_on
 from .._scalarjit.components import Component
-from .._scalarjit.function import fused
+from .._scalarjit.function import ScalarFunction
 from .._scalarjit.linear import as_vector, determinant
 from .._system.system import State, System, unpacked
 from .trajectory import Status, reason
@@ -124,16 +125,7 @@ def events_of(system: System, t: Array, state: State) -> Events:
 
     program, found = jax.make_jaxpr(named, return_shape=True)(t, state.q, u_all)
     directions = tuple(e.direction if isinstance(e, Crossing) else 0 for e in found.values())
-    return Events(tuple(found), directions, _is_read(program.jaxpr, program.jaxpr.invars[-1]))
-
-
-def _is_read(program: Any, variable: Any) -> bool:
-    """Whether the results of a program depend on a variable at all."""
-    needed = {id(v) for v in program.outvars}
-    for equation in reversed(program.eqns):
-        if any(id(v) in needed for v in equation.outvars):
-            needed |= {id(v) for v in equation.invars}
-    return id(variable) in needed
+    return Events(tuple(found), directions, any(depends_on(program, [2])))
 
 
 def _events(system: System, t: Component, q: Any, u_all: Any, dtype: Any) -> dict[str, Any]:
@@ -168,7 +160,7 @@ class Watched(NamedTuple):
     determinant: Array
 
 
-@fused
+@ScalarFunction
 def watched(system: System, t: Component, y: Array, y_dot: Array | None) -> Watched:
     """What may end a motion, of a packed state. `y_dot`: None where no event reads speeds."""
     state, like = unpacked(system, y), y
@@ -353,14 +345,14 @@ class _Decision(NamedTuple):
     state: EventState
 
 
-@fused
+@ScalarFunction
 def _begun(limits: Limits, start: Quantities) -> Quantities:
     # What would have vanished within a rounding error of the start is on zero there.
     on_zero = jnp.abs(start.values) <= jnp.abs(start.rates) * limits.rounding
     return start._replace(values=jnp.where(on_zero, jnp.zeros_like(start.values), start.values))
 
 
-@fused
+@ScalarFunction
 def _decision(limits: Limits, state: EventState, now: Quantities | None, step: Step) -> _Decision:
     # One function of scalars: as a hundred operations it would be as many programs, and half of XLA's work.
     # What is left of a step that was taken back is gone at once: a fixed step stays on its grid.

@@ -9,12 +9,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from .._common.lookup import refuse_unknown
 from .._kane.arguments import is_numeric
-from .._scalarjit.compat import ClosedJaxpr, Jaxpr, Literal, bound
+from .._scalarjit.compat import Tracer, evaluated, interpret, operation_of, programs_in, types_of
 from .._scalarjit.components import Component, Inputs
 from .._system.system import explain_value_of_traced
 
@@ -233,7 +232,7 @@ def _called_samples(
     arrays = lambda x: [each for each in jax.tree.leaves(x) if eqx.is_array(each)]  # noqa: E731
     program = jax.make_jaxpr(lambda t, y: arrays(_asked(label, f, t, state_of(t, y))))(t, y)
     calls: list[_Call] = []
-    _follow(program.jaxpr, [*program.consts, _Shifted(jnp.zeros_like(t)), _MOVING], calls)
+    _follow(program, [_Shifted(jnp.zeros_like(t)), _MOVING], calls)
     times: list[tuple[Array, str]] = []
     for ts, offset, kind in calls:
         if fixed and kind == "held":
@@ -274,42 +273,34 @@ class _Call(NamedTuple):
 def _follow(program: Any, inputs: list[Any], calls: list[_Call]) -> list[Any]:
     """What a traced program makes of its inputs, each a number that is known, `_Shifted` or `_MOVING`; the samples that
     it calls are added to `calls`."""
-    values = dict(zip([*program.constvars, *program.invars], inputs, strict=True))
-    for equation in program.eqns:
-        xs = [x.val if isinstance(x, Literal) else values[x] for x in equation.invars]
-        operation, name = equation.primitive.name, str(equation.params.get("name", ""))
+
+    def results(equation: Any, xs: list[Any]) -> Any:
+        operation = operation_of(equation)
         is_known = [x is not _MOVING and not isinstance(x, _Shifted) for x in xs]
-        ys: Any = [_MOVING] * len(equation.outvars)
-        if all(is_known) and not equation.effects:
-            ys = bound(equation, xs)
-            ys = ys if equation.primitive.multiple_results else [ys]
-        elif name.startswith(_NAMED):
+        ys: Any = [_MOVING] * operation.results
+        if all(is_known) and operation.is_pure:
+            return evaluated(equation, xs)
+        if operation.function.startswith(_NAMED):
             offset = xs[1].offset if isinstance(xs[1], _Shifted) and is_known[0] else None
-            calls.append(_Call(xs[0], offset, name.removeprefix(_NAMED)))
-        elif operation in _SHIFTS and is_known.count(False) == 1 and isinstance(xs[is_known.index(False)], _Shifted):
-            if operation != "sub" or not is_known[0]:
-                ys = [_Shifted(bound(equation, [x.offset if isinstance(x, _Shifted) else x for x in xs]))]
-        else:
-            for inner in _programs_in(equation.params):
-                n = len(inner.jaxpr.invars)
-                passed = xs[1:] if operation == "cond" else xs
-                if operation in ("scan", "while") or len(passed) != n:
-                    passed = [_MOVING] * n
-                results = _follow(inner.jaxpr, [*inner.consts, *passed], calls)
-                ys = results if operation != "cond" and len(results) == len(ys) else ys
-        values |= zip(equation.outvars, ys, strict=True)
-    return [x.val if isinstance(x, Literal) else values[x] for x in program.outvars]
+            calls.append(_Call(xs[0], offset, operation.function.removeprefix(_NAMED)))
+            return ys
+        if operation.name in _SHIFTS and is_known.count(False) == 1 and isinstance(xs[is_known.index(False)], _Shifted):
+            if operation.name == "sub" and is_known[0]:
+                return ys
+            return [_Shifted(*evaluated(equation, [x.offset if isinstance(x, _Shifted) else x for x in xs]))]
+        for inner in programs_in(equation):
+            n = len(types_of(inner)[0])
+            passed = xs[1:] if operation.name == "cond" else xs
+            if operation.name in ("scan", "while") or len(passed) != n:
+                passed = [_MOVING] * n
+            outputs = _follow(inner, passed, calls)
+            ys = outputs if operation.name != "cond" and len(outputs) == len(ys) else ys
+        return ys
+
+    return interpret(program, inputs, results)
 
 
 _SHIFTS = ("add", "sub", "convert_element_type", "broadcast_in_dim", "reshape", "squeeze", "copy")
-
-
-def _programs_in(params: Mapping[str, Any]) -> list[Any]:
-    """The programs that an equation of a traced program runs."""
-    values = [x for value in params.values() for x in (value if isinstance(value, (tuple, list)) else [value])]
-    return [
-        x if isinstance(x, ClosedJaxpr) else ClosedJaxpr(x, ()) for x in values if isinstance(x, (ClosedJaxpr, Jaxpr))
-    ]
 
 
 def for_fixed_steps(signals: Any) -> Any:

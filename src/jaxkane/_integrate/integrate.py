@@ -17,9 +17,9 @@ from .._kane.arguments import checked_inputs
 from .._kane.constraints import configuration_is_met, correction, has_configuration_constraints, projected
 from .._kane.kane import KaneEquations
 from .._kane.rhs import outputs_at, rates_are_native, values_of, vector_field
-from .._scalarjit.cache_key import captured, compiled, reads_any
+from .._scalarjit.cache_key import captured_tracers, captures_any, jit
 from .._scalarjit.components import Component
-from .._scalarjit.function import fused
+from .._scalarjit.function import ScalarFunction
 from .._scalarjit.linear import as_vector
 from .._scalarjit.nan import all_finite, derivative_free_where_not_finite, flat, nan_derivative_where, nan_where
 from .._system.parameters import ANY, ParameterInfo, parameters_in
@@ -62,7 +62,7 @@ def is_valid(system: System, state: State, t: Array, signals: Any, rises: Array 
     return _is_sound(*eqx.combine(jax.lax.stop_gradient(numbers), static), others)
 
 
-@fused
+@ScalarFunction
 def _is_sound(system: System, state: State, t: Array, others: Array) -> Array:
     """Whether a motion can begin there, one answer from all the numbers; `others`: from those that are too many."""
     facts = [others, configuration_is_met(system, t, state.q)]
@@ -105,7 +105,7 @@ class _Limits(eqx.Module):
     these: tuple[ParameterInfo, ...] = eqx.field(static=True)
 
 
-@fused
+@ScalarFunction
 def _sound_scalars(limits: _Limits, values: list[Array]) -> list[Array]:
     return [_sound_or_one(x, info) for x, info in zip(values, limits.these, strict=True)]
 
@@ -114,7 +114,7 @@ def _sound_or_one(x: Array, info: ParameterInfo) -> Array:
     return jnp.where(info.allows(x), x, jnp.ones_like(x))
 
 
-@fused
+@ScalarFunction
 def _safe_scalars(valid: Array, values: list[Array]) -> list[Array]:
     return [jnp.where(valid, x, jnp.ones_like(x)) for x in values]
 
@@ -169,7 +169,7 @@ class _Found(NamedTuple):
     stats: dict[str, Array]
 
 
-@compiled
+@jit
 def solve(
     system: System,
     state: State,
@@ -229,13 +229,13 @@ def _calling_samples(system: System) -> dict[str, Callable[..., Any]]:
     def rates(t: Array, now: Now) -> Array:
         return vector_field(system, t, packed(State(now.q, now.u, now.x)), {})
 
-    return {type(system).__name__: rates} if samples_of(system) or reads_any(Samples, system) else {}
+    return {type(system).__name__: rates} if samples_of(system) or captures_any(Samples, system) else {}
 
 
 def refuse_captured(system: System) -> None:
     """**Raises:** `TypeError` where a description reads a number of a trace that is under way from outside: the rules
     by which events, constraints and steps are differentiated know what they are given alone."""
-    if captured(system):
+    if captured_tracers(system):
         raise TypeError(
             f"{type(system).__name__}: its description reads, by a closure or a global, a number that is being traced "
             "(by jax.grad, jax.jvp, jax.jit or jax.vmap). Make it a parameter of the system, or an input."
@@ -389,7 +389,7 @@ def inputs_at(system: System, signals: Any, t: Component, state: State, all_of_t
     return {name: jnp.asarray(values.get(name, 0.0), dtype=state.q.dtype) for name in names}
 
 
-@fused
+@ScalarFunction
 def _dependent_speeds_of(system: System, t: Array, y: Array) -> Array:
     state = unpacked(system, y)
     return as_vector(KaneEquations(system, t, state.q, state.u).u_dep, y)

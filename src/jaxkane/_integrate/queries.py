@@ -16,8 +16,8 @@ from .._kane.equations import InputValues, _dependent_accelerations, checked_arr
 from .._kane.kane import KaneEquations, motion_rates
 from .._kane.reactions import forces_now, multipliers_now
 from .._kane.rhs import outputs_at, rates
-from .._scalarjit.cache_key import compiled
-from .._scalarjit.function import fused
+from .._scalarjit.cache_key import jit
+from .._scalarjit.function import ScalarFunction
 from .._scalarjit.linear import as_vector
 from .._scalarjit.nan import nan_where
 from .._system.kinematics import Frame, Point
@@ -173,41 +173,41 @@ def _frames(now: KaneEquations) -> dict[str, Frame]:
     return {body.name: body.frame for body in motion.bodies} | motion.frames
 
 
-@fused
+@ScalarFunction
 def _positions(system, t, q, u, inputs):
     points = _points(KaneEquations(system, t, q, u, inputs))
     found = {name: point.position for name, point in points.items() if point.has_position}
     return {name: as_vector(r.components_in(r.frame.root), q) for name, r in found.items()}
 
 
-@fused
+@ScalarFunction
 def _velocities(system, t, q, u, inputs):
     found = {name: point.velocity for name, point in _points(KaneEquations(system, t, q, u, inputs)).items()}
     return {name: as_vector(v.components_in(v.frame.root), q) for name, v in found.items()}
 
 
-@fused
+@ScalarFunction
 def _orientations(system, t, q, u, inputs):
     frames = _frames(KaneEquations(system, t, q, u, inputs))
     return {name: frame.matrix(frame.root).astype(q.dtype) for name, frame in frames.items()}
 
 
-_compiled_positions = compiled(_positions)
-_compiled_velocities = compiled(_velocities)
-_compiled_orientations = compiled(_orientations)
+_compiled_positions = jit(_positions)
+_compiled_velocities = jit(_velocities)
+_compiled_orientations = jit(_orientations)
 
 
-_compiled_outputs = compiled(outputs_at)
+_compiled_outputs = jit(outputs_at)
 
 
-@compiled
+@jit
 def _compiled_state_rates(system, t, q, u, inputs):
     at_zero = dict.fromkeys(system.states, jnp.zeros((), q.dtype))  # those that are left out
     x_dot = rates(system, t, q, u, at_zero | inputs).x
     return {} if x_dot is None else dict(zip(system.states, x_dot, strict=True))
 
 
-@compiled
+@jit
 def _compiled_speed_rates(system, t, q, u, inputs):
     u_dot = motion_rates(system, t, q, u, inputs)[1]
     u_dep_dot = _dependent_accelerations(system, t, q, u, inputs, u_dot)

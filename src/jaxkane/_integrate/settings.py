@@ -12,12 +12,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array
 
 from .._kane.arguments import by_names, check_is_system, refuse_incomplete
 from .._scalarjit.compat import (
-    FUSES,
+    MISSING,
+    Tracer,
     as_lowering,
     is_moved_forward,
     is_moved_forward_below,
@@ -238,7 +238,7 @@ def for_reverse_mode(values: Any) -> Any:
     """
     if any(map(is_moved_forward_below, jax.tree.leaves(values))):
         _refuse()
-    if FUSES:
+    if MISSING:
         return values
     return jax.tree.map(lambda x: _guarded(x) if eqx.is_inexact_array(x) else x, values)
 
@@ -273,7 +273,7 @@ def _batch(values: Any, dims: Any) -> Any:
 
 
 # Linear in the first of its arguments, the tangent; the second is the point.
-_reverse_only: Any = None if FUSES else new_primitive(
+_reverse_only: Any = None if MISSING else new_primitive(
     "reverse_mode_only",
     evaluate=_refuse,
     shapes=lambda x_dot, x: [x_dot],

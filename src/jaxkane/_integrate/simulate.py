@@ -7,15 +7,14 @@ from typing import Any, Literal
 
 import diffrax
 import numpy as np
-from jax.core import Tracer
 
 from .._kane.arguments import is_concrete
 from .._kane.checks import check_system, with_possible_bodies
 from .._kane.constraints import check_state
 from .._kane.equations import diagnosis
 from .._kane.rhs import values_of
-from .._scalarjit.cache_key import captured
-from .._scalarjit.compat import nothing_is_traced
+from .._scalarjit.cache_key import captured_tracers
+from .._scalarjit.compat import Tracer, nothing_is_traced
 from .._scalarjit.components import Inputs
 from .._system.system import State, System
 from .inputs import as_signals, with_one_times
@@ -90,7 +89,7 @@ def simulate(
         progress=progress,
         rising=not isinstance(ts, Tracer),
     )
-    given = (system, state, ts, with_one_times(signals)), captured(signals)
+    given = (system, state, ts, with_one_times(signals)), captured_tracers(signals)
     settings, (parts, closures) = in_its_mode(settings, adjoint, given)
     name_of_adjoint = type(settings.adjoint).__name__
     if nothing_is_traced() and isinstance(settings.adjoint, ADJOINTS["reverse"]):

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._scalarjit.function import fused
+from .._scalarjit.function import ScalarFunction
 from .._system.system import System
 from .events import AdaptiveToStops, EventController, Events, Limits, Quantities, watched
 from .inputs import Kinks
@@ -75,7 +75,7 @@ class _Tolerance(eqx.Module):
     order: float = eqx.field(static=True)
 
 
-@fused
+@ScalarFunction
 def _adapted(tolerance: _Tolerance, t0: Array, t1: Array, y0: Array, y1: Array, y_error: Array):
     rtol, atol, shortest = tolerance.numbers
     # A step that leaves the domain of the equations is measured by its start.
@@ -177,7 +177,7 @@ def times_of(ts: Array, settings: Settings) -> Times:
     return _of_three(jnp.stack([ts[0], ts[1], ts[-1]]), rtol, atol)
 
 
-@fused
+@ScalarFunction
 def _of_three(ts: Array, rtol: Array, atol: Array) -> Times:
     """Of the first, the second and the last time."""
     eps, whole = jnp.finfo(ts.dtype).eps, jax.lax.stop_gradient(ts[2] - ts[0])

@@ -7,11 +7,11 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 from .._common.lookup import by_name
 from .._kane.arguments import check_is_system
+from .._scalarjit.compat import Tracer
 from .._system.system import State, System, names_of
 
 

@@ -8,10 +8,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array
 
 from .._common.lookup import not_there, refuse_unknown
+from .._scalarjit.compat import Tracer
 from .._scalarjit.components import Component, component
 from .._system.system import System
 

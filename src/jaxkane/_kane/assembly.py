@@ -11,9 +11,7 @@ import numpy as np
 import optimistix as optx
 
 from .._common.lookup import as_names, refuse_unknown
-from .._common.lru_cache import LRUCache
-from .._scalarjit.backends.numpy import derivative_in_numbers, in_numbers, is_in_numbers
-from .._scalarjit.cache_key import compiled
+from .._scalarjit.cache_key import Cache, jit
 from .._scalarjit.compat import concretely
 from .._scalarjit.components import Component
 from .._scalarjit.nan import nan_where
@@ -62,25 +60,25 @@ def found_of(system: System, named: Iterable[str]) -> tuple[tuple[str, ...], dic
     return plan.moved, plan.guess
 
 
-_EULER_PARAMETERS = LRUCache()  # places of Euler parameters by structure
+_EULER_PARAMETERS = Cache()  # places of Euler parameters by structure
 
 
 def euler_parameters(system: System) -> list[tuple[int, ...]]:
     """Places of every four coordinates, one after the other, of which a constraint says that their norm is one."""
-    structure = structure_of(system)
-    found = _EULER_PARAMETERS.get(structure)
-    if found is None:
-        rng = np.random.default_rng(0)
-        probe = rng.uniform(0.2, 0.9, len(system.coordinates)).astype(jnp.result_type(float))
-        with concretely():
-            trial = at_random_point((system, np.zeros((), probe.dtype), probe), rng)
-            values = np.abs(in_numbers(configuration_residual, *trial))
-        found = _EULER_PARAMETERS[structure] = [
-            (i, i + 1, i + 2, i + 3)
-            for i, square in enumerate(np.convolve(probe**2, np.ones(4), "valid") if len(probe) > 3 else ())
-            if any(np.any(np.abs(values - abs(x)) < 1e-5) for x in (square - 1.0, square**0.5 - 1.0))
-        ]
-    return found
+    return _EULER_PARAMETERS.get(structure_of(system), lambda: _search_euler_parameters(system))
+
+
+def _search_euler_parameters(system: System) -> list[tuple[int, ...]]:
+    rng = np.random.default_rng(0)
+    probe = rng.uniform(0.2, 0.9, len(system.coordinates)).astype(jnp.result_type(float))
+    with concretely():
+        trial = at_random_point((system, np.zeros((), probe.dtype), probe), rng)
+        values = np.abs(configuration_residual.numpy(*trial))
+    return [
+        (i, i + 1, i + 2, i + 3)
+        for i, square in enumerate(np.convolve(probe**2, np.ones(4), "valid") if len(probe) > 3 else ())
+        if any(np.any(np.abs(values - abs(x)) < 1e-5) for x in (square - 1.0, square**0.5 - 1.0))
+    ]
 
 
 def _met(residuals):
@@ -109,7 +107,7 @@ class Found(NamedTuple):
     steps: Any
 
 
-@compiled
+@jit
 def newton(system: System, q0, t, where: tuple[int, ...], lenient: bool) -> Found:
     places, origin = np.array(where, int), (system, q0, t)
     # What is not finite must not enter the linear solver, which would raise for all members of a batch.
@@ -185,9 +183,9 @@ def newton_in_numbers(system: System, q0, t, where: tuple[int, ...], lenient: bo
     along[places, np.arange(len(places))] = 1.0
 
     def slopes(q):
-        return derivative_in_numbers(configuration_residual, (system, t, q), (None, None, along))
+        return configuration_residual.numpy_jvp((system, t, q), (None, None, along))
 
-    h = in_numbers(configuration_residual, system, t, q0)
+    h = configuration_residual.numpy(system, t, q0)
     beside, already_met = _of_slopes(np, h, _svd(slopes(q0)), slopes(_elsewhere(q0)))
     start, already_met = q0 + along @ beside.astype(q0.dtype), already_met & lenient
     n_h = len(already_met)
@@ -196,7 +194,7 @@ def newton_in_numbers(system: System, q0, t, where: tuple[int, ...], lenient: bo
     def at(amount):
         """The coordinates, the residuals, and how what Newton's method sees of them changes with the amount."""
         q = start + along @ (amount @ directions)
-        h = in_numbers(configuration_residual, system, t, q)
+        h = configuration_residual.numpy(system, t, q)
         derivatives = np.where(already_met[:, None], np.eye(n_h, dtype=q0.dtype), slopes(q) @ directions.T)
         return q, h, derivatives
 
@@ -300,7 +298,7 @@ def _solve_configuration(system: System, q0, t, plan: Plan):
         )
     places = tuple(system.coordinates.index(c) for c in plan.moved)
     concrete = is_concrete(system, q0, t)
-    in_python = concrete and is_in_numbers(configuration_residual, system, t, q0)
+    in_python = concrete and configuration_residual.is_numpy(system, t, q0)
     found = (newton_in_numbers if in_python else newton)(system, q0, t, places, plan.lenient)
     if concrete and not bool(found.good):
         raise NoConfiguration(_why_not(system, q0, plan, found))

@@ -12,13 +12,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
-from .._common.lru_cache import LRUCache
-from .._scalarjit.backends.numpy import derivative_in_numbers, in_numbers
-from .._scalarjit.compat import concretely
+from .._scalarjit.cache_key import Cache
+from .._scalarjit.compat import Tracer, concretely
 from .._scalarjit.components import Component, is_exact
-from .._scalarjit.function import fused
+from .._scalarjit.function import ScalarFunction
 from .._scalarjit.linear import as_vector, stack
 from .._system.bodies import Force, Load
 from .._system.kinematics import Frame, Point
@@ -62,7 +60,7 @@ def _value(x: Any) -> Any:
 # -- bodies
 
 
-@fused
+@ScalarFunction
 def _masses_and_inertias(system: System, t: Any, q: Any):
     u = (0.0,) * (len(system.speeds) + len(system.dependent_speeds))
     bodies = DescriptionEvaluator(system).read("bodies", t, tuple(q[i] for i in range(len(system.coordinates))), u)
@@ -76,7 +74,7 @@ def check_bodies(system: System, t: Any, q: Any) -> None:
     rounding, by up to 5 % for measured and warned about, beyond that refused, unless the class has
     `check_inertia = False`. A moment about one axis alone, (0, 0, J), is a rotor's: the other two are elsewhere.
     """
-    for i, (mass, I) in enumerate(in_numbers(_masses_and_inertias, system, t, q)):
+    for i, (mass, I) in enumerate(_masses_and_inertias.numpy(system, t, q)):
         mass, I = float(mass), np.asarray(I, dtype=float)  # [kg], (3,3) [kg m^2]
         fault = _fault(mass, I) or (_excess_in_words(I) if system.check_inertia else "")
         if fault:
@@ -167,7 +165,7 @@ Quantities = dict[tuple[Any, ...], Any]  # (number, kind, names ...) -> numbers;
 Quantity = tuple[tuple[str, ...], list[tuple[Component, ...]]]
 
 
-@fused
+@ScalarFunction
 def consistency_quantities(system: System, t: Any, q: Any, u: Any, inputs: Any) -> Quantities:
     evaluator = DescriptionEvaluator(system, inputs)
     q, u, like = tuple(q[i] for i in range(len(q))), tuple(u[i] for i in range(len(u))), q
@@ -249,7 +247,7 @@ def _has_consistent_velocity(point: Point) -> bool:
     return all(is_exact(x) and x == 0.0 for x in known)  # the origin
 
 
-_CHECKED = LRUCache()  # structures
+_CHECKED = Cache()  # structures
 _SIZES = (-1.0, 1e-2, -20.0, 1e3, -1e3)  # multiples of test speeds of order 1
 
 
@@ -268,15 +266,14 @@ def check_description(system: System, t: Any, q: Any) -> None:
     if q is not None and not isinstance(q, Tracer) and not np.all(np.isfinite(q)):
         return
     structure = structure_of(system)
-    if structure not in _CHECKED:
+    if not _CHECKED.known(structure, False):
         rng = np.random.default_rng(0)
-        if _Consistency(*at_random_point((system, t, q), rng), rng=rng).check():
-            _CHECKED[structure] = None
+        _CHECKED.keep(structure, _Consistency(*at_random_point((system, t, q), rng), rng=rng).check())
     if q is not None and is_concrete(system, t, q):
         _check_numbers(system, t, q)
 
 
-@fused
+@ScalarFunction
 def _rotations_and_residuals(system: System, t: Any, q: Any, u: Any) -> tuple[Any, Any, Any]:
     """Orientations of frames in their parents (f, 3, 3); of bodies that turn in their frames, how, and their inertia
     (b, 4, 3); and the velocity residuals (k,)."""
@@ -290,7 +287,7 @@ def _rotations_and_residuals(system: System, t: Any, q: Any, u: Any) -> tuple[An
 def _check_numbers(system: System, t: Any, q: Any) -> None:
     """Refuse what depends on the numbers: frames that no rotation turns, and bodies that turn in their frames about an
     axis about which they are not symmetric."""
-    read = lambda u: in_numbers(_rotations_and_residuals, system, t, q, u.astype(q.dtype))  # noqa: E731
+    read = lambda u: _rotations_and_residuals.numpy(system, t, q, u.astype(q.dtype))  # noqa: E731
     u = np.linspace(0.7, 1.3, len(system.speeds) + len(system.dependent_speeds))
     orientations, spins, _ = read(u)
     wrong = [i for i, R in enumerate(orientations) if _rotation_error(R) > ROTATION_ERROR]  # NaN is another check's
@@ -366,14 +363,14 @@ class _Consistency:
         return self._check_motion(beside.astype(self.q.dtype)) or judged
 
     def _read(self, q: np.ndarray, u: np.ndarray) -> Quantities:
-        return in_numbers(consistency_quantities, self.system, self.t, q, u.astype(q.dtype), self.inputs)
+        return consistency_quantities.numpy(self.system, self.t, q, u.astype(q.dtype), self.inputs)
 
     def _rates(self, q: np.ndarray, u: np.ndarray, quantities: Quantities) -> Quantities:
         """How all quantities change along the motion [1/s]."""
         q_dot = np.concatenate([x.ravel() for x in _of_kind(quantities, "rate").values()])
         at = self.system, self.t, q, u.astype(q.dtype), self.inputs
         along = None, np.ones((1,), q.dtype), q_dot[:, None], None, None
-        return jax.tree.map(lambda x: x[..., 0], derivative_in_numbers(consistency_quantities, at, along))
+        return jax.tree.map(lambda x: x[..., 0], consistency_quantities.numpy_jvp(at, along))
 
     def _random_speeds(self) -> np.ndarray:
         n = len(self.speeds)
@@ -431,7 +428,7 @@ class _Consistency:
 
     def _on_constraints(self, q: np.ndarray) -> np.ndarray:
         """The nearest coordinates that meet the configuration constraints; NaN where there are none nearby."""
-        residual = lambda q: in_numbers(configuration_residual, self.system, self.t, q).astype(float)  # noqa: E731
+        residual = lambda q: configuration_residual.numpy(self.system, self.t, q).astype(float)  # noqa: E731
         h, step = residual(q), self.tolerance
         for _ in range(20):
             if not h.size or np.max(np.abs(h)) <= 0.1 * self.tolerance:

@@ -14,9 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._scalarjit.backends.numpy import in_numbers
 from .._scalarjit.components import Component
-from .._scalarjit.function import fused
+from .._scalarjit.function import ScalarFunction
 from .._scalarjit.linear import as_vector, solve, stack
 from .._scalarjit.nan import nan_where
 from .._system.motion import flatten_residuals
@@ -29,13 +28,13 @@ SINGULAR_ROUNDING = 1e-12
 """The reciprocal of the largest condition number with which residuals are solved for dependent speeds."""
 
 
-@fused
+@ScalarFunction
 def configuration_residual(system: System, t: Any, q: Any):
     """Residuals (h,) of the configuration constraints."""
     return as_vector(DescriptionEvaluator(system).configuration(t, tuple(q[i] for i in range(len(q)))), q)
 
 
-@fused
+@ScalarFunction
 def _implied_residual(system: System, t: Any, q: Any):
     residuals = system.implied_constraints(t, tuple(q[i] for i in range(len(q))))
     return as_vector(flatten_residuals(residuals, f"{type(system).__name__}: the residuals of implied_constraints"), q)
@@ -50,7 +49,7 @@ def implied_residual(system: System, t: Any, q: Any) -> Any:
 
 def _residual_of(f: Callable[..., Any], system: System, t: Any, q: Any) -> Any:
     """Of numbers by NumPy, so that nothing is compiled."""
-    return in_numbers(f, system, t, q) if is_concrete(system, t, q) else f(system, t, q)
+    return f.numpy(system, t, q) if is_concrete(system, t, q) else f(system, t, q)
 
 
 def configuration_tolerance(dtype: Any) -> float:
@@ -70,7 +69,7 @@ def check_state(system: System, t: Any, q: Any) -> None:
     """Refuse coordinates that violate a configuration constraint, with the residual."""
     if not is_concrete(system, t, q) or configuration_is_met(system, t, q):
         return
-    name, residual = type(system).__name__, in_numbers(configuration_residual, system, t, q)
+    name, residual = type(system).__name__, configuration_residual.numpy(system, t, q)
     if not np.max(np.abs(residual), initial=0.0) <= configuration_tolerance(q.dtype):
         adjust = ", ".join(system.dependent_coordinates) or "the coordinates"
         raise ValueError(
@@ -205,7 +204,7 @@ def best_dependent_speeds(system: System, t: Component, q: Any) -> DependentSpee
     return dependent_speeds_from(C, c0, (*system.speeds, *system.dependent_speeds), system.dependent_speeds, name)
 
 
-@fused
+@ScalarFunction
 def constraint_rows(system: System, t: Component, q: Array) -> tuple[Array, Array]:
     """C (k, n + k) and c0 (k,) of the velocity residuals."""
     now = KaneEquations(system, t, q, jnp.zeros(len(system.speeds), q.dtype))

@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._scalarjit.cache_key import compiled
+from .._scalarjit.cache_key import jit
 from .._scalarjit.components import Component, matvec, sub
-from .._scalarjit.function import fused
+from .._scalarjit.function import ScalarFunction
 from .._scalarjit.linear import as_vector, rounding_of_pivots, stack
 from .._system.bodies import Force
 from .._system.motion import kinetic_energy_of
@@ -112,7 +112,7 @@ def partial_velocities(
     return _partial_velocities(*checked_arrays(system, t, q, u, inputs))
 
 
-@fused
+@ScalarFunction
 def _partial_velocities(system, t, q, u, inputs):
     kane = KaneEquations(system, t, q, u, inputs)
     motion, partials = kane.motion(kane.t, kane.q, kane.u_all), kane.partials()
@@ -131,7 +131,7 @@ def generalized_active_forces(
     return _generalized_active_forces(*checked_arrays(system, t, q, u, inputs))
 
 
-@fused
+@ScalarFunction
 def _generalized_active_forces(system, t, q, u, inputs):
     kane = KaneEquations(system, t, q, u, inputs)
     return as_vector(kane.active_forces(kane.partials()), q)
@@ -151,7 +151,7 @@ def generalized_inertia_forces(
     return _generalized_inertia_forces(*arrays, u_dot)
 
 
-@fused
+@ScalarFunction
 def _generalized_inertia_forces(system, t, q, u, inputs, u_dot):
     kane = KaneEquations(system, t, q, u, inputs)
     partials = kane.partials()
@@ -167,7 +167,7 @@ def coordinate_rates(system: System, t: Component, q: Any, u: Any) -> Float[Arra
     return _coordinate_rates(*checked_arrays(system, t, q, u))
 
 
-@fused
+@ScalarFunction
 def _coordinate_rates(system, t, q, u, inputs):
     return as_vector(KaneEquations(system, t, q, u).q_dot, q)
 
@@ -177,7 +177,7 @@ def dependent_speeds(system: System, t: Component, q: Any, u: Any) -> Float[Arra
     return _dependent_speeds(*checked_arrays(system, t, q, u))
 
 
-@fused
+@ScalarFunction
 def _dependent_speeds(system, t, q, u, inputs):
     return as_vector(KaneEquations(system, t, q, u).u_dep, q)
 
@@ -190,7 +190,7 @@ def dependent_accelerations(
     return finite_or_explained(_dependent_accelerations(*arrays, motion_rates(*arrays)[1]), arrays)
 
 
-@fused
+@ScalarFunction
 def _dependent_accelerations(system, t, q, u, inputs, u_dot):
     kane = KaneEquations(system, t, q, u, inputs)
     return as_vector(kane.dependent_accelerations(as_row(u_dot, system.speeds, "u_dot")), q)
@@ -201,7 +201,7 @@ def constraint_jacobian(system: System, t: Component, q: Any) -> Float[Array, "k
     return _constraint_jacobian(*checked_arrays(system, t, q, (0.0,) * len(system.speeds)))
 
 
-@fused
+@ScalarFunction
 def _constraint_jacobian(system, t, q, u, inputs):
     return stack(KaneEquations(system, t, q, u).J).astype(q.dtype).T
 
@@ -216,7 +216,7 @@ def constraint_jacobian_rate(system: System, t: Component, q: Any, u: Any) -> Fl
     return _constraint_jacobian_rate(*checked_arrays(system, t, q, u))
 
 
-@fused
+@ScalarFunction
 def _constraint_jacobian_rate(system, t, q, u, inputs):
     kane = KaneEquations(system, t, q, u)
     still = (0.0,) * kane.n
@@ -229,7 +229,7 @@ def kinetic_energy(system: System, t: Component, q: Any, u: Any) -> Float[Array,
     return _kinetic_energy(*checked_arrays(system, t, q, u))
 
 
-@fused
+@ScalarFunction
 def _kinetic_energy(system, t, q, u, inputs):
     kane = KaneEquations(system, t, q, u)
     return as_vector([kinetic_energy_of(kane.motion(kane.t, kane.q, kane.u_all))], q)[0]
@@ -237,7 +237,7 @@ def _kinetic_energy(system, t, q, u, inputs):
 
 # -- why the equations have no solution
 
-_equations = compiled(rates_and_equations)
+_equations = jit(rates_and_equations)
 
 
 def diagnosis(system: System, t: Any, q: Any, u: Any, inputs: Any = None) -> str:

@@ -12,11 +12,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
 from .._scalarjit.cache_key import version_of
+from .._scalarjit.compat import Tracer
 from .._scalarjit.components import Component, is_exact, is_zero, matvec, scale3
-from .._scalarjit.function import recorded
+from .._scalarjit.function import ScalarFunction
 from .._scalarjit.linear import Rows
 from .._system.bodies import Body, Load, flatten_loads
 from .._system.kinematics import Frame
@@ -97,7 +97,7 @@ class DescriptionEvaluator:
 
     def read(self, part: str, t: Component, q: Row, u: Row) -> Any:
         """One of the parts of `EvaluatedDescription`."""
-        return _parts(part, self.system, (dict(self.inputs), t, tuple(q), tuple(u)), self._memory)
+        return _parts.replay(part, self.system, (dict(self.inputs), t, tuple(q), tuple(u)), self._memory)
 
     def motion(self, t: Component, q: Row, u: Row) -> Motion:
         motion = self.system.motion(t, q, u)
@@ -210,7 +210,7 @@ def frames_of(motion: Motion, loads: Iterable[Load] = ()) -> list[Frame]:
     return list(seen)
 
 
-@recorded
+@ScalarFunction
 def _parts(system: System, components: Any) -> dict[str, Any]:
     inputs, t, q, u = components
     said = EvaluatedDescription(DescriptionEvaluator(system, inputs), t, q, u)

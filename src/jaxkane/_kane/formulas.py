@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .._scalarjit.compat import FUSES, ClosedJaxpr, jaxpr_as_fun
+from .._scalarjit.compat import MISSING, ClosedJaxpr, jaxpr_as_fun
 from .._scalarjit.graph import Graph, NotScalarError, unrolled
 from .._scalarjit.jaxpr import cse, jacobian
 from .._scalarjit.linear import as_vector, is_written_out
@@ -118,8 +118,8 @@ class Formulas:
             )
         if not is_concrete(system):
             raise TypeError(f"{self.name} is being traced: write its equations outside of jax.jit, vmap and grad.")
-        if FUSES is not None:
-            raise ImportError(f"{self.name} cannot be written as formulas: {FUSES}.")
+        if MISSING is not None:
+            raise ImportError(f"{self.name} cannot be written as formulas: {MISSING}.")
         check_system(system, 0.0, None)
         paths, self.structure = jax.tree_util.tree_flatten_with_path(system)
         self.leaves = [leaf for _, leaf in paths]
@@ -187,7 +187,7 @@ class Formulas:
             return {"jacobian": np.concatenate([*blocks.values()])}
         program = self.program(function)
         try:
-            found = unrolled(program.jaxpr, program.consts, self.inputs, self.graph)
+            found = unrolled(program, self.inputs, self.graph)
         except NotScalarError as error:
             raise ValueError(self._refusal(function, error)) from None
         return dict(zip(FUNCTIONS[function].outputs, found, strict=True))

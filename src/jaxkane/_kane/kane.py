@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._scalarjit.components import Component, add, add3, component, cross, dot, is_exact, matvec, mul, scale3, total
-from .._scalarjit.function import fused
+from .._scalarjit.function import ScalarFunction
 from .._scalarjit.linear import Rows, as_vector, is_written_out, solve, solve_positive, solve_positive_array, stack
 from .._system.bodies import Load
 from .._system.motion import Motion
@@ -230,32 +230,32 @@ def accelerations_and_mass_matrix(
     return solve_positive_array(M, f), M
 
 
-@fused
+@ScalarFunction
 def _motion_rates(system, t, q, u, inputs):
     now = KaneEquations(system, t, q, u, inputs)
     return as_vector(now.q_dot, q), as_vector(now.accelerations(), q)
 
 
-@fused
+@ScalarFunction
 def _equations_written_out(system, t, q, u, inputs):
     now = KaneEquations(system, t, q, u, inputs)
     M, f = now.equations()
     return as_vector(now.q_dot, q), stack(M).astype(q.dtype), as_vector(f, q)
 
 
-@fused
+@ScalarFunction
 def _accelerations_and_mass_matrix(system, t, q, u, inputs):
     M, f = KaneEquations(system, t, q, u, inputs).equations()
     return as_vector(solve_positive(M, f), q), stack(M).astype(q.dtype)
 
 
-@fused
+@ScalarFunction
 def _rates_and_forcing(system, t, q, u, inputs):
     now = KaneEquations(system, t, q, u, inputs)
     return as_vector(now.q_dot, q), as_vector(now.forcing(), q)
 
 
-@fused
+@ScalarFunction
 def _mass_times(system, t, q, u, inputs, direction):
     now = KaneEquations(system, t, q, u, inputs)
     return as_vector(now.mass_times(as_row(direction, system.speeds, "direction")), q)

@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 
-from .._scalarjit.cache_key import compiled
+from .._scalarjit.cache_key import jit
 from .._scalarjit.components import Component, Triple, add, dot, mul
-from .._scalarjit.function import fused
+from .._scalarjit.function import ScalarFunction
 from .._scalarjit.linear import as_vector, solve
 from .._system.kinematics import Frame, Point, auxiliary_speed
 from .._system.motion import Motion
@@ -29,25 +29,25 @@ from .evaluate import EvaluatedDescription, unit
 from .kane import KaneEquations, motion_rates
 
 
-@compiled
+@jit
 def multipliers_now(system, t, q, u, inputs):
     """Of the residuals (k,), at the accelerations of the motion."""
     return _multipliers(system, t, q, u, inputs, motion_rates(system, t, q, u, inputs)[1])
 
 
-@compiled
+@jit
 def forces_now(system, t, q, u, inputs):
     """By name, numbers and components in N (3,), at the accelerations of the motion."""
     return _forces(system, t, q, u, inputs, motion_rates(system, t, q, u, inputs)[1])
 
 
-@fused
+@ScalarFunction
 def _multipliers(system, t, q, u, inputs, u_dot):
     multipliers = Reactions(system, t, q, u, inputs, u_dot).multipliers
     return as_vector(multipliers, q)
 
 
-@fused
+@ScalarFunction
 def _forces(system, t, q, u, inputs, u_dot):
     kane = Reactions(system, t, q, u, inputs, u_dot)
     vectors = {name: as_vector(row, q) for name, row in kane.forces_of_parts()}

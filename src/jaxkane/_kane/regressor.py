@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._common.lookup import as_names, refuse_unknown
-from .._common.lru_cache import LRUCache
-from .._scalarjit.compat import Literal, concretely
+from .._scalarjit.cache_key import Cache
+from .._scalarjit.compat import concretely, depends_on
 from .._scalarjit.components import ZERO3, Component, add, add3, dot, is_zero, mul, sub, total
-from .._scalarjit.function import fused, recorded
+from .._scalarjit.function import ScalarFunction
 from .._scalarjit.linear import as_vector, stack
 from .._system.bodies import UNNAMED, Body, Force
 from .._system.kinematics import Point, Vector
@@ -86,7 +86,7 @@ def _is_fixed_in(point: Point, body: Body) -> bool:
     return still and turns  # where a body spins in its frame, only points of the axis are fixed in both
 
 
-_PARTS = LRUCache()  # by structure
+_PARTS = Cache()  # by structure
 
 
 def described(system: System, bodies: Bodies) -> Described:
@@ -95,10 +95,7 @@ def described(system: System, bodies: Bodies) -> Described:
     **Raises:** `ValueError` for a name that is no body's, or no parameter's that it can have, and for a body that spins
     in its frame about no axis of it.
     """
-    structure = structure_of(system)
-    if structure not in _PARTS:
-        _PARTS[structure] = _read_parts(system)
-    parts, leaves = _PARTS[structure]
+    parts, leaves = _PARTS.get(structure_of(system), lambda: _read_parts(system))
     given = bodies
     if bodies is not None:
         bodies = as_names(bodies)
@@ -147,7 +144,7 @@ def _read_parts(system: System) -> tuple[tuple[Part, ...], tuple[int, ...]]:
     number = jax.ShapeDtypeStruct((), dtype_of(system))
     n_u = len(system.speeds) + len(system.dependent_speeds)
     rows = [[number] * n for n in (len(system.coordinates), n_u)]
-    program = jax.make_jaxpr(lambda *args: read(*args)[0])(leaves, number, *rows).jaxpr
+    program = jax.make_jaxpr(lambda *args: read(*args)[0])(leaves, number, *rows)
     (motion,) = motions
     bodies = [(i, body) for i, body in enumerate(motion.bodies) if not is_zero(body.mass)]
     own = [body.angular_velocity is not body.frame.angular_velocity and not body.is_particle for _, body in bodies]
@@ -155,7 +152,7 @@ def _read_parts(system: System) -> tuple[tuple[Part, ...], tuple[int, ...]]:
     if any(own):
         spins = _at_trial_numbers(lambda *args: read(*args)[1], system, n_u)
         axes = [_axis(spin) if has else None for has, spin in zip(own, spins, strict=True)]
-    reads = np.array([_reach(program, v) for v in program.invars[: len(leaves)]], bool).reshape(len(leaves), -1)
+    reads = np.array([depends_on(program, [i]) for i in range(len(leaves))], bool).reshape(len(leaves), -1)
     numbered = [not any(column) for column in reads.T]
     found = _parts(motion, list(zip([i for i, _ in bodies], axes, numbered, strict=True)))
     return found, tuple(int(i) for i in np.flatnonzero(reads.any(axis=1)))
@@ -176,15 +173,6 @@ def _axis(spin: np.ndarray) -> int | None:
     """The axis of its frame about which an axisymmetric body spins there; None where it turns with its frame."""
     turning = np.flatnonzero(np.abs(spin) > np.finfo(spin.dtype).eps ** 0.5 * max(1.0, float(np.abs(spin).max())))
     return None if not turning.size else int(turning[0]) if turning.size == 1 else SKEW
-
-
-def _reach(program: Any, variable: Any) -> list[bool]:
-    """Which results of a program may depend on one of its arguments."""
-    reached = {variable}
-    for equation in program.eqns:
-        if any(not isinstance(v, Literal) and v in reached for v in equation.invars):
-            reached.update(equation.outvars)
-    return [not isinstance(v, Literal) and v in reached for v in program.outvars]
 
 
 def _parts(motion: Motion, bodies: Sequence[tuple[int, int | None, bool]]) -> tuple[Part, ...]:
@@ -237,7 +225,7 @@ class _SaidOfPoints(EvaluatedDescription):
         return [(a.angular_velocity.components, b.angular_velocity.components) for a, b in frames]
 
 
-@recorded
+@ScalarFunction
 def _said(described: Described, components: Any) -> dict[str, Any]:
     inputs, t, q, u = components
     said = _SaidOfPoints(DescriptionEvaluator(described.system, inputs), described.parts, t, q, u)
@@ -252,7 +240,7 @@ class _Points(KaneEquations):
         super().__init__(described.system, t, q, u, inputs)
 
     def read(self, part: str, t: Component, q: Row, u: Row) -> Any:
-        return _said(part, self.described, (dict(self.inputs), t, tuple(q), tuple(u)), self._memory)
+        return _said.replay(part, self.described, (dict(self.inputs), t, tuple(q), tuple(u)), self._memory)
 
     def weights(self) -> list[tuple[Component, Row]]:
         """How each body's mass changes with the parameters that it reads, and how the forces at its centre do.
@@ -295,7 +283,7 @@ def _at_center(body: Body, loads: Sequence[Any]) -> Row:
     return total
 
 
-@fused
+@ScalarFunction
 def carried(described: Described, t, q, u, inputs, u_dot) -> Carried:
     """`Carried` of the bodies of a system, at accelerations `u_dot` (n,) of the independent speeds."""
     now = _Points(described, t, q, u, inputs)
@@ -354,7 +342,7 @@ def columns_of(now: Carried, parts: Sequence[Part]) -> Float[Array, "n p"]:
     return jnp.concatenate([jnp.zeros((now.V.shape[2], 0), Y.dtype), *rows], axis=1)
 
 
-@fused
+@ScalarFunction
 def values_of(described: Described, t, q, u) -> Float[Array, " p"]:
     """The parameters of the bodies, in the order of the columns; they are the same at all times, `u` (n + k,)."""
     rows = [tuple(x[i] for i in range(x.shape[0])) for x in (q, u)]
@@ -379,7 +367,7 @@ def _times(x: Float[Array, "b 3"]) -> Float[Array, "b 3 6"]:
     return jnp.stack(rows, axis=1).reshape(-1, 3, 6)
 
 
-@fused
+@ScalarFunction
 def unbalanced(system: System, t, q, u, inputs, u_dot) -> Float[Array, " n"]:
     """-(F_r + F*_r) (n,) at accelerations `u_dot`: zero in the motion."""
     now = KaneEquations(system, t, q, u, inputs)

@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 from .._common.lookup import not_there, refuse_unknown
 from .._scalarjit.components import Component, add3, component, cross, is_exact
-from .._scalarjit.function import fused, is_native
+from .._scalarjit.function import ScalarFunction
 from .._scalarjit.linear import as_vector, is_written_out
 from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Motion
@@ -177,7 +177,7 @@ def outputs_at(system: System, t: Array, q: Array, u: Array, inputs: Mapping[str
     return _outputs_now(system, t, q, u, inputs, motion_rates(system, t, q, u, inputs)[1])
 
 
-@fused
+@ScalarFunction
 def _outputs_now(system, t, q, u, inputs, u_dot):
     now = KaneEquations(system, t, q, u, inputs)
     found = read_at(now, as_row(u_dot, system.speeds, "u_dot"), _outputs)
@@ -236,7 +236,7 @@ def vector_field(system: System, t: Array, y: Array, inputs: Mapping[str, Any]) 
 
 def rates_are_native(system: System, t: Array, y: Array, inputs: Mapping[str, Any]) -> bool:
     """Whether `vector_field` of these is one native kernel."""
-    return is_written_out(len(system.speeds)) and is_native(_vector_field, system, t, y, dict(inputs))
+    return is_written_out(len(system.speeds)) and _vector_field.is_native(system, t, y, dict(inputs))
 
 
 def values_of(system: System, x: Array | None, inputs: Mapping[str, Any]) -> dict[str, Any]:
@@ -244,7 +244,7 @@ def values_of(system: System, x: Array | None, inputs: Mapping[str, Any]) -> dic
     return {**inputs, **{name: x[..., i] for i, name in enumerate(system.states)}} if x is not None else dict(inputs)
 
 
-@fused
+@ScalarFunction
 def _vector_field(system, t, y, inputs):
     state = unpacked(system, y)
     now = KaneEquations(system, t, state.q, state.u, values_of(system, state.x, inputs))
@@ -253,7 +253,7 @@ def _vector_field(system, t, y, inputs):
     return as_vector((*now.q_dot, *u_dot, *x_dot), y)
 
 
-@fused
+@ScalarFunction
 def first_order_rates(system, t, q, u, inputs, u_dot):
     """x_dot (n_x,) at the accelerations u_dot (n,)."""
     now = KaneEquations(system, t, q, u, inputs)

@@ -1,13 +1,5 @@
-"""What the code of functions, classes and objects reads, and whether it has changed. Knows Python; knows no mechanics.
-
-A program keeps the numbers that its code read when it was traced: globals, attributes of modules, classes and objects,
-closures, defaults, and the code of the functions that it calls. They are part of every key under which a program is
-kept (`fuse.fused`, `versions.compiled`), by a digest that is formed once. After that, a look at every place where
-something was found costs some microseconds.
-
-It does not see what is read from the environment or a file, through objects of libraries, C extensions, `getattr` with
-a name that is put together, or arrays above a megabyte that are changed in place: for these there is `forget`.
-"""
+"""The values that the code of functions, classes and objects reads, and whether they have changed. `cache_key` says
+what is noticed. Their digest is formed once; after that, a look at every place costs some microseconds."""
 
 from __future__ import annotations
 
@@ -32,7 +24,8 @@ from operator import is_
 from typing import Any, NamedTuple
 
 import numpy as np
-from jax.core import Tracer
+
+from .compat import Tracer
 
 _LARGEST_ARRAY = 1 << 20  # [bytes] compared number by number
 _MOST_PLACES = 20_000  # beyond these what a place holds is told by its identity
@@ -95,7 +88,7 @@ class CapturedValues:
         walk.value(root)
         walk.into_modules()
         self.version = walk.sha.digest()
-        self.kept = walk.seen  # an identity means nothing once its object is gone
+        self.seen = walk.seen  # an identity means nothing once its object is gone
 
     def unchanged(self) -> bool:
         """Whether every place still holds what was found there."""

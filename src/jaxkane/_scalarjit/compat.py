@@ -4,7 +4,7 @@ Each has a way back, so that where a release takes it away, results stay right a
 
 | what | without it |
 |---|---|
-| jaxprs and primitives (`jax.extend`, `jax.interpreters`) | `FUSES` says why; right-hand sides are plain JAX |
+| jaxprs and primitives (`jax.extend`, `jax.interpreters`) | `MISSING` says why; right-hand sides are plain JAX |
 | the frontend attribute that makes one function of a program | XLA cuts the program as it does any other |
 | tracers of a derivative in forward mode | such a derivative must be announced by `adjoint="forward"` |
 | the state of traces | motions are compiled for derivatives that nobody can take, a tenth slower at first |
@@ -12,6 +12,7 @@ Each has a way back, so that where a release takes it away, results stay right a
 | `eval_context` | a sweep on a cluster may be refused, since programs that were first traced in a check differ |
 | `process_allgather` | none: a fit by several processes raises ImportError |
 
+Jaxprs are read in this room alone: equation by equation by `interpret`, and by `jaxpr`, `graph` and `digest`.
 `tests/scalarjit/test_compat.py` names what has gone.
 """
 
@@ -20,25 +21,88 @@ from __future__ import annotations
 import contextlib
 import copy
 import importlib
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NamedTuple
 
 import jax
-from jax.core import Tracer
+from jax.core import Tracer as Tracer
 
-FUSES: str | None = None  # why programs cannot be fused, or None
+MISSING: str | None = None  # what this JAX lacks, without which there are no scalar programs
 try:
-    from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal, Primitive, jaxpr_as_fun
+    from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Primitive, jaxpr_as_fun
     from jax.interpreters import ad, batching, mlir
     from jax.interpreters.ad import instantiate_zeros, is_undefined_primal
     from jax.interpreters.partial_eval import dce_jaxpr
 
-    _ = Jaxpr.replace, JaxprEqn.replace
+    _ = Jaxpr.replace, Jaxpr.eqns, Jaxpr.invars, Jaxpr.constvars, Jaxpr.outvars
+    _ = JaxprEqn.replace, JaxprEqn.primitive, JaxprEqn.params, JaxprEqn.invars, JaxprEqn.outvars, JaxprEqn.effects
+    _ = ClosedJaxpr.jaxpr, ClosedJaxpr.consts, ClosedJaxpr.in_avals, ClosedJaxpr.out_avals, Primitive.get_bind_params
 except (ImportError, AttributeError) as error:
-    FUSES = f"this JAX lacks what that needs ({error})"
+    MISSING = f"this JAX lacks what that needs ({error})"
     missing: Any = None
-    ClosedJaxpr = Jaxpr = Literal = Primitive = missing
+    ClosedJaxpr = Jaxpr = Primitive = missing
     jaxpr_as_fun = dce_jaxpr = instantiate_zeros = is_undefined_primal = ad = batching = mlir = missing
+
+
+def is_literal(v: Any) -> bool:
+    """Whether a variable of a jaxpr is a number, `v.val`."""
+    return hasattr(v, "val")
+
+
+def interpret(
+    program: Any,
+    inputs: Sequence[Any],
+    rule: Callable[[Any, list[Any]], Iterable[Any]],
+    constant: Callable[[Any, Any], Any] = lambda v, x: x,
+) -> list[Any]:
+    """The outputs of a program whose equations have the results `rule(equation, inputs)`. `constant(v, x)` stands for
+    an array x that it holds, of the variable v, and for a number that is written in it, of the literal v."""
+    jaxpr = program.jaxpr
+    values = dict(zip(jaxpr.invars, inputs, strict=True))
+    values.update(zip(jaxpr.constvars, map(constant, jaxpr.constvars, program.consts), strict=True))
+    read = lambda v: constant(v, v.val) if is_literal(v) else values[v]  # noqa: E731
+    for equation in jaxpr.eqns:
+        values.update(zip(equation.outvars, rule(equation, [*map(read, equation.invars)]), strict=True))
+    return [*map(read, jaxpr.outvars)]
+
+
+class Operation(NamedTuple):
+    """What an equation does: the name of its primitive, that of the function it calls, the number of its results, and
+    whether it does nothing besides."""
+
+    name: str
+    function: str
+    results: int
+    is_pure: bool
+
+
+def operation_of(equation: Any) -> Operation:
+    name = str(equation.params.get("name", ""))
+    return Operation(equation.primitive.name, name, len(equation.outvars), not equation.effects)
+
+
+def evaluated(equation: Any, inputs: Sequence[Any]) -> Sequence[Any]:
+    """The results of an equation at other inputs; with its own rules for derivatives, where it has some."""
+    primitive = equation.primitive
+    results = primitive.bind(*inputs, **primitive.get_bind_params(equation.params))
+    return results if primitive.multiple_results else [results]
+
+
+def programs_in(equation: Any) -> list[ClosedJaxpr]:
+    """The programs that an equation runs."""
+    values = [x for p in equation.params.values() for x in (p if isinstance(p, (tuple, list)) else [p])]
+    programs = [x for x in values if isinstance(x, (ClosedJaxpr, Jaxpr))]
+    return [x if isinstance(x, ClosedJaxpr) else ClosedJaxpr(x, ()) for x in programs]
+
+
+def depends_on(program: Any, inputs: Iterable[int]) -> list[bool]:
+    """Which outputs of a program follow from any of the inputs at these places."""
+    jaxpr = program.jaxpr
+    moved = {jaxpr.invars[i] for i in inputs}
+    for equation in jaxpr.eqns:
+        if any(not is_literal(v) and v in moved for v in equation.invars):
+            moved.update(equation.outvars)
+    return [not is_literal(v) and v in moved for v in jaxpr.outvars]
 
 
 def types_of(program: Any) -> tuple[list[Any], list[Any]]:
@@ -69,12 +133,6 @@ def new_primitive(
     mlir.register_lowering(primitive, mlir.lower_fun(traced, multiple_results=True))
     mlir.register_lowering(primitive, lower_on_cpu, platform="cpu")
     return primitive
-
-
-def bound(equation: Any, inputs: list[Any]) -> Any:
-    """What an equation of a jaxpr does, to other inputs; with its own rules for derivatives, where it has some."""
-    primitive = equation.primitive
-    return primitive.bind(*inputs, **primitive.get_bind_params(equation.params))
 
 
 def new_variable(like: Any) -> Any:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jax.lax import RoundingMethod
 
-from .compat import ClosedJaxpr, Jaxpr, Literal, types_of
+from .compat import ClosedJaxpr, interpret, types_of
 
 OPERATORS: dict[str, Callable[..., Any]] = {
     "add": operator.add,
@@ -139,20 +139,13 @@ def graph_of(program: ClosedJaxpr) -> tuple[Graph, list[np.ndarray]]:
     for i, aval in enumerate(types_of(program)[0]):
         elements = [graph.add("input", (i, e, aval.size), str(aval.dtype)) for e in range(aval.size)]
         inputs.append(np.array(elements, np.int64).reshape(aval.shape))
-    return graph, unrolled(program.jaxpr, program.consts, inputs, graph)
+    return graph, unrolled(program, inputs, graph)
 
 
-def unrolled(program: Jaxpr, consts: Sequence[Any], inputs: Sequence[np.ndarray], graph: Graph) -> list[np.ndarray]:
+def unrolled(program: ClosedJaxpr, inputs: Sequence[np.ndarray], graph: Graph) -> list[np.ndarray]:
     """The program's outputs as arrays of node numbers."""
-
-    constants = functools.partial(as_constants, graph=graph)
-    values: dict[Any, np.ndarray] = {}
-    values.update(zip(program.constvars, map(constants, consts), strict=True))
-    values.update(zip(program.invars, inputs, strict=True))
-    for equation in program.eqns:
-        xs = [constants(v.val) if isinstance(v, Literal) else values[v] for v in equation.invars]
-        values.update(zip(equation.outvars, applied(equation, xs, graph), strict=True))
-    return [constants(v.val) if isinstance(v, Literal) else values[v] for v in program.outvars]
+    rule = functools.partial(applied, graph=graph)
+    return interpret(program, inputs, rule, lambda v, x: as_constants(x, graph))
 
 
 def as_constants(x: Any, graph: Graph) -> np.ndarray:
@@ -167,7 +160,7 @@ def applied(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.ndarra
     """The outputs of an equation whose inputs are these nodes."""
     if equation.primitive.name in _OPENED:
         inner = equation.params[_OPENED[equation.primitive.name]]
-        return unrolled(inner.jaxpr, inner.consts, xs, graph)
+        return unrolled(inner, xs, graph)
     avals: list[Any] = [v.aval for v in equation.outvars]
     found = zip(_operation(equation, xs, graph), avals, strict=True)
     return [x if x.shape == aval.shape else np.broadcast_to(x, aval.shape) for x, aval in found]

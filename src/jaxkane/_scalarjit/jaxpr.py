@@ -1,18 +1,18 @@
-"""Products of small matrices as sums of products of numbers, as in a small neural network. Knows arrays only."""
+"""Programs of JAX rewritten: common subexpressions once, small products as sums, derivatives as programs again."""
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .compat import ClosedJaxpr, Jaxpr, Literal, dce_jaxpr, jaxpr_as_fun, new_variable, one_function, types_of
+from .compat import ClosedJaxpr, Jaxpr, dce_jaxpr, interpret, is_literal, jaxpr_as_fun, new_variable, types_of
 from .graph import CALLS, Graph, applied, as_constants
 
 _LONGEST, _LARGEST = 64, 4096  # sum, number of products
@@ -66,7 +66,7 @@ def cse(program: ClosedJaxpr) -> ClosedJaxpr:
     after JAX has differentiated every copy.
     """
     once = _Once()
-    outputs = once.walk(program.jaxpr, program.consts, program.jaxpr.invars)
+    outputs = once.walk(program, program.jaxpr.invars)
     jaxpr = program.jaxpr.replace(constvars=[*once.consts], eqns=once.equations, outvars=outputs)
     jaxpr, _ = dce_jaxpr(jaxpr, [True] * len(outputs), instantiate=True)
     return ClosedJaxpr(jaxpr, [*once.consts.values()])
@@ -81,27 +81,23 @@ class _Once:
         self.consts: dict[Any, Any] = {}  # by their variables
         self._known: dict[Any, Sequence[Any]] = {}  # the outputs of an equation, by its name
 
-    def walk(self, program: Jaxpr, consts: Sequence[Any], inputs: Sequence[Any]) -> list[Any]:
+    def walk(self, program: ClosedJaxpr, inputs: Sequence[Any]) -> list[Any]:
         """The variables of a program's outputs, where its inputs are these variables or literals."""
-        values: dict[Any, Any] = dict(zip(program.invars, inputs, strict=True))
-        values.update((v, self._const(v, x)) for v, x in zip(program.constvars, consts, strict=True))
-        read = lambda v: v if isinstance(v, Literal) else values[v]  # noqa: E731
-        for equation in program.eqns:
-            xs = [read(v) for v in equation.invars]
-            inner = opened(equation)
-            if inner is not None:
-                outputs = self.walk(inner.jaxpr, inner.consts, xs)
-            else:
-                # Numbers by their bits, all else by identity.
-                names = [_bits(x) if isinstance(x, Literal) else id(x) for x in xs]
-                key = (equation.primitive, *names, _name_of(equation))
-                if key not in self._known:
-                    self._known[key] = self._put_down(equation, xs)
-                outputs = self._known[key]
-            values.update(zip(equation.outvars, outputs, strict=True))
-        return [read(v) for v in program.outvars]
+        return interpret(program, inputs, self._results, self._constant)
 
-    def _const(self, variable: Any, value: Any) -> Any:
+    def _results(self, equation: Any, xs: list[Any]) -> Sequence[Any]:
+        inner = opened(equation)
+        if inner is not None:
+            return self.walk(inner, xs)
+        # Numbers by their bits, all else by identity.
+        key = (equation.primitive, *(_bits(x) if is_literal(x) else id(x) for x in xs), _parameters_of(equation))
+        if key not in self._known:
+            self._known[key] = self._put_down(equation, xs)
+        return self._known[key]
+
+    def _constant(self, variable: Any, value: Any) -> Any:
+        if is_literal(variable):
+            return variable
         key = ("const", id(value))
         if key not in self._known:
             self._known[key] = [new_variable(variable)]
@@ -112,7 +108,7 @@ class _Once:
         if equation.primitive.name == "dot_general" and is_small(equation):
             specs = [jax.ShapeDtypeStruct(v.aval.shape, v.aval.dtype) for v in xs]
             product = jax.make_jaxpr(functools.partial(sum_of_products, equation))(*specs)
-            return self.walk(product.jaxpr, product.consts, xs)
+            return self.walk(product, xs)
         outputs = [*map(new_variable, equation.outvars)]  # a program may be opened twice
         self.equations.append(equation.replace(invars=xs, outvars=outputs))
         return outputs
@@ -122,7 +118,7 @@ def _bits(literal: Any) -> tuple[bytes, str]:
     return np.asarray(literal.val).tobytes(), str(literal.aval)  # -0.0 == 0.0, and an array's text is rounded
 
 
-def _name_of(equation: Any) -> Any:
+def _parameters_of(equation: Any) -> Any:
     """What two equations that do the same have in common: their parameters; itself where these cannot be compared."""
     key = tuple(sorted(equation.params.items()))
     try:
@@ -142,10 +138,10 @@ def opened(equation: Any) -> ClosedJaxpr | None:
 
 def reads_of(program: Jaxpr) -> tuple[bool, ...]:
     """Which of its inputs a program reads at all; the first, if it reads none."""
-    read = {v for e in program.eqns for v in e.invars if not isinstance(v, Literal)}
-    read.update(v for v in program.outvars if not isinstance(v, Literal))
-    found = tuple(v in read for v in program.invars)
-    return found if any(found) else (True, *found[1:])
+    variables = {v for e in program.eqns for v in e.invars if not is_literal(v)}
+    variables.update(v for v in program.outvars if not is_literal(v))
+    is_read = tuple(v in variables for v in program.invars)
+    return is_read if any(is_read) else (True, *is_read[1:])
 
 
 def is_fusable(program: Jaxpr) -> bool:
@@ -168,70 +164,34 @@ def unsupported_primitives(program: Jaxpr, is_ours: bool = False) -> Iterator[tu
             yield f"{name} of more than {_LARGEST_SUM}", not is_ours
 
 
-# XLA's time to compile a function grows faster than its length, above all where values of the beginning are needed at
-# the end, as in a reverse derivative: 6000 equations take 17 s whole, and 2.5 s in pieces.
-_WHOLE_UP_TO = 2500
-_PIECE = 250
-
-
-def in_pieces(program: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
-    """What a program gives, compiled as one function, or as several one after the other."""
-    jaxpr = program.jaxpr
-    if len(jaxpr.eqns) <= _WHOLE_UP_TO:
-        return _one_function(jaxpr_as_fun(program), args)
-    values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*program.consts, *args), strict=True))
-    for piece in _pieces(jaxpr):
-        values.update(zip(piece.outputs, _one_function(piece, [values[v] for v in piece.inputs]), strict=True))
-    return [v.val if isinstance(v, Literal) else values[v] for v in jaxpr.outvars]
-
-
-def _one_function(f: Callable[..., Any], args: Sequence[Any]) -> Any:
-    # XLA aborts on a parameter that its simplified program no longer reads. The sum reads them all, and the barrier
-    # hides constant arguments, which XLA would write into the program in the parameter's stead.
-    places = [i for i, x in enumerate(args) if x.size]
-
-    def values_and_sum(*some):
-        return f(*replaced(args, places, some)), sum(x[(0,) * x.ndim].astype(float) for x in some)
-
-    with one_function():
-        values, _ = jax.jit(values_and_sum)(*jax.lax.optimization_barrier([args[i] for i in places]))
-    return values
-
-
-class _Piece(NamedTuple):
-    """Some equations of a program, one after the other: a function of the variables `inputs`."""
-
-    inputs: list[Any]
-    outputs: list[Any]
-    equations: Sequence[Any]
-
-    def __call__(self, *args: Any) -> list[Any]:
-        values = dict(zip(self.inputs, args, strict=True))
-        for equation in self.equations:
-            inputs = [v.val if isinstance(v, Literal) else values[v] for v in equation.invars]
-            outputs = equation.primitive.bind(*inputs, **equation.params)
-            values.update(zip(equation.outvars, outputs if equation.primitive.multiple_results else [outputs]))
-        return [values[v] for v in self.outputs]
-
-
-def _pieces(program: Jaxpr) -> list[_Piece]:
-    read_later = {v for v in program.outvars if not isinstance(v, Literal)}
-    pieces = []
-    for start in reversed(range(0, len(program.eqns), _PIECE)):
-        equations = program.eqns[start : start + _PIECE]
-        made = {v for e in equations for v in e.outvars}
-        read = dict.fromkeys(v for e in equations for v in e.invars if not isinstance(v, Literal) and v not in made)
-        pieces.append(_Piece(list(read), [v for e in equations for v in e.outvars if v in read_later], equations))
-        read_later |= set(read)
-    return pieces[::-1]
-
-
 def replaced(values: Sequence[Any], places: Sequence[int], new: Sequence[Any]) -> list[Any]:
     """The values, with new ones in some places."""
     values = list(values)
     for i, x in zip(places, new, strict=True):
         values[i] = x
     return values
+
+
+def specs_of(avals: Sequence[Any]) -> list[jax.ShapeDtypeStruct]:
+    return [jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type) for a in avals]
+
+
+def is_inexact(aval: Any) -> bool:
+    """Whether there can be a derivative of this kind of number, or by it."""
+    return jnp.issubdtype(aval.dtype, jnp.inexact)
+
+
+def tangent_program(program: ClosedJaxpr, moving: Sequence[int]) -> ClosedJaxpr:
+    """(inputs, tangents of those at the places `moving`) -> tangents of the outputs that have any."""
+    (inputs, outputs), evaluate = types_of(program), jaxpr_as_fun(program)
+    specs = specs_of(inputs)
+
+    def tangents(xs, dxs):
+        of_moving = lambda *ys: evaluate(*replaced(xs, moving, ys))  # noqa: E731
+        dys = jax.jvp(of_moving, [xs[i] for i in moving], dxs)[1]
+        return [dy for dy, aval in zip(dys, outputs, strict=True) if is_inexact(aval)]
+
+    return jax.make_jaxpr(tangents)(specs, [specs[i] for i in moving])
 
 
 Direction = tuple[int, int]  # an argument and the place of the element in it
@@ -242,15 +202,15 @@ def jacobian(
 ) -> list[np.ndarray]:
     """The derivatives (..., d) of each output by d elements of the inputs, as nodes of the graph."""
     moving = sorted({i for i, _ in directions})
-    tangents, avals = _tangents(program, moving)
-    jaxpr = tangents.jaxpr
+    tangents = cse(tangent_program(program, moving))
+    jaxpr, avals = tangents.jaxpr, types_of(program)
     values = dict(zip(jaxpr.invars, inputs, strict=False)) | {
         v: as_constants(x, graph) for v, x in zip(jaxpr.constvars, tangents.consts, strict=True)
     }
     of_direction = set(jaxpr.invars[len(inputs) :])
     later = []
     for equation in jaxpr.eqns:  # what depends on the direction waits
-        if of_direction.isdisjoint(v for v in equation.invars if not isinstance(v, Literal)):
+        if of_direction.isdisjoint(v for v in equation.invars if not is_literal(v)):
             values.update(zip(equation.outvars, _outputs(equation, values, graph), strict=True))
         else:
             of_direction.update(equation.outvars)
@@ -259,36 +219,18 @@ def jacobian(
     columns = []
     for argument, element in directions:
         along = dict(values)
-        for v, i, aval in zip(jaxpr.invars[len(inputs) :], moving, avals, strict=True):
-            along[v] = np.full(aval.shape, NOTHING, np.int64)
+        for v, i in zip(jaxpr.invars[len(inputs) :], moving, strict=True):
+            along[v] = np.full(v.aval.shape, NOTHING, np.int64)
             if i == argument:
-                along[v].flat[element] = graph.constant(1.0, str(aval.dtype))
+                along[v].flat[element] = graph.constant(1.0, str(v.aval.dtype))
         for equation in later:
             along.update(zip(equation.outvars, _outputs(equation, along, moves), strict=True))
-        read = [_read(v, along, moves) for v in jaxpr.outvars]
-        columns.append([moves.instantiated(x, str(a.dtype)) for x, a in zip(read, types_of(program)[1], strict=True)])
+        outputs = zip([_read(v, along, moves) for v in jaxpr.outvars], avals[1], strict=True)
+        columns.append([moves.instantiated(x, str(aval.dtype)) for x, aval in outputs])
     return [
         np.stack([column[i] for column in columns], axis=-1) if columns else np.zeros((*aval.shape, 0), np.int64)
-        for i, aval in enumerate(types_of(program)[1])
+        for i, aval in enumerate(avals[1])
     ]
-
-
-def _tangents(program: ClosedJaxpr, moving: Sequence[int]) -> tuple[ClosedJaxpr, list[Any]]:
-    """(inputs, tangents of those that move) -> tangents of the outputs."""
-    specs = [jax.ShapeDtypeStruct(a.shape, a.dtype, weak_type=a.weak_type) for a in types_of(program)[0]]
-    evaluate = jaxpr_as_fun(program)
-
-    def tangents(xs, dxs):
-        def of_moving(*ys):
-            full = list(xs)
-            for i, y in zip(moving, ys, strict=True):
-                full[i] = y
-            return evaluate(*full)
-
-        return jax.jvp(of_moving, [xs[i] for i in moving], dxs)[1]
-
-    avals = [specs[i] for i in moving]
-    return cse(jax.make_jaxpr(tangents)(specs, avals)), avals
 
 
 def _outputs(equation: Any, values: dict[Any, np.ndarray], graph: Any) -> list[np.ndarray]:
@@ -296,7 +238,7 @@ def _outputs(equation: Any, values: dict[Any, np.ndarray], graph: Any) -> list[n
 
 
 def _read(v: Any, values: dict[Any, np.ndarray], graph: Any) -> np.ndarray:
-    return as_constants(v.val, graph) if isinstance(v, Literal) else values[v]
+    return as_constants(v.val, graph) if is_literal(v) else values[v]
 
 
 NOTHING = -1  # in the place of a node: no derivative at all

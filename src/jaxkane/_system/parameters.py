@@ -13,7 +13,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
+
+from .._scalarjit.compat import Tracer
 
 
 def parameter(

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._common.lookup import not_there, refuse_unknown
-from .._scalarjit.cache_key import kept_from_a_trace
+from .._scalarjit.cache_key import leaked_tracer
 from .._scalarjit.components import Component
 from .motion import Motion, motion_number
 from .parameters import check_fields, check_parameter, parameter_info, to_float
@@ -202,7 +202,7 @@ def _named(method: Callable[..., Any], name: str) -> Callable[..., Any]:
         with explain_value_of_traced(f"{type(self).__name__}.{name}", _STATIC_FIELD):
             result = method(self, t, q, *rest, **kwargs)
         if isinstance(result, Motion) and result.number < number:
-            raise kept_from_a_trace(type(self).__name__)
+            raise leaked_tracer(type(self).__name__)
         return result
 
     vars(call)["reads_by_name"] = call

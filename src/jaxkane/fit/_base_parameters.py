@@ -15,7 +15,7 @@ from .._common.lookup import refuse_unknown
 from .._kane.assembly import assemble
 from .._kane.constraints import has_configuration_constraints
 from .._kane.regressor import Bodies
-from .._scalarjit.cache_key import compiled
+from .._scalarjit.cache_key import jit
 from .._system.parameters import leaf_name
 from .._system.system import System
 from ._identifiability import combination
@@ -132,7 +132,7 @@ def equations_at(chosen: Chosen, at: KinematicSamples) -> tuple[tuple[str, ...],
     return chosen.system.speeds, Y[fine], tau[fine], at.trial[fine]
 
 
-@compiled
+@jit
 def _at_all(chosen, t, q, u, inputs, u_dot):
     found = jax.vmap(chosen.at)(t, q, u, inputs, u_dot)
     return found.matrix, found.forces
@@ -162,7 +162,7 @@ def random_states(system: System, n: int) -> KinematicSamples:
     return KinematicSamples(t, q, rng.normal(0.0, 3.0, (n, n_u)), rng.normal(0.0, 10.0, (n, n_u)), inputs)
 
 
-@compiled
+@jit
 def _assembled(system, t, q):
     return jax.vmap(lambda t, q: assemble(system, q, t=t).q)(t, q)
 

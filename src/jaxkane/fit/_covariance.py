@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Array
 
-from .._scalarjit.cache_key import compiled
+from .._scalarjit.cache_key import jit
 from ._block_lsq import Blocks, Eliminated, eliminate
 from ._linearize import Linearization
 from ._model import Unknowns
@@ -188,13 +188,13 @@ def intervals(parameters: Parameters, x: Array, half: np.ndarray) -> list[tuple[
     return [(float(min(a, b)), float(max(a, b))) for a, b in zip(low, high, strict=True)]
 
 
-@compiled
+@jit
 def parameter_values(parameters: Parameters, x: Any) -> Any:
     """`parameters.values(x)`, as one program."""
     return parameters.values(x)
 
 
-@compiled
+@jit
 def parameter_slopes(parameters: Parameters, x: Any) -> Any:
     """`parameters.slopes(x)`, as one program."""
     return parameters.slopes(x)

@@ -13,7 +13,7 @@ import numpy as np
 from .._common.lookup import not_there
 from .._kane.evaluate import DescriptionEvaluator
 from .._kane.regressor import origin_of
-from .._scalarjit.cache_key import compiled
+from .._scalarjit.cache_key import jit
 from .._system.parameters import leaf_name
 from .._system.system import System
 
@@ -236,7 +236,7 @@ def _bodies(system: System) -> list[str]:
     return names
 
 
-@compiled
+@jit
 def _all_slopes(system):
     read = lambda s: jnp.stack([row for _, row in _numbers(s)])  # noqa: E731
     return read(system), jax.jacfwd(read)(system)

@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 
 from .._kane.checks import check_bodies
 from .._kane.regressor import described
-from .._scalarjit.cache_key import compiled
+from .._scalarjit.cache_key import jit
 from .._system.system import System
 from ._base_parameters import BaseParameters, equations_at, estimated, states_for, structure_of_states
 from ._kinematics import Motions, kinematic_samples, max_spacing
@@ -33,7 +33,7 @@ def _values(chosen: Chosen) -> Any:
     return chosen.values(jnp.zeros(()), jnp.full(len(chosen.system.coordinates), 0.3))
 
 
-_compiled_values = compiled(_values)
+_compiled_values = jit(_values)
 
 
 def column_values(chosen: Chosen, system: System) -> np.ndarray:
@@ -74,7 +74,7 @@ def nearest(chosen: Chosen, parameters: Parameters, base: BaseParameters) -> tup
     return found.x, float(np.linalg.norm(residuals(found.x)[: len(root)]))
 
 
-@compiled
+@jit
 def values_with_slopes(chosen, parameters, x):
     """The values of the columns and the residuals of the priors, and how both change with the free numbers."""
     both = lambda x: (_values_at(chosen, parameters, x), parameters.prior_residuals(x))  # noqa: E731

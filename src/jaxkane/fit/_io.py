@@ -12,7 +12,8 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from .._common.files import atomic_write, digest
+from .._common.files import atomic_write
+from .._scalarjit.digest import digest
 from .._system.parameters import leaf_name
 from ._kalman import filtered
 from ._problem import Problem

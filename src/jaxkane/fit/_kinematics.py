@@ -14,7 +14,7 @@ from scipy.interpolate import make_interp_spline, make_lsq_spline
 from .._common.lookup import refuse_unknown
 from .._integrate.trajectory import Trajectory, refuse_other_system
 from .._kane.equations import coordinate_rates
-from .._scalarjit.cache_key import compiled
+from .._scalarjit.cache_key import jit
 from .._system.system import System
 from ._trial import Trial
 
@@ -23,7 +23,7 @@ _MOST_OF_A_SAMPLE = 4.0  # knots are no closer than so many samples
 _RATIO = 1.25  # between spacings that are tried
 
 
-@compiled
+@jit
 def speeds_and_rates(system, t, q, q_dot, q_ddot):
     """Independent speeds and their rates (n, n_u), from the coordinates' rates, which are affine in them."""
     zero = jnp.zeros(len(system.speeds), q.dtype)

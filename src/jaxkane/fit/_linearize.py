@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._integrate.trajectory import Trajectory
-from .._scalarjit.cache_key import compiled
+from .._scalarjit.cache_key import jit
 from .._scalarjit.compat import process_allgather
 from ._block_lsq import Blocks
 from ._kalman import Filtered, filtered, information_of, minus_twice_log_likelihood
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ._problem import Problem
 
 
-@compiled
+@jit
 def starts_of(model: Model, windows: Windows, point: Unknowns) -> tuple[Array, Array]:
     """Starts (W, n) and their derivatives (W, n, n_z + n_b + p) by z, b and x."""
     # A program of its own: inside that of the simulation Newton's method would be differentiated a tangent at a time.
@@ -53,7 +53,7 @@ def jacobian_of(model: Model, window: Windows, start: Array, start_dot: Array, z
     return jax.vmap(along, out_axes=(None, -1, None))(*directions)
 
 
-@compiled
+@jit
 def blocks_of(
     model: Model, windows: Windows, by_trial: Array, point: Unknowns, starts: Array, starts_dot: Array
 ) -> tuple[Blocks, Prediction]:
@@ -79,7 +79,7 @@ def blocks_of(
     return Blocks(R, by_trial, n_z, n_next, n_b), seen
 
 
-@compiled
+@jit
 def costs_of(model: Model, windows: Windows, point: Unknowns, starts: Array) -> tuple[Array, Prediction]:
     """Costs (W,), and what was seen: `blocks_of` without derivatives."""
 
@@ -98,7 +98,7 @@ def costs_of(model: Model, windows: Windows, point: Unknowns, starts: Array) -> 
     return each(window_cost, _arguments(windows, point, starts))
 
 
-@compiled
+@jit
 def rides_of(model: Model, windows: Windows, point: Unknowns, starts: Array) -> Trajectory:
     """The motion of every window, stacked."""
     return each(lambda now: model.simulate(now[0], now[4], now[3], point.x), _arguments(windows, point, starts))

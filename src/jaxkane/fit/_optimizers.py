@@ -16,9 +16,9 @@ import optimistix as optx
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float
 
-from .._common.files import digest
 from .._common.lookup import real_number
-from .._scalarjit.cache_key import compiled
+from .._scalarjit.cache_key import jit
+from .._scalarjit.digest import digest
 from ._block_lsq import Eliminated, eliminate
 from ._density import half_cost
 from ._linearize import Linearization, cost, linearize
@@ -325,13 +325,13 @@ class BFGS(Optimizer):
         return dataclasses.replace(best, cost=at.cost, at=at), status
 
 
-@compiled
+@jit
 def _begun(model, windows, by_trial, solver, origin, unit, y):
     f = _of_round_unknowns(half_cost(model, windows, by_trial), origin, unit)
     return _of_strong_types(solver.init(f, y, None, {}, *jax.eval_shape(f, y, None), frozenset()))
 
 
-@compiled
+@jit
 def _step(model, windows, by_trial, solver, memory):
     f = _of_round_unknowns(half_cost(model, windows, by_trial), memory.origin, memory.unit)
     y, state, _ = solver.step(f, memory.y, None, {}, memory.of_optimistix, frozenset())

@@ -9,17 +9,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from .._common.lru_cache import LRUCache
 from .._kane.arguments import as_array, check_is_system, check_time, checked_values, refuse_incomplete
 from .._kane.checks import check_system
 from .._kane.equations import InputValues
 from .._kane.evaluate import at_random_point, structure_of
 from .._kane.regressor import UNITS, Bodies, Carried, Described, carried, columns_of, described, unbalanced, values_of
-from .._scalarjit.cache_key import compiled
-from .._scalarjit.compat import concretely
+from .._scalarjit.cache_key import Cache, jit
+from .._scalarjit.compat import Tracer, concretely
 from .._system.parameters import declared, leaf_name
 from .._system.system import System
 from ._parameters import find_leaves
@@ -139,7 +137,7 @@ def chosen_of(system: System, bodies: Bodies, parameters: Names) -> Chosen:
     return found
 
 
-@compiled
+@jit
 def regressor_at(chosen: Chosen, t, q, u, inputs, u_dot):
     return chosen.carried_at(t, q, u, inputs, u_dot)
 
@@ -147,20 +145,19 @@ def regressor_at(chosen: Chosen, t, q, u, inputs, u_dot):
 # ---- whether the equations are linear in what was chosen
 
 
-_CHECKED = LRUCache()  # structures, with what is chosen
+_CHECKED = Cache()  # structures, with what is chosen
 
 
 def check_linear(chosen: Chosen, t: Any, q: Any) -> None:
     """Refuse what would make tau or Y depend on the parameters themselves; once for each structure and choice."""
     key = (structure_of(chosen.system), chosen.described.parts, chosen.places)
-    if key in _CHECKED:
+    if _CHECKED.known(key, False):
         return
     # What is differentiated alone has a value; what is traced has none.
     value = lambda x: jax.lax.stop_gradient(x) if isinstance(x, Tracer) else x  # noqa: E731
     system, t, q = jax.tree.map(value, (chosen.system, t, q))
     with concretely():
-        if _Linearity(chosen, system, t, q).check():
-            _CHECKED[key] = None
+        _CHECKED.keep(key, _Linearity(chosen, system, t, q).check())
 
 
 class _Linearity:

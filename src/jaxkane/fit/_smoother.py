@@ -13,7 +13,7 @@ from scipy import stats
 
 from .._common.lookup import not_there
 from .._kane.equations import _dependent_speeds
-from .._scalarjit.cache_key import compiled
+from .._scalarjit.cache_key import jit
 from .._system.system import unpacked
 from . import _kalman as kalman
 from ._kalman import brought_back, filtered
@@ -119,7 +119,7 @@ def _beginnings(fit: Fit) -> Array:
     return jnp.asarray(begin, problem.windows.t.dtype)
 
 
-@compiled
+@jit
 def _smoothed(model: Model, windows: Any, point: Unknowns, starts: Array, begin: Array) -> tuple[Array, Array]:
     """Of every trial, mean (W, n_t, n) and a root of the covariance (W, n_t, n, k) of [q, u, x, u_dep, b]."""
     n = len(state_names(model.system))

@@ -9,9 +9,9 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
 
 from .. import rotations
+from .._scalarjit.compat import Tracer
 from .._scalarjit.components import Component, Triple, is_zero, mul, sub
 from .._system.bodies import Body, Force, Load, Torque
 from .._system.kinematics import Frame, Point

@@ -8,10 +8,10 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.core import Tracer
 
 from .. import rotations
 from .._common.lookup import not_there
+from .._scalarjit.compat import Tracer
 from ..rotations import Matrix
 from ._joints import Hinge, Joint, JointType, Slide, components, exact, exact_numbers, is_structural_zero
 from ._loops import with_dependent

@@ -8,9 +8,9 @@ from typing import Any
 import jax
 import numpy as np
 import scipy.linalg
-from jax.core import Tracer
 
 from .._common.lookup import as_names, not_there
+from .._scalarjit.compat import Tracer
 from ._joints import JointType
 from ._mechanism import Field, Structure, class_of, loop_residuals
 

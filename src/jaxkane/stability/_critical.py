@@ -14,7 +14,7 @@ from jaxtyping import Array, Complex, Float, Int
 
 from .._common.lookup import not_there
 from .._kane.arguments import is_concrete
-from .._scalarjit.cache_key import compiled
+from .._scalarjit.cache_key import jit
 from .._scalarjit.nan import nan_where
 from .._system.system import System
 from ._eig import Eig, eig
@@ -186,7 +186,7 @@ class _Brackets(NamedTuple):
         return self._replace(lower=lower, upper=upper, near=near, rises=rises, count=self.count + jnp.sum(is_one))
 
 
-@compiled
+@jit
 def _crossings(system, values, motion, states, groups, most: int):
     fixed = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, (system, values))
     kept: list[tuple[str, ...]] = []

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Complex, Float
 
 from .._scalarjit.backends import native
-from .._scalarjit.function import fused
+from .._scalarjit.function import ScalarFunction
 from .._scalarjit.nan import _spread
 
 SIZES = range(2, 7)  # of matrices; larger ones are better off with LAPACK
@@ -44,7 +44,7 @@ def qr_eigenvalues(A: Float[Array, "n n"]) -> Complex[Array, " n"]:
     return jax.lax.complex(*_of_blocks(H, jnp.where(unfinished, jnp.nan, size)))
 
 
-@fused
+@ScalarFunction
 def _hessenberg(A):
     """H (n, n) similar to A / size and zero below its subdiagonal; size; whether a block is larger than two by two."""
     n, H = len(A), [list(row) for row in A]
@@ -80,7 +80,7 @@ def _at_once(H) -> int:
     return 2 if len(H) <= 4 else 1
 
 
-@fused
+@ScalarFunction
 def _steps(H, exceptional):
     for _ in range(_at_once(H) - 1):
         H, _ = _step(H, False)
@@ -151,7 +151,7 @@ def _deflated(H):
     return jnp.stack([jnp.stack(row) for row in H]), unfinished
 
 
-@fused
+@ScalarFunction
 def _of_blocks(H, size):
     """Real and imaginary parts (n,) of the eigenvalues of `size` H, which has blocks of one and two rows."""
     n = len(H)

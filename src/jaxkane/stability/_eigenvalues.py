@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 
 from .._common.lookup import as_names, not_there
 from .._kane.arguments import check_is_system, is_concrete, is_numeric
-from .._scalarjit.cache_key import compiled
+from .._scalarjit.cache_key import jit
 from .._scalarjit.nan import nan_where
 from .._system.parameters import parameter_info
 from .._system.system import State, System, unit_of, units_of
@@ -277,7 +277,7 @@ def matrix(system: System, value: Any, motion: Any, states: tuple[str, ...] | No
     return model.A, model.states
 
 
-@compiled
+@jit
 def _along(system, values, motion, states, groups):
     names: list[tuple[str, ...]] = []
 

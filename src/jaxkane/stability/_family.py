@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from .._common.lookup import by_name, hint
 from .._integrate.trajectory import refuse_other_system
-from .._scalarjit.cache_key import compiled
+from .._scalarjit.cache_key import jit
 from .._system.system import System, names_of
 from ._steady import Problem, SteadyMotion, as_motion, jacobian
 
@@ -207,7 +207,7 @@ class _Curve:
         return y
 
 
-@compiled
+@jit
 def _residual_and_slope(problem: Problem, z, args):
     return problem.residual(z, args), jacobian(lambda z: problem.residual(z, args), z)
 

@@ -20,9 +20,9 @@ from .._kane.checks import check_system
 from .._kane.constraints import SINGULAR_ROUNDING, configuration_residual
 from .._kane.equations import dependent_speeds, diagnosis
 from .._kane.rhs import has_outputs, output_names, outputs_at, rates, values_of
-from .._scalarjit.cache_key import compiled
+from .._scalarjit.cache_key import jit
 from .._scalarjit.components import Component
-from .._scalarjit.function import fused
+from .._scalarjit.function import ScalarFunction
 from .._scalarjit.linear import as_vector, solve, stack
 from .._scalarjit.nan import nan_where
 from .._system.parameters import parameters_in
@@ -274,7 +274,7 @@ class _Choice(eqx.Module):
     outputs: tuple[str, ...] = eqx.field(static=True)
 
 
-@compiled
+@jit
 def _derivatives(at, choice: _Choice, functions: dict[str, Callable[..., Any]]):
     q, w = at[2], at[5]
     T = _tangents(*at[:3], choice)
@@ -317,7 +317,7 @@ def _at_deviation(x, w, at, T, choice: _Choice, functions: dict[str, Callable[..
     return tuple(jnp.stack(z) if z else jnp.zeros(0, q.dtype) for z in ([x_dot[k] for k in choice.states], y))
 
 
-@fused
+@ScalarFunction
 def _tangents(system: System, t, q, choice: _Choice):
     """T (n_q, n_q), column i: how all coordinates move when the i-th does; zero for dependent ones."""
     names = system.coordinates

@@ -19,7 +19,7 @@ from .._kane.constraints import configuration_residual
 from .._kane.equations import dependent_speeds, diagnosis
 from .._kane.rhs import rates, values_of
 from .._kane.rhs import rates as rates_of
-from .._scalarjit.cache_key import compiled, on_forget, version_of
+from .._scalarjit.cache_key import Cache, jit, version_of
 from .._scalarjit.compat import concretely
 from .._scalarjit.components import Component
 from .._scalarjit.nan import nan_where
@@ -85,13 +85,11 @@ def _levenberg_marquardt(F: Callable[[Array], Array], z: Array, max_steps: int =
     return jax.lax.while_loop(going, step, start)[0]
 
 
-_FOUND: dict[tuple, tuple[str, ...]] = {}
+_CYCLIC = Cache()  # names, by structure
 _TRIALS = 3  # at which the rates are finite
 _MOST_TRIALS = 12
 _SHIFTS = (0.3, -7.0, 150.0)  # of a coordinate [rad, m]: what begins far away counts too
 _INPUTS = (1.0, 30.0, 1000.0)  # sizes of trial inputs
-
-on_forget(_FOUND.clear)
 
 
 def cyclic_coordinates(system: System) -> tuple[str, ...]:
@@ -110,10 +108,8 @@ def cyclic_coordinates(system: System) -> tuple[str, ...]:
     leaves, treedef = jax.tree.flatten(system)
     shapes = tuple((jnp.shape(x), str(jnp.result_type(x))) for x in leaves)
     key = (type(system), str(treedef), shapes, version_of(system))
-    if key not in _FOUND:
-        with concretely():
-            _FOUND[key] = _search(system, leaves, treedef)
-    return _FOUND[key]
+    with concretely():
+        return _CYCLIC.get(key, lambda: _search(system, leaves, treedef))
 
 
 def _search(system: System, leaves: list, treedef) -> tuple[str, ...]:
@@ -179,7 +175,7 @@ def inputs_by_name(system: System, w) -> dict[str, Any]:
     return {k: w[i] for i, k in enumerate(system.inputs)}
 
 
-@compiled
+@jit
 def _rates(system, t, q, u, x, w):
     rate = rates(system, t, q, u, values_of(system, x, inputs_by_name(system, w)))
     return rate.q, rate.u, x if rate.x is None else rate.x, configuration_residual(system, t, q)
@@ -422,7 +418,7 @@ class Problem(eqx.Module):
         return dependent_speeds(system, t, q, u)[system.dependent_speeds.index(name)]
 
 
-@compiled
+@jit
 def _solve(problem: Problem, guess, args):
     system, t, q, known, _ = args
     z = root(problem.residual, guess, args)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Callable, Iterator, Sequence
 from importlib.metadata import version
 from platform import python_version_tuple
@@ -16,14 +15,14 @@ import numpy as np
 from jax.sharding import AxisType, Mesh
 from jax.sharding import PartitionSpec as P
 
-from .._common.files import digest
 from .._integrate.integrate import solve
 from .._integrate.settings import Settings
 from .._integrate.trajectory import Trajectory
 from .._kane.checks import with_possible_bodies
 from .._scalarjit.backends import native as kernels
-from .._scalarjit.cache_key import compiled, on_forget, version_of
+from .._scalarjit.cache_key import Cache, jit, version_of
 from .._scalarjit.captured_values import CapturedValues
+from .._scalarjit.digest import digest
 from .._system.system import State
 from ._members import start_of, system_and_signals
 
@@ -89,13 +88,13 @@ def mesh_of(devices: Sequence[Any] | None) -> Mesh | None:
     return jax.make_mesh((len(devices),), ("members",), axis_types=(AxisType.Auto,), devices=devices)
 
 
-@compiled
+@jit
 def _starts(members: Any, job: Job) -> State:
     # A program of its own: lineax, which Newton's method calls, cannot be traced within shard_map.
     return jax.vmap(lambda own: start_of(own, job.shared, job.ts[0]))(members)
 
 
-@compiled
+@jit
 def _solve(members: Any, starts: State, job: Job) -> Part:
     arrays, static = eqx.partition(job, eqx.is_array)
 
@@ -204,8 +203,8 @@ def solve_elsewhere(
             f"This worker has no native kernels, and would round differently: {kernels.why_not()}. Or call "
             "jaxkane.configure(native=False) where the sweep is started."
         )
-    job, _ = _received(common)
-    libraries, computed = _program_here(common, version_of(job))
+    job, like = _JOBS.get(common, lambda: _received(common))
+    libraries, computed = _PROGRAMS.get((common, version_of(job)), lambda: _program(job, like))
     if libraries == program[0] and computed != program[1]:  # what another JAX has traced cannot be compared
         raise RuntimeError(_ANOTHER)
     part = job.solve(cloudpickle.loads(own), size)
@@ -217,23 +216,15 @@ def _program(job: Job, like: Any) -> tuple[str, str]:
     return repr(versions()), traced(job, like)[0]
 
 
-@functools.lru_cache(maxsize=8)
-def _program_here(common: bytes, version: bytes) -> tuple[str, str]:
-    """`_program` on a worker, once for all chunks; `version` is that of what its code reads now."""
-    return _program(*_received(common))
+# On a worker, once for all chunks: functions that are unpickled anew would be compiled anew.
+_JOBS, _PROGRAMS = Cache(8), Cache(8)
 
 
-@functools.lru_cache(maxsize=8)
 def _received(common: bytes) -> tuple[Job, Any]:
-    # Once for all chunks: functions that are unpickled anew would be compiled anew.
     import cloudpickle
 
     job, like = cloudpickle.loads(common)
     return jax.tree.map(_as_jax, job), like
-
-
-for _memory in (_received, _program_here):
-    on_forget(_memory.cache_clear)
 
 
 def _as_numpy(x: Any) -> Any:

@@ -14,9 +14,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from .._common.files import SCRATCH, atomic_write, differences, digest
+from .._common.files import SCRATCH, atomic_write, differences
 from .._integrate.settings import Settings
 from .._scalarjit.backends.native import is_on
+from .._scalarjit.digest import digest
 from .._system.system import State, System
 from ._chunks import versions
 from ._members import Table

@@ -8,10 +8,10 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jax.core import Tracer
 
 from .._common.lookup import not_there
 from .._integrate.trajectory import Status, Trajectory, reason
+from .._scalarjit.compat import Tracer
 from ._chunks import Part
 from ._members import Table
 

@@ -17,7 +17,7 @@ from .._integrate.integrate import refuse_captured
 from .._integrate.settings import as_state, checked_times, in_its_mode, settings_for
 from .._integrate.trajectory import Status, Trajectory
 from .._kane.arguments import is_concrete
-from .._scalarjit.cache_key import captured
+from .._scalarjit.cache_key import captured_tracers
 from .._scalarjit.components import Inputs
 from .._system.system import State, System
 from ._chunks import GROUP, Job, Part, mesh_of, on_cluster, traced
@@ -91,7 +91,7 @@ def sweep(
         refuse_captured(system)
     members, shared, n = members_of(system, state, inputs, table, ts)
     found = table if table is not None else Table({}, ("member",), (n,))
-    closures = captured(shared, reduce)
+    closures = captured_tracers(shared, reduce)
     job = Job(shared, ts, settings, reduce, None if client is not None else mesh_of(devices), closures)
     own = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), members)
     if n == 0:
