@@ -8,7 +8,6 @@ import pytest
 from systems import POSED, PUSH, SEEN, TRIAL, Track
 from systems import T as t
 
-import jaxkane.fit._linearize as linearization
 from jaxkane.fit import (
     BFGS,
     GradientDescent,
@@ -21,7 +20,6 @@ from jaxkane.fit import (
     profile,
     read_trials,
 )
-from jaxkane.fit._linearize import cost, linearize
 from jaxkane.sweep import grid
 
 
@@ -129,7 +127,7 @@ def test_bfgs_keeps_the_best_when_it_is_interrupted(problem, monkeypatch):
     best = minimize(problem, BFGS())
     assert best.status == "interrupted"
     assert whole.cost <= best.cost < best.history[0]
-    assert best.cost == pytest.approx(cost(problem, best.point), rel=1e-10)
+    assert best.cost == pytest.approx(problem.cost(best.point), rel=1e-10)
     assert len(best.history) == 7
     calls += [1] * 10
     at_once = minimize(problem, BFGS())
@@ -160,9 +158,9 @@ def test_lack_of_memory_is_not_taken_for_a_bad_start(problem, monkeypatch):
     def exhausted(*_):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 bytes.")
 
-    monkeypatch.setattr(linearization, "starts_of", exhausted)
+    monkeypatch.setattr("jaxkane.fit._problem.starts_of", exhausted)
     with pytest.raises(jax.errors.JaxRuntimeError, match="RESOURCE_EXHAUSTED"):
-        linearize(problem, problem.start)
+        problem.linearize(problem.start)
 
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])

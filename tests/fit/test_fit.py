@@ -18,12 +18,12 @@ from jaxkane.fit import (
     Problem,
     Simulation,
     Trial,
+    _optimizers,
     fit,
     identifiability,
     minimize,
 )
 from jaxkane.fit._block_lsq import Blocks, eliminate
-from jaxkane.fit._linearize import linearize
 
 TRUTH = DoublePendulum(mass=1.2, length=0.7)
 GUESS = DoublePendulum(mass=1.0, length=0.8)
@@ -78,7 +78,7 @@ def test_jacobian_against_central_differences(swings):
         b = jnp.zeros_like(point.b).at[0].set(x[4:6])
         return eqx.tree_at(lambda p: (p.z, p.b, p.x), point, (z, b, x[6:]))
 
-    R = linearize(problem, at(x)).blocks.R[1]
+    R = problem.linearize(at(x)).blocks.R[1]
     A = jnp.column_stack([exact, here])
     np.testing.assert_allclose(R.T @ R, A.T @ A, rtol=1e-8, atol=1e-8 * float(jnp.max(A.T @ A)))
 
@@ -143,17 +143,15 @@ def test_plain_coordinates_go_down(problem):
 
 
 def test_an_interrupted_fit_keeps_the_best(problem, monkeypatch):
-    import jaxkane.fit._optimizers as module
-
-    calls = []
+    calls, step = [], _optimizers._guarded
 
     def interrupted(*arguments):
         calls.append(1)
         if len(calls) > 4:
             raise KeyboardInterrupt
-        return linearize(*arguments)
+        return step(*arguments)
 
-    monkeypatch.setattr(module, "linearize", interrupted)
+    monkeypatch.setattr(_optimizers, "_guarded", interrupted)
     result = minimize(problem, GradientDescent())
     assert result.status == "interrupted"
     assert "best so far" in result.message

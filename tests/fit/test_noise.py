@@ -37,7 +37,6 @@ from jaxkane.fit import (
     smoothed,
     trajectories,
 )
-from jaxkane.fit._linearize import cost, linearize
 
 EXACT = 1e-8
 STIFFNESS, DAMPING, Q = 4.0, 0.3, 0.2  # of the cart of 1 kg; the noise's intensity [m^2/s^3]
@@ -118,9 +117,9 @@ def found(case):
 @pytest.mark.slow
 def test_the_likelihood_is_that_of_the_linear_motion(case):
     _, y, problem = case
-    there = linearize(problem, problem.start)
+    there = problem.linearize(problem.start)
     assert there.cost == pytest.approx(minus_twice_log_likelihood(y), rel=EXACT)
-    assert cost(problem, problem.start) == pytest.approx(there.cost, rel=1e-13)
+    assert problem.cost(problem.start) == pytest.approx(there.cost, rel=1e-13)
     # By stiffness, damping, intensity and the factor of sigma.
     d, values = 1e-4, np.array([STIFFNESS, DAMPING, Q, 1.0])
     by = lambda p: minus_twice_log_likelihood(y, *p)  # noqa: E731
@@ -152,7 +151,7 @@ def test_the_information_is_fishers_on_average(case):
     for seed in range(40):
         other = np.stack(list(drawn(seed)[1].values()))
         windows = dataclasses.replace(problem.windows, measured=jnp.asarray(np.nan_to_num(other)[None]))
-        R = np.asarray(linearize(dataclasses.replace(problem, windows=windows), problem.start).blocks.R)[0]
+        R = np.asarray(dataclasses.replace(problem, windows=windows).linearize(problem.start).blocks.R)[0]
         told.append(to_values @ R[:, 2:-1].T @ R[:, 2:-1] @ to_values)
     error = np.std(told, axis=0) / len(told) ** 0.5
     assert np.all(np.abs(np.mean(told, axis=0) - exact) < 3.5 * error + 1e-6 * np.abs(exact))
@@ -191,7 +190,7 @@ def test_other_optimizers_end_there_too(case, found):
     for optimizer in (GradientDescent(), BFGS()):
         assert minimize(problem, optimizer).cost == pytest.approx(found.cost, abs=1e-3), optimizer
     slope = jax.jit(jax.grad(log_density(problem, over="x")))(problem.start).x
-    np.testing.assert_allclose(slope, -linearize(problem, problem.start).blocks.gradient[2], rtol=1e-9)
+    np.testing.assert_allclose(slope, -problem.linearize(problem.start).blocks.gradient[2], rtol=1e-9)
 
 
 def test_a_fit_is_saved(case, found, tmp_path):
@@ -214,7 +213,7 @@ def conditioned(y, q=Q, deviation=DEVIATION, **values):
 
 
 def applied(problem, point):
-    return Fit(problem, point, linearize(problem, point), np.zeros(1), (0.0,), "applied", "none")
+    return Fit(problem, point, problem.linearize(point), np.zeros(1), (0.0,), "applied", "none")
 
 
 def test_the_smoother_knows_all_measurements(case):
@@ -324,7 +323,7 @@ def test_biases_inputs_and_several_trials():
         estimates.append(bias * (of_bias[seen] @ np.linalg.solve(C, e)))
     options = OPTIONS | {"noise": {"push": of_push, "x_dot": Q}, "sensor_bias": {"x": bias}}
     problem = Problem.of(cart, trials, ("stiffness", SpectralDensity("push")), simulation=TIGHT, **options)
-    assert cost(problem, problem.start) == pytest.approx(exact, rel=EXACT)
+    assert problem.cost(problem.start) == pytest.approx(exact, rel=EXACT)
     held = applied(problem, problem.start)
     assert held.parameters.units[1] == ""  # of a push without a declared unit
     for k, name in enumerate(held.trial_names):
@@ -413,7 +412,7 @@ def test_states_are_disturbed_too():
     trial = Trial(t, y, sigma=sigma, initial={"x": 0.4, "x_dot": 0.1})
     options = {"unknown": {"x": 0.1, "x_dot": 0.2, "force": 0.5}, "noise": {"force": q_force, "x_dot": Q}}
     problem = Problem.of(Dragged(), trial, "lag", simulation=TIGHT, **options)
-    assert cost(problem, problem.start) == pytest.approx(total, rel=EXACT)
+    assert problem.cost(problem.start) == pytest.approx(total, rel=EXACT)
 
 
 class Swing(jk.System):
@@ -478,7 +477,7 @@ def test_coordinates_that_constraints_bind():
         unknown = {name: 0.01 if name == "angle" else 0.01 * length * np.cos(begun), "rate": 0.1}
         trial = Trial(t, {"place": place}, sigma=1e-3, initial=initial | {"rate": 0.2})
         problem = Problem.of(system, trial, "length", unknown=unknown, noise={"rate": 1e-3})
-        costs.append(cost(problem, problem.start))
+        costs.append(problem.cost(problem.start))
         motion = smoothed(applied(problem, problem.start))["trial"]
         roots.append(motion.deviation("rate"))
         if name == "x":

@@ -1,6 +1,7 @@
 """An optimizer is one class: the loop gives it steps, a checkpoint, a callback, Ctrl-C and the result."""
 
 import dataclasses
+import inspect
 from typing import ClassVar
 
 import equinox as eqx
@@ -19,13 +20,14 @@ from jaxkane.fit import (
     Problem,
     Trial,
     fit,
+    fit_bicycle,
     minimize,
     multi_start,
     save_report,
 )
 from jaxkane.fit._block_lsq import eliminate
-from jaxkane.fit._linearize import linearize
 from jaxkane.fit._nuisance import moved, refined
+from jaxkane.fit._problem import ProblemSpec
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,14 +41,14 @@ class Part(Optimizer):
     def name(self):
         return "part of the way"
 
-    def begin(self, problem, point, at):
+    def init(self, problem, point, at):
         return jnp.zeros(())
 
     def step(self, problem, now, taken):
         eliminated = eliminate(now.at.blocks, 0.0)
         point = moved(now.point, self.part * eliminated.step(0.0)[0], eliminated)
-        at = linearize(problem, point)
-        return Iterate(point, at.cost, at, now.memory + 1)
+        at = problem.linearize(point)
+        return Iterate(point, at.cost, at, now.state + 1)
 
 
 def test_an_optimizer_is_one_class(tmp_path):
@@ -123,11 +125,19 @@ def test_a_trial_in_which_a_step_leads_too_far_holds_up_no_other():
     problem = Problem.of(Dial(), [near, far], "inertia", unknown=("angle",), simulation=POSED["simulation"])
     # From here Gauss-Newton solves the first at once, and steps with the second beyond where it began.
     begun = eqx.tree_at(lambda p: p.z, problem.start, jnp.array([[0.19], [0.48]]))
-    before = linearize(problem, begun)
-    whole = linearize(problem, moved(begun, jnp.zeros(1), eliminate(before.blocks, 0.0)))
+    before = problem.linearize(begun)
+    whole = problem.linearize(moved(begun, jnp.zeros(1), eliminate(before.blocks, 0.0)))
     assert whole.costs[0] < 1e-2 * before.costs[0] < before.costs[1] < whole.costs[1]
     point, at = refined(problem, begun, before, steps=1, rtol=1e-2)
     assert at.costs == pytest.approx([whole.costs[0], before.costs[1]])
     point, at = refined(problem, begun, before, steps=20, rtol=1e-12)
     assert at.cost < 1e-6 * before.cost
-    assert linearize(problem, point).cost == pytest.approx(at.cost, abs=1e-12)
+    assert problem.linearize(point).cost == pytest.approx(at.cost, abs=1e-12)
+
+
+def test_least_squares_by_default_and_every_option_in_the_signature():
+    found = fit(Track(), TRIAL, ["gain", "drift"], **POSED)
+    assert found.method == "Levenberg-Marquardt"
+    options = [f.name for f in dataclasses.fields(ProblemSpec)][2:]
+    for function in (fit, Problem.of, fit_bicycle):
+        assert set(options) <= inspect.signature(function).parameters.keys()

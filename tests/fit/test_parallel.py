@@ -145,7 +145,7 @@ def test_shares_put_together_are_the_whole(monkeypatch, processes):
     monkeypatch.setattr(parallel, "process_allgather", lambda found, tiled: said.append(found) or found)
     for i in range(processes):
         monkeypatch.setattr(jax, "process_index", lambda i=i: i)
-        parallel._by_all(evaluate, windows, point, 0.1 * np.arange(5))
+        parallel._by_all_processes(evaluate, windows, point, 0.1 * np.arange(5))
     together = {name: np.concatenate([found[name] for found in said])[:5] for name in said[0]}
     np.testing.assert_array_equal(together["trial"], np.arange(5))
     np.testing.assert_allclose(together["sum"], 12.1 * np.arange(5), rtol=1e-15)

@@ -152,10 +152,10 @@ def test_friction_that_starts_at_its_bound_is_found():
 def test_what_is_posed_again_keeps_its_priors_and_the_trials_that_count():
     problem = Problem.of(Track(), [TRIAL, TRIAL], ["gain", "drift"], priors={"drift": (0.0, 2.0)}, **POSED)
     known = problem.with_priors({"gain": (1.0, 0.1)})
-    for again in (known.with_trials(TRIAL), known.asking(known.specification)):
+    for again in (known.with_trials(TRIAL), known.with_specification(known.specification)):
         assert again.parameters.prior_deviation.tolist() == [0.1, 2.0]
     one = known.only([1])
-    assert one.asking(known.specification).size == one.size
+    assert one.with_specification(known.specification).size == one.size
     assert Problem.of(Track(), TRIAL, iter(["gain"]), **POSED).with_trials(TRIAL).parameters.names == ("gain",)
 
 

@@ -25,7 +25,6 @@ import pytest
 import jaxkane as jk
 from jaxkane._scalarjit.cache_key import Cache, version_of
 from jaxkane._scalarjit.function import ScalarFunction
-from jaxkane.fit._linearize import cost
 
 RTOL = 1e-12
 TS = np.linspace(0.0, 0.2, 3)
@@ -328,7 +327,7 @@ def fixed_ride():
 def cost_of_a_fit():
     trial = jk.fit.Trial(TS, {"x": TS}, sigma=1.0)
     problem = jk.fit.Problem.of(Pressed(), trial, ["mass"], simulation=jk.fit.Simulation(**SHORT))
-    return cost(problem, problem.start)
+    return problem.cost(problem.start)
 
 
 QUESTIONS: dict[str, Callable[[], Any]] = {
@@ -508,7 +507,7 @@ def test_sweeps_fits_models_and_forces_follow(monkeypatch):
         rides = jk.sweep.sweep(Drop(), REST, TS, table=table, reduce=lambda ride: ride["x"][-1], **SHORT)
         model = jk.stability.linearize(Sprung(), REST)
         force = jk.constraint_forces(Hung(), 0.0, [0.0], [0.0])["P"][2]
-        return *rides.values, cost(problem, problem.start), float(model.A[1, 0]), float(force)
+        return *rides.values, problem.cost(problem.start), float(model.A[1, 0]), float(force)
 
     distance = fall(9.81 - 1.62) * (TS / TS[-1]) ** 2
     np.testing.assert_allclose(now(), [fall(9.81), fall(9.81), np.sum(distance**2), -9.81, 2 * 9.81], rtol=1e-6)

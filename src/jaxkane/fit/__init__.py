@@ -15,7 +15,6 @@ from ._declarations import NoiseScale as NoiseScale
 from ._declarations import Offset as Offset
 from ._declarations import SpectralDensity as SpectralDensity
 from ._declarations import inertia_of as inertia_of
-from ._density import log_density as log_density
 from ._design import Design as Design
 from ._design import design as design
 from ._extensions import Extension as Extension
@@ -24,6 +23,7 @@ from ._extensions import forward_selection as forward_selection
 from ._first_estimate import FirstEstimate as FirstEstimate
 from ._first_estimate import first_estimate as first_estimate
 from ._fit import fit as fit
+from ._fit import minimize as minimize
 from ._identifiability import Direction as Direction
 from ._identifiability import Identifiability as Identifiability
 from ._identifiability import identifiability as identifiability
@@ -32,14 +32,14 @@ from ._kinematics import kinematic_samples as kinematic_samples
 from ._model import Model as Model
 from ._model import Simulation as Simulation
 from ._model import Unknowns as Unknowns
-from ._optimize import Iterate as Iterate
-from ._optimize import Optimizer as Optimizer
-from ._optimize import minimize as minimize
 from ._optimizers import BFGS as BFGS
 from ._optimizers import GradientDescent as GradientDescent
+from ._optimizers import Iterate as Iterate
 from ._optimizers import LeastSquares as LeastSquares
+from ._optimizers import Optimizer as Optimizer
 from ._posterior import Laplace as Laplace
 from ._posterior import laplace as laplace
+from ._posterior import log_density as log_density
 from ._posterior import marginal_likelihood as marginal_likelihood
 from ._problem import Problem as Problem
 from ._regressor import Regressor as Regressor

@@ -278,7 +278,7 @@ def extended(
         step = float(np.median(np.asarray(fit.problem.windows.step)))
         chosen = dataclasses.replace(asked.simulation or Simulation(), step=step)
         asked = dataclasses.replace(asked, simulation=chosen)
-    problem = fit.problem.asking(asked)
+    problem = fit.problem.with_specification(asked)
     names, trial, system = problem.parameters.names, problem.model.nuisance.trial, asked.system
     own_x = {c.name: tuple(names.index(n) for n in _parameter_names(system, c)) for c in both}
     own_b = {c.name: tuple(trial.index(pair) for pair in _pairs(c)) for c in both}

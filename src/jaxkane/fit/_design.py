@@ -18,7 +18,7 @@ from tqdm import tqdm
 from .._common.lookup import as_names, refuse_unknown
 from .._system.system import System, packed
 from ._covariance import infinite_along
-from ._linearize import by_next, each, jacobian_of, starts_of
+from ._linearize import by_next, jacobian_of, map_windows, starts_of
 from ._model import Model, Unknowns
 from ._parameters import parameters_of
 from ._problem import Problem
@@ -90,7 +90,7 @@ def _information(
         J = jnp.column_stack([J[:, :n_z], links, J[:, n_z:]])  # by [z, z_next, b, x]
         return J.T @ J, seen.simulated
 
-    N, simulated = each(of_window, (windows, point.z, point.b[windows.trial], starts, starts_dot))
+    N, simulated = map_windows(of_window, (windows, point.z, point.b[windows.trial], starts, starts_dot))
     # What a window and those before it say about [z_next, b, x] is known of [z, b, x] in the next.
     places = np.r_[:n_next, n_z + n_next : n_z + n_next + n_b + p]
 

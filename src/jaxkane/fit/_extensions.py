@@ -17,11 +17,10 @@ from ._block_lsq import Blocks, eliminate
 from ._candidates import Candidate, Extended, candidates_of, carried, extended, groups_of, posed_with
 from ._compare import Plausible, plausible_of
 from ._covariance import parameter_slopes, parameter_values
-from ._fit import solve
-from ._linearize import Linearization, linearize
+from ._fit import minimize, solve, uninterrupted
+from ._linearize import Linearization
 from ._model import Unknowns
 from ._nuisance import usable
-from ._optimize import minimize, uninterrupted
 from ._optimizers import LeastSquares
 from ._problem import Problem, refuse_other
 from ._result import Fit
@@ -59,7 +58,7 @@ class Standing:
     def of(cls, fit: Fit) -> Standing:
         problem, at = fit.problem, fit.linearization
         if np.any(np.isfinite(np.asarray(fit.parameters.prior_deviation))):
-            again = linearize(without_priors(problem), fit.point)
+            again = without_priors(problem).linearize(fit.point)
             assert again is not None
             at = again
         n_r, n_unknown = problem.size
@@ -264,7 +263,7 @@ class Trying:
         bar.set_postfix_str(f"{len(group)} linearized")
         try:
             more = extended(self.fit, (self.standing.problem, self.standing.point), group, self.selected, self.order)
-            at, why = linearize(without_priors(more.problem), more.point), "cannot be simulated where it starts"
+            at, why = without_priors(more.problem).linearize(more.point), "cannot be simulated where it starts"
         except ValueError as error:
             more, at, why = None, None, str(error)
         bar.update()
@@ -334,7 +333,7 @@ class Trying:
         problem, start = more.with_only([promise.candidate], common.held)
         try:
             found = uninterrupted(minimize(problem, LeastSquares(), start=start))
-            at = linearize(without_priors(problem), found.point)
+            at = without_priors(problem).linearize(found.point)
         except ValueError as error:
             return dataclasses.replace(row, reason=str(error)), None
         if at is None or not usable(at) or found.status != "converged":
@@ -555,5 +554,5 @@ def _check(fit: Fit, depth: Any, refits: Any, level: float) -> None:
 
 def _fitted(fit: Fit, taken: Sequence[Candidate], standing: Standing) -> Fit:
     """The fit with what was taken, as a user would pose it."""
-    problem = fit.problem.asking(posed_with(fit, taken))
+    problem = fit.problem.with_specification(posed_with(fit, taken))
     return solve(problem, LeastSquares(), start=standing.carried_to(problem))

@@ -1,73 +1,40 @@
-"""A problem solved to its end: with steps of integration that are fine enough where it ends. Knows no method."""
+"""A fit: the problem is specified, an optimizer's steps are made, with checkpoints, and the result is put together."""
 
 from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+from tqdm import tqdm
 
+from .._common.files import differences
 from .._system.system import System
-from ._declarations import Prior
-from ._model import Simulation, Unknowns
-from ._optimize import Optimizer, minimize
-from ._optimizers import GradientDescent
-from ._problem import Names, Problem
+from ._io import described, read_state, tree_of, write_state
+from ._model import Unknowns
+from ._nuisance import solve_nuisance, usable
+from ._optimizers import Iterate, LeastSquares, Optimizer
+from ._problem import Problem, refuse_other, with_options
 from ._result import Fit
 from ._trial import Trial
 
 
-def solve(
-    problem: Problem,
-    optimizer: Optimizer | None = None,
-    steps: int | None = None,
-    start: Unknowns | None = None,
-    checkpoint: str | os.PathLike[str] | None = None,
-    callback: Callable[[Unknowns, float], None] | None = None,
-    progress: bool = False,
-) -> Fit:
-    """`minimize`, gone on with from where it ended, as long as the steps of integration are too coarse there."""
-    optimizer = GradientDescent() if optimizer is None else optimizer
-    run: Any = {"steps": steps, "callback": callback, "progress": progress}
-    result = minimize(problem, optimizer, start=start, checkpoint=checkpoint, **run)
-    # The file is that of the first steps: what follows begins near its end.
-    for _ in range(3):
-        if not result.problem.chooses_steps or result.status != "converged" or not result.too_coarse:
-            break
-        problem = result.problem.finer(result.point)
-        if np.array_equal(problem.windows.step, result.problem.windows.step):
-            break
-        again = minimize(problem, optimizer.without_preparation(), start=result.point, **run)
-        result = dataclasses.replace(again, history=(*result.history, *again.history[1:]))
-    return result
-
-
+@with_options
 def fit(
     system: System,
     trials: Sequence[Trial] | Trial,
     free: Any,
     *,
-    unknown: Names = (),
-    sensor_bias: Names = (),
-    sensor_gain: Names = (),
-    input_bias: Names = (),
-    input_gain: Names = (),
-    input_delay: Names = (),
-    priors: Mapping[str, Prior] | None = None,
-    zero_order_hold: Sequence[str] = (),
-    window: float | None = None,
-    defect_std: Mapping[str, float] | None = None,
-    noise: Mapping[str, float] | None = None,
-    processes: bool = False,
-    simulation: Simulation | None = None,
     optimizer: Optimizer | None = None,
     steps: int | None = None,
     start: Unknowns | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
     callback: Callable[[Unknowns, float], None] | None = None,
     progress: bool = False,
+    **options: Any,
 ) -> Fit:
     """The parameters of a system with which its motion is nearest to what was measured.
 
@@ -102,30 +69,191 @@ def fit(
         calls `jax.distributed.initialize(...)` before anything else, and this with all trials; each simulates a share
         of the windows, all take the same steps and return the same `Fit`, that of one process alone.
     - `simulation`: how motions are integrated: `Simulation(rtol=1e-8)`, `Simulation(step=0.01)`.
-    - `optimizer`: `GradientDescent()`, `LeastSquares()` (Levenberg-Marquardt; with `damping=0` Gauss-Newton) or
-        `BFGS()`, with their options; by default the first.
+    - `optimizer`: `LeastSquares()` (Levenberg-Marquardt, the default; with `damping=0` Gauss-Newton),
+        `GradientDescent()` or `BFGS()`, with their options.
     - `steps`, `start`, `checkpoint`, `callback`, `progress`: of its run, as in `minimize`.
 
     **Returns:** a `Fit`.
 
     **Raises:** `ValueError` that names what is wrong with a trial, a channel, a parameter or a window.
     """
-    problem = Problem.of(
-        system,
-        trials,
-        free,
-        unknown=unknown,
-        sensor_bias=sensor_bias,
-        sensor_gain=sensor_gain,
-        input_bias=input_bias,
-        input_gain=input_gain,
-        input_delay=input_delay,
-        priors=priors,
-        zero_order_hold=zero_order_hold,
-        window=window,
-        defect_std=defect_std,
-        noise=noise,
-        simulation=simulation,
-        processes=processes,
-    )
+    problem = Problem.of(system, trials, free, **options)
     return solve(problem, optimizer, steps, start, checkpoint, callback, progress)
+
+
+def solve(
+    problem: Problem,
+    optimizer: Optimizer | None = None,
+    steps: int | None = None,
+    start: Unknowns | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    callback: Callable[[Unknowns, float], None] | None = None,
+    progress: bool = False,
+) -> Fit:
+    """`minimize`, and again from where it ended while the steps of integration are too coarse there."""
+    method: Any = LeastSquares() if optimizer is None else optimizer
+    run: Any = {"steps": steps, "callback": callback, "progress": progress}
+    result = minimize(problem, method, start=start, checkpoint=checkpoint, **run)
+    # The checkpoint has the first run only: what follows begins near its end.
+    for _ in range(3):
+        if not result.problem.chooses_steps or result.status != "converged" or not result.too_coarse:
+            break
+        problem = result.problem.finer(result.point)
+        if np.array_equal(problem.windows.step, result.problem.windows.step):
+            break
+        if method.horizons:
+            method = dataclasses.replace(method, horizons=())
+        again = minimize(problem, method, start=result.point, **run)
+        result = dataclasses.replace(again, history=(*result.history, *again.history[1:]))
+    return result
+
+
+def minimize(
+    problem: Problem,
+    optimizer: Optimizer,
+    *,
+    steps: int | None = None,
+    start: Unknowns | None = None,
+    checkpoint: str | os.PathLike[str] | None = None,
+    callback: Callable[[Unknowns, float], None] | None = None,
+    progress: bool = False,
+) -> Fit:
+    """Solve a `Problem`; `fit` specifies it and solves it.
+
+        minimize(Problem.of(system, trials, free), LeastSquares(rtol=1e-9), steps=200)
+
+    **Arguments:**
+
+    - `optimizer`: such as `LeastSquares()`, `GradientDescent()` or `BFGS()`.
+    - `steps`: at most; by default as many as suit the optimizer.
+    - `start`: `Unknowns` to go on from, such as `fit.point`; by default the system's values.
+    - `checkpoint`: a file in which the state is kept after every step; where it exists the fit goes on from there.
+    - `callback`: called with the unknowns and their cost at the start and after every step. `progress`: a progress bar.
+
+    **Returns:** a `Fit` at the best point, with the history of the cost; after an interruption (Ctrl-C) too, and
+    `status` says so.
+
+    **Raises:** `TypeError` for what is no optimizer; `ValueError` where a window cannot be simulated with the initial
+    guess, or a checkpoint is of another fit.
+    """
+    if not isinstance(optimizer, Optimizer):
+        raise TypeError(f"`optimizer` is such as LeastSquares(), GradientDescent() or BFGS(); got {optimizer!r}.")
+    refuse_other(problem, Problem, "minimize", "minimize(fit.problem, LeastSquares())")
+    if start is not None:
+        refuse_other(start, Unknowns, "`start=`", "start=fit.point, or change the system's values")
+    steps = optimizer.steps if steps is None else steps
+    if not isinstance(steps, int) or steps < 0:
+        raise ValueError(f"`steps` is a whole number that is not negative, got {steps!r}.")
+    start = problem.start if start is None else start
+    key = {} if checkpoint is None else {"method": optimizer.name, **optimizer.checkpoint_key(problem, steps)}
+    file, optimizer = Checkpoint(checkpoint, problem, **key), optimizer.with_steps(steps)
+    run = _resumed(file, problem, optimizer, start) or _first(problem, optimizer, start, steps)
+    first, status = run.now, "steps"
+    bar = tqdm(total=steps, initial=len(run.history) - 1, disable=not progress, desc=optimizer.name)
+    try:
+        if callback:
+            callback(run.now.point, run.now.cost)
+        for i in range(len(run.history) - 1, steps):
+            now = optimizer.step(problem, run.now, i)
+            if isinstance(now, str):
+                status = now
+                break
+            run.add(now)
+            file.write(point=now.point, state=now.state, best=run.best.point, history=np.array(run.history))
+            if callback:
+                callback(now.point, now.cost)
+            bar.update()
+            bar.set_postfix(cost=f"{now.cost:.6g}")
+        run.best, status = optimizer.finish(problem, run.best, status)
+    except KeyboardInterrupt:
+        status = "interrupted"
+    finally:
+        bar.close()
+    return _result(problem, optimizer, run, first, status)
+
+
+@dataclasses.dataclass
+class _Run:
+    """A search under way."""
+
+    now: Iterate
+    best: Iterate
+    history: list[float]
+
+    def add(self, now: Iterate) -> None:
+        self.now = now
+        self.history.append(now.cost)
+        if now.cost < self.best.cost:
+            self.best = now
+
+
+def _first(problem: Problem, optimizer: Optimizer, start: Unknowns, steps: int) -> _Run:
+    whole = np.array([n for _, _, n in problem.slices])
+    for share in optimizer.horizons:
+        coarse: Any = dataclasses.replace(optimizer, rtol=1e-3, horizons=())  # type: ignore[type-var]
+        part = problem.shortened(np.maximum(2, np.round(share * whole).astype(int)))
+        start = minimize(part, coarse, steps=steps, start=start).point
+    point, at = solve_nuisance(problem, start)
+    now = Iterate(point, at.cost, at, optimizer.init(problem, point, at))
+    return _Run(now, now, [at.cost])
+
+
+def _resumed(file: Checkpoint, problem: Problem, optimizer: Optimizer, start: Unknowns) -> _Run | None:
+    """The search as a checkpoint has it; None without one."""
+    saved = file.read(point=start, best=start, history=0.0)
+    if saved is None:
+        return None
+    at, at_best = (problem.linearize(saved[name]) for name in ("point", "best"))
+    if at is None or at_best is None or not (usable(at) and usable(at_best)):
+        raise ValueError(f"{file.path}: the residuals are not finite where this fit was left; delete the file.")
+    state = (file.read(state=optimizer.init(problem, saved["point"], at)) or {})["state"]
+    now = Iterate(saved["point"], at.cost, at, state)
+    return _Run(now, Iterate(saved["best"], at_best.cost, at_best, state), [float(c) for c in saved["history"]])
+
+
+def _result(problem: Problem, optimizer: Optimizer, run: _Run, first: Iterate, status: str) -> Fit:
+    best = run.best
+    at = problem.linearize(best.point) if best.at is None else best.at
+    if at is None or not usable(at):  # it can be simulated there, but has no derivatives
+        best, at, status = first, first.at, status if status == "interrupted" else "stuck"
+    assert at is not None
+    return Fit.of(problem, best.point, at, run.history, status, optimizer.name)
+
+
+def uninterrupted(fit: Any) -> Any:
+    """A fit that is a part of a study. **Raises:** `KeyboardInterrupt` where Ctrl-C ended it: that ends the study."""
+    if fit.status == "interrupted":
+        raise KeyboardInterrupt
+    return fit
+
+
+class Checkpoint:
+    """One file, `path`, for one problem and method; with `path` None nothing is kept.
+
+    `method`: its name, and whatever else of it the next step depends on, by name.
+    """
+
+    def __init__(self, path: str | os.PathLike[str] | None, problem: Problem, **method: Any):
+        self.path = None if path is None else Path(path).expanduser()
+        self.key = {} if path is None else {**method, **described(problem)}
+
+    def write(self, **state: Any) -> None:
+        """Keep the state, whole or not at all: a crash while writing leaves the one before."""
+        if self.path is not None:
+            write_state(self.path, self.key, state)
+
+    def read(self, **like: Any) -> dict[str, Any] | None:
+        """The state that was kept, or None; `like` has trees of the structure of what was written.
+
+        **Raises:** `ValueError` where the file belongs to another problem, data or method, or cannot be read.
+        """
+        if self.path is None or not self.path.exists():
+            return None
+        there, arrays = read_state(self.path)
+        wrong = differences(there, self.key)
+        if wrong:
+            raise ValueError(
+                f"{self.path} is the state of another fit. It differs in {wrong}. Name another file, or delete this "
+                "one."
+            )
+        return {name: tree_of(self.path, arrays, name, tree) for name, tree in like.items()}

@@ -115,9 +115,9 @@ class Unknowns(eqx.Module):
 
 
 class Nuisance(eqx.Module):
-    """Unknowns that are not asked for: `start`, names of the unknown part of a window's start; `trial`, pairs of a kind
+    """Unknowns beside the parameters: `start`, names of the unknown part of a window's start; `trial`, pairs of a kind
     and a channel or input that every trial has its own of. Standard deviations are those of priors, infinite without.
-    `jump` (n_z,): of the difference between a window's end and the next window's start, infinite where it is free.
+    `defect_std` (n_z,): of the jump from a window's end to the next window's start, infinite where it is free.
     """
 
     start: tuple[str, ...] = eqx.field(static=True)
@@ -125,7 +125,7 @@ class Nuisance(eqx.Module):
     has_defects: bool = eqx.field(static=True)
     start_deviation: Float[Array, " n_z"]
     trial_deviation: Float[Array, " n_b"]
-    jump: Float[Array, " n_z"]
+    defect_std: Float[Array, " n_z"]
 
     def of_trial(self, b: Array, kind: str, name: str, otherwise: float) -> Array:
         """The value of one of a trial's unknowns."""
@@ -151,15 +151,20 @@ class Ramps(eqx.Module):
 
 
 class Prediction(eqx.Module):
-    """What the model says of every window: `simulated` (W, n_c, n_t), with process noise predicted from what was
-    measured before; `status` (W,). With process noise only: `deviation` (W, n_c, n_t) of what is predicted, `value`
-    (W,), minus twice the log likelihood, and `unknowns` (W, n_b), what is unknown of the trial as it was found."""
+    """What the model predicts of every window: `simulated` (W, n_c, n_t), with process noise from the measurements
+    before; `status` (W,). With process noise only: `deviation` (W, n_c, n_t) of what is predicted, `cost` (W,), minus
+    twice the log likelihood, and `unknowns` (W, n_b), the trial's own as the filter estimates them."""
 
     simulated: Float[Array, "W n_c n_t"]
     status: Int[Array, " W"]
     deviation: Float[Array, "W n_c n_t"] | None = None
-    value: Float[Array, " W"] | None = None
+    cost: Float[Array, " W"] | None = None
     unknowns: Float[Array, "W n_b"] | None = None
+
+    @property
+    def with_deviations(self) -> np.ndarray:
+        """Simulated measurements, followed by their deviations where there are such: (W, n_c or 2 n_c, n_t)."""
+        return np.concatenate([x for x in (self.simulated, self.deviation) if x is not None], axis=1)
 
 
 class Model(eqx.Module):
@@ -175,7 +180,7 @@ class Model(eqx.Module):
     nuisance: Nuisance
     settings: Settings
     channels: tuple[str, ...] = eqx.field(static=True)
-    driven: tuple[str, ...] = eqx.field(static=True)  # inputs of which there are samples
+    sampled_inputs: tuple[str, ...] = eqx.field(static=True)
     zero_order_hold: tuple[str, ...] = eqx.field(static=True)
     assembled: tuple[str, ...] | None = eqx.field(static=True)  # coordinates that `assemble` moves, if not its own
     quaternions: tuple[tuple[int, ...], ...] = eqx.field(static=True, default=())  # places of Euler parameters
@@ -238,7 +243,7 @@ class Model(eqx.Module):
             bias = self.nuisance.of_trial(b, "bias of input", name, 0.0) + calibration.get(
                 ("offset of input", name), 0.0
             )
-            if name in self.driven:
+            if name in self.sampled_inputs:
                 gain = calibration.get(("gain of input", name), 1.0) * self.nuisance.of_trial(
                     b, "gain of input", name, 1.0
                 )
@@ -277,7 +282,7 @@ class Model(eqx.Module):
         difference = jnp.where(window.weight > 0, (simulated - window.measured) * window.weight, 0.0)
         end = packed(ride.state())
         following = self.known(window.next_start, calibration)
-        jump = jnp.where(window.linked > 0, (end - following)[self.unknown_places] / n.jump, 0.0)
+        jump = jnp.where(window.linked > 0, (end - following)[self.unknown_places] / n.defect_std, 0.0)
         rows = [difference.ravel(), *([jump] if n.has_defects else []), self.priors(window, z, b, x)]
         return jnp.concatenate(rows), Prediction(simulated, ride.status)
 

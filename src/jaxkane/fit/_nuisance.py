@@ -12,7 +12,7 @@ from jaxtyping import Array
 
 from .._integrate.trajectory import Status, reason
 from ._block_lsq import Eliminated, eliminate
-from ._linearize import Linearization, linearize, without_start
+from ._linearize import Linearization
 from ._model import Unknowns
 from ._problem import Problem
 
@@ -32,7 +32,7 @@ class Unsimulated(ValueError):
     """Windows that cannot be simulated to their end. `reasons`: by the number of their trial, why."""
 
     def __init__(self, problem: Problem, point: Unknowns, at: Linearization | None, bad: np.ndarray):
-        bad = without_start(problem, point) if at is None else bad
+        bad = problem.without_start(point) if at is None else bad
         self.reasons: dict[int, str] = {}
         for i in np.flatnonzero(bad):
             (k, first, n), why = problem.slices[i], "no consistent start"
@@ -73,13 +73,13 @@ def solve_nuisance(
 def _solved(problem: Problem, point: Unknowns, steps: int, rtol: float) -> tuple[Unknowns, Linearization]:
     whole = np.array([n for _, _, n in problem.slices])
     samples = whole.copy()
-    at = linearize(problem.shortened(samples), point)
+    at = problem.shortened(samples).linearize(point)
     while at is None or not at.good.all():
         bad = ~at.good if at is not None else np.full(len(whole), True)
         if at is None or np.any(samples[bad] <= 2):
             raise Unsimulated(problem, point, at, bad & (samples <= 2))
         samples = np.where(bad, np.maximum(samples // 2, 2), samples)
-        at = linearize(problem.shortened(samples), point)
+        at = problem.shortened(samples).linearize(point)
     stuck = 0
     while True:
         point, at = refined(problem.shortened(samples), point, at, steps if np.all(samples == whole) else 2, rtol)
@@ -88,14 +88,14 @@ def _solved(problem: Problem, point: Unknowns, steps: int, rtol: float) -> tuple
         longer = (
             np.minimum(2 * samples, whole) if stuck == 0 else np.minimum(samples + np.maximum(samples // 4, 1), whole)
         )
-        tried = linearize(problem.shortened(longer), point)
+        tried = problem.shortened(longer).linearize(point)
         bad = ~tried.good if tried is not None else np.full(len(whole), True)
         if np.all(samples[~bad] == longer[~bad]) and bad.any():
             stuck += 1
             if stuck > 2:
                 raise Unsimulated(problem, point, tried, bad)
         samples = np.where(bad, samples, longer)
-        at = tried if tried is not None and not bad.any() else linearize(problem.shortened(samples), point)
+        at = tried if tried is not None and not bad.any() else problem.shortened(samples).linearize(point)
         assert at is not None
 
 
@@ -112,7 +112,7 @@ def refined(
     damping, before = np.zeros(len(problem.trials)), _by_owner(at, owner, len(problem.trials))
     for _ in range(steps):
         tried = moved(point, still, eliminate(at.blocks, damping))
-        there = linearize(problem, tried)
+        there = problem.linearize(tried)
         after = np.full_like(before, np.inf) if there is None else _by_owner(there, owner, len(before))
         better = (after <= before) & (after < np.inf)
         damping = np.where(better, damping / 10, np.maximum(10 * damping, 1e-2))

@@ -1,7 +1,8 @@
-"""Least squares, gradient descent and BFGS for a fit."""
+"""Optimizers of a fit: their interface, least squares, gradient descent, BFGS."""
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
@@ -10,7 +11,6 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
@@ -20,12 +20,63 @@ from .._common.lookup import real_number
 from .._scalarjit.cache_key import jit
 from .._scalarjit.digest import digest
 from ._block_lsq import Eliminated, eliminate
-from ._density import half_cost
-from ._linearize import Linearization, cost, linearize
+from ._linearize import Linearization, half_cost
 from ._model import Unknowns
 from ._nuisance import moved, refined, solve_nuisance, usable
-from ._optimize import Iterate, Optimizer, minimize
 from ._problem import Problem
+
+
+@dataclasses.dataclass(frozen=True)
+class Iterate:
+    """A point of a search, its `cost`, and the problem linearized `at` it, where the optimizer needs that. `state`: a
+    tree of arrays, all else that the next step depends on."""
+
+    point: Unknowns
+    cost: float
+    at: Linearization | None
+    state: Any
+
+
+class Optimizer(abc.ABC):
+    """A method and its options: a frozen dataclass, without a state."""
+
+    steps: ClassVar[int]
+    """At most, by default."""
+    horizons: Sequence[float] = ()
+    """Shares of every window that are fitted before the whole."""
+
+    def __post_init__(self) -> None:
+        for name in ("rtol", "damping"):
+            label = f"{type(self).__name__}: `{name}`"
+            value = real_number(getattr(self, name, 0.0), label)
+            if not 0 <= value < float("inf"):
+                raise ValueError(f"{label} is a number that is not negative, got {value}.")
+
+    @property
+    @abc.abstractmethod
+    def name(self) -> str:
+        """For tables."""
+
+    def checkpoint_key(self, problem: Problem, steps: int) -> dict[str, Any]:
+        """By name, what the next step depends on besides the problem and the state: a checkpoint is resumed only where
+        that is the same."""
+        return {}
+
+    def with_steps(self, steps: int) -> Optimizer:
+        """The same for so many steps at most, where its options follow from that."""
+        return self
+
+    @abc.abstractmethod
+    def init(self, problem: Problem, point: Unknowns, at: Linearization) -> Any:
+        """The state before the first step."""
+
+    @abc.abstractmethod
+    def step(self, problem: Problem, now: Iterate, i: int) -> Iterate | str:
+        """The iterate after step number i, from 0; or the status (see `STATUS`) with which the search ends."""
+
+    def finish(self, problem: Problem, best: Iterate, status: str) -> tuple[Iterate, str]:
+        """The best iterate, refined at the end, and the status."""
+        return best, status
 
 
 @dataclasses.dataclass(frozen=True)
@@ -63,21 +114,12 @@ class LeastSquares(Optimizer):
     def name(self) -> str:
         return "Levenberg-Marquardt" if self.damping else "Gauss-Newton"
 
-    def before(self, problem: Problem, point: Unknowns, steps: int) -> Unknowns:
-        for share in self.horizons:
-            coarse = dataclasses.replace(self, rtol=1e-3, horizons=())
-            point = minimize(_part(problem, share), coarse, steps=steps, start=point).point
-        return point
-
-    def without_preparation(self) -> LeastSquares:
-        return dataclasses.replace(self, horizons=())
-
-    def begin(self, problem: Problem, point: Unknowns, at: Linearization) -> Array:
+    def init(self, problem: Problem, point: Unknowns, at: Linearization) -> Array:
         return jnp.asarray(self.damping, point.x.dtype)
 
-    def step(self, problem: Problem, now: Iterate, taken: int) -> Iterate | str:
+    def step(self, problem: Problem, now: Iterate, i: int) -> Iterate | str:
         """A step that is refused leaves the point and raises the damping."""
-        damping, at = float(now.memory), now.at
+        damping, at = float(now.state), now.at
         assert at is not None
         eliminated = eliminate(at.blocks, damping)
         x, promised = eliminated.step(damping)
@@ -88,7 +130,7 @@ class LeastSquares(Optimizer):
         if gain <= 0:  # all that a damped step promises is lost in rounding
             return "stuck"
         tried = moved(now.point, x, eliminated)
-        there = linearize(problem, tried)
+        there = problem.linearize(tried)
         if there is not None and usable(there) and there.cost >= at.cost:
             # Often only the nuisance values, which went along a straight line, are not yet where they belong.
             tried, there = refined(problem, tried, there, 3, self.rtol, enough=at.cost - 0.5 * gain)
@@ -100,7 +142,7 @@ class LeastSquares(Optimizer):
         if _is_refined(problem, at):
             return "converged"
         damping = max(5 * damping, 1e-3)
-        return dataclasses.replace(now, memory=jnp.asarray(damping, x.dtype)) if damping <= 1e8 else "stuck"
+        return dataclasses.replace(now, state=jnp.asarray(damping, x.dtype)) if damping <= 1e8 else "stuck"
 
 
 def _is_refined(problem: Problem, at: Linearization) -> bool:
@@ -110,11 +152,6 @@ def _is_refined(problem: Problem, at: Linearization) -> bool:
     known = problem.model.noise is not None or n_r <= n_unknown
     variance = 1.0 if known else at.squares / (n_r - n_unknown)
     return at.squares - float(eliminate(at.blocks, 0.0).step(0.0)[1]) <= 0.01 * variance
-
-
-def _part(problem: Problem, share: float) -> Problem:
-    """The first part of every window."""
-    return problem.shortened(np.array([max(2, round(share * n)) for _, _, n in problem.slices]))
 
 
 class DescentState(eqx.Module):
@@ -159,47 +196,47 @@ class GradientDescent(Optimizer):
     def name(self) -> str:
         return "gradient descent"
 
-    def depends_on(self, problem: Problem, steps: int) -> dict[str, Any]:
-        found: dict[str, Any] = {"refresh": self.refresh}
+    def checkpoint_key(self, problem: Problem, steps: int) -> dict[str, Any]:
+        key: dict[str, Any] = {"refresh": self.refresh}
         if self.transform is None:
-            return {**found, "optimizer": "default", "steps of its schedule": steps}
+            return {**key, "optimizer": "default", "steps of its schedule": steps}
         y = jnp.zeros_like(problem.start.x)
         with jax.numpy_dtype_promotion("standard"):
             program = jax.make_jaxpr(self.transform.update)(y, self.transform.init(y), y)
-        return {**found, "optimizer": digest(program)}
+        return {**key, "optimizer": digest(program)}
 
-    def for_steps(self, steps: int) -> GradientDescent:
+    def with_steps(self, steps: int) -> GradientDescent:
         if self.transform is not None:
             return self
         rate = optax.cosine_decay_schedule(0.3, max(steps, 1), 0.1)
         return dataclasses.replace(self, transform=optax.sgd(rate, momentum=0.6, nesterov=True))
 
-    def begin(self, problem: Problem, point: Unknowns, at: Linearization) -> DescentState:
+    def init(self, problem: Problem, point: Unknowns, at: Linearization) -> DescentState:
         assert self.transform is not None
         y, p = jnp.zeros_like(point.x), point.x.shape[0]
         return DescentState(y, jnp.eye(p, dtype=y.dtype), jnp.zeros((), y.dtype), self.transform.init(y))
 
-    def step(self, problem: Problem, now: Iterate, taken: int) -> Iterate | str:
-        at, memory = now.at, now.memory
+    def step(self, problem: Problem, now: Iterate, i: int) -> Iterate | str:
+        at, state = now.at, now.state
         assert at is not None
         assert self.transform is not None
         eliminated = eliminate(at.blocks, 0.0)
         if _is_minimum(at, eliminated, self.rtol):
             return "converged"
-        directions, unit, gradient = memory.directions, memory.unit, _gradient(eliminated)
-        if taken == 0 or (self.refresh and taken % self.refresh == 0):
+        directions, unit, gradient = state.directions, state.unit, _gradient(eliminated)
+        if i == 0 or (self.refresh and i % self.refresh == 0):
             directions = _directions(eliminated, at.squares / problem.size[0] if self.refresh else None)
         unit = unit if unit > 0 else jnp.linalg.norm(directions.T @ gradient)
-        step, y, of_optax = _descend(self.transform)(directions, unit, gradient, memory.of_optax, memory.y)
+        step, y, of_optax = _descend(self.transform)(directions, unit, gradient, state.of_optax, state.y)
         after = _guarded(problem, now.point, at, step, eliminated)
         if after is None:
             return "stuck"
         point, there = after
         return Iterate(point, there.cost, there, DescentState(y, directions, unit, of_optax))
 
-    def after(self, problem: Problem, best: Iterate, status: str) -> tuple[Iterate, str]:
+    def finish(self, problem: Problem, best: Iterate, status: str) -> tuple[Iterate, str]:
         point, at = solve_nuisance(problem, best.point, steps=3, rtol=1e-9)
-        return (Iterate(point, at.cost, at, best.memory) if at.cost <= best.cost else best), status
+        return (Iterate(point, at.cost, at, best.state) if at.cost <= best.cost else best), status
 
 
 @functools.lru_cache(maxsize=16)
@@ -242,7 +279,7 @@ def _guarded(problem: Problem, point: Unknowns, at: Linearization, step: Array, 
     """Where a step leads, halved until it can be simulated; None where even a thousandth cannot."""
     for _ in range(12):
         tried = moved(point, step, eliminated)
-        there = linearize(problem, tried)
+        there = problem.linearize(tried)
         if there is not None and usable(there) and there.cost <= at.cost + 3 * at.squares:
             return tried, there
         step = step / 2
@@ -287,10 +324,10 @@ class BFGS(Optimizer):
     def _solver(self) -> optx.AbstractMinimiser:
         return optx.BFGS(rtol=self.rtol, atol=self.rtol) if self.solver is None else self.solver
 
-    def depends_on(self, problem: Problem, steps: int) -> dict[str, Any]:
+    def checkpoint_key(self, problem: Problem, steps: int) -> dict[str, Any]:
         return {"solver": repr(self._solver)}
 
-    def begin(self, problem: Problem, point: Unknowns, at: Linearization) -> BFGSState:
+    def init(self, problem: Problem, point: Unknowns, at: Linearization) -> BFGSState:
         squares = jnp.sum(at.blocks.R**2, axis=(0, 1))
         n_z, n_x, n_b = at.blocks.n_z, at.blocks.n_x, at.blocks.n_b
         # Of each kind of unknown the mean curvature: what has no influence keeps a unit of its own.
@@ -303,19 +340,19 @@ class BFGS(Optimizer):
             lambda u, c: jnp.broadcast_to(jnp.where(c > 0, jax.lax.rsqrt(c), 1.0), u.shape), point, kinds
         )
         y = jnp.zeros_like(ravel_pytree(point)[0])
-        state = _begun(problem.model, problem.windows, problem.by_trial, self._solver, point, unit, y)
+        state = _init(problem.model, problem.windows, problem.by_trial, self._solver, point, unit, y)
         return BFGSState(point, unit, y, state, jnp.asarray(False), jnp.asarray(True))
 
-    def step(self, problem: Problem, now: Iterate, taken: int) -> Iterate | str:
+    def step(self, problem: Problem, now: Iterate, i: int) -> Iterate | str:
         # One step at a time, so that after Ctrl-C the best so far is known: a running program cannot be interrupted.
-        if now.memory.done:
-            return "converged" if now.memory.success else "stuck"
-        memory = _step(problem.model, problem.windows, problem.by_trial, self._solver, now.memory)
-        point = _unknowns(memory.origin, memory.unit, memory.y)
-        return Iterate(point, cost(problem, point), None, memory)
+        if now.state.done:
+            return "converged" if now.state.success else "stuck"
+        state = _step(problem.model, problem.windows, problem.by_trial, self._solver, now.state)
+        point = _unknowns(state.origin, state.unit, state.y)
+        return Iterate(point, problem.cost(point), None, state)
 
-    def after(self, problem: Problem, best: Iterate, status: str) -> tuple[Iterate, str]:
-        at = linearize(problem, best.point) if best.at is None else best.at
+    def finish(self, problem: Problem, best: Iterate, status: str) -> tuple[Iterate, str]:
+        at = problem.linearize(best.point) if best.at is None else best.at
         if at is None or not usable(at):
             return best, status
         to_gain = at.squares - float(eliminate(at.blocks, 0.0).step(1e-9)[1])
@@ -326,26 +363,26 @@ class BFGS(Optimizer):
 
 
 @jit
-def _begun(model, windows, by_trial, solver, origin, unit, y):
-    f = _of_round_unknowns(half_cost(model, windows, by_trial), origin, unit)
+def _init(model, windows, by_trial, solver, origin, unit, y):
+    f = _scaled(half_cost(model, windows, by_trial), origin, unit)
     return _of_strong_types(solver.init(f, y, None, {}, *jax.eval_shape(f, y, None), frozenset()))
 
 
 @jit
-def _step(model, windows, by_trial, solver, memory):
-    f = _of_round_unknowns(half_cost(model, windows, by_trial), memory.origin, memory.unit)
-    y, state, _ = solver.step(f, memory.y, None, {}, memory.of_optimistix, frozenset())
-    done, result = solver.terminate(f, y, None, {}, state, frozenset())
+def _step(model, windows, by_trial, solver, state):
+    f = _scaled(half_cost(model, windows, by_trial), state.origin, state.unit)
+    y, of_optimistix, _ = solver.step(f, state.y, None, {}, state.of_optimistix, frozenset())
+    done, result = solver.terminate(f, y, None, {}, of_optimistix, frozenset())
     success = result == optx.RESULTS.successful
-    return _of_strong_types(BFGSState(memory.origin, memory.unit, y, state, done | ~success, success))
+    return _of_strong_types(BFGSState(state.origin, state.unit, y, of_optimistix, done | ~success, success))
 
 
-def _of_strong_types(memory):
-    """As it comes back from a file, so that a fit that goes on does not compile its step anew."""
-    return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype) if eqx.is_array(x) else x, memory)
+def _of_strong_types(state):
+    """As it comes back from a file, so that a resumed fit does not compile its step anew."""
+    return jax.tree.map(lambda x: jax.lax.convert_element_type(x, x.dtype) if eqx.is_array(x) else x, state)
 
 
-def _of_round_unknowns(f, origin, unit):
+def _scaled(f, origin, unit):
     return lambda y, _: (f(_unknowns(origin, unit, y)), None)
 
 

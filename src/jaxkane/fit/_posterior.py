@@ -4,16 +4,55 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from ._block_lsq import Eliminated, eliminate
+from ._linearize import half_cost
+from ._model import Unknowns
 from ._problem import Problem, refuse_other
 from ._result import Fit
 
 LOG_2PI = math.log(2 * math.pi)
+
+
+def log_density(problem: Problem, *, over: str = "values") -> Callable[[Unknowns], Array]:
+    """The logarithm of the posterior density, up to a constant, as a function of `Unknowns`.
+
+        log p = -1/2 cost + log |det d values / d x|
+
+    `Unknowns` are unconstrained numbers only, so a sampler may go anywhere: parameters stay inside their bounds, and
+    bodies possible. Priors are part of the cost; `sigma` is taken as it was given, unless a factor of it is free. It
+    may be differentiated once, in either mode (`jax.grad`, `jax.jvp`).
+
+        density = log_density(fit.problem)
+        blackjax.nuts(density, ...)                                       # starts from fit.point
+        numpyro.infer.NUTS(potential_fn=lambda point: -density(point))    # init_params=fit.point
+
+    **Arguments:**
+
+    - `problem`: a `Problem`, such as `fit.problem`.
+    - `over`: "values": where there is no prior, all values of a parameter are as likely; "x": all its free numbers are,
+        as all orders of magnitude of a positive one.
+
+    **Returns:** a function of `Unknowns`; minus infinity where nothing can be simulated.
+    """
+    if over not in ("values", "x"):
+        raise ValueError(f"`over` is 'values' or 'x', got {over!r}.")
+    refuse_other(problem, Problem, "log_density", "log_density(fit.problem)")
+    cost = half_cost(problem.model, problem.windows, problem.by_trial)
+
+    def density(point: Unknowns) -> Array:
+        log_p = -cost(point)
+        if over == "values":
+            log_p = log_p + problem.parameters.log_determinant(point.x)
+        return jnp.where(jnp.isfinite(log_p), log_p, -jnp.inf)
+
+    return density
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,7 +145,7 @@ def log_nuisance_priors(problem: Problem) -> float:
     counts = (  # how many densities of each nuisance value there are, whose squares are in the cost
         (n.start_deviation, np.asarray(problem.windows.first).sum() if n.has_defects else len(problem.slices)),
         (n.trial_deviation, np.asarray(problem.windows.first).sum()),
-        (n.jump, np.asarray(problem.windows.linked).sum()),
+        (n.defect_std, np.asarray(problem.windows.linked).sum()),
     )
     for deviations, count in counts:
         known = np.asarray(deviations, float)[np.isfinite(deviations)]

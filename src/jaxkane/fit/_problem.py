@@ -1,12 +1,13 @@
-"""A fit that is posed: trials, windows, what is free and what is unknown. Knows names; knows no optimizer."""
+"""The problem that a fit solves: its specification, and residuals, cost and steps of integration at a point."""
 
 from __future__ import annotations
 
 import contextlib
 import copy
 import dataclasses
-from collections.abc import Collection, Mapping, Sequence
-from typing import Any, NamedTuple
+import inspect
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
 import jax
@@ -20,20 +21,30 @@ from .._kane.assembly import NoConfiguration, euler_parameters, found_of
 from .._kane.constraints import has_configuration_constraints
 from .._kane.rhs import output_names
 from .._system.system import System
-from . import _linearize as step_halving
 from ._declarations import Prior
-from ._linearize import check_same, rides_of, starts_of
-from ._model import Model, Nuisance, Simulation, Unknowns
+from ._linearize import (
+    Linearization,
+    blocks_by_all_processes,
+    blocks_of,
+    check_same,
+    costs_by_all_processes,
+    costs_of,
+    starts_of,
+    trajectories_of,
+)
+from ._model import Model, Nuisance, Prediction, Simulation, Unknowns
 from ._parameters import Parameters, as_items, parameters_of
 from ._process_noise import noise_of
 from ._trial import Trial, as_trials
 from ._windows import Reach, Windows, WindowSlice, cut, state_names
 
+Names = Sequence[str] | Mapping[str, float | None]
+"""Names, or names with the standard deviation of a Gaussian prior around the initial guess (None: no prior)."""
+
 
 @dataclasses.dataclass(frozen=True)
 class ProblemSpec:
-    """The arguments of `jaxkane.fit.fit` that pose it, but for the trials: all that a `Problem` is derived from, and
-    what it is posed by again."""
+    """All that specifies a `Problem` but its trials. `jaxkane.fit.fit` says what the arguments are."""
 
     system: System
     free: Any
@@ -67,24 +78,31 @@ class ProblemSpec:
         if self.window is not None and not real_number(self.window, "`window`") > 0:
             raise ValueError(f"`window` is a length of time [s], got {self.window}.")
         if self.defect_std is not None and self.window is None:
-            raise ValueError("`defect_std` binds the windows of a trial together: give their length, `window` [s].")
+            raise ValueError("`defect_std` links the windows of a trial: give their length, `window` [s].")
 
-    def with_priors(self, priors: Mapping[str, Prior]) -> ProblemSpec:
-        """The same with these priors in the place of those of the same names."""
-        return dataclasses.replace(self, priors={**(self.priors or {}), **priors})
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+
+def with_options(function: F) -> F:
+    """Put the options of a `ProblemSpec`, which a function takes as `**options`, into its signature."""
+    signature, spec = inspect.signature(function), inspect.signature(ProblemSpec)
+    parameters = list(signature.parameters.values())
+    options = [p for p in spec.parameters.values() if p.kind is p.KEYWORD_ONLY and p.name not in signature.parameters]
+    places = [i for i, p in enumerate(parameters) if p.kind in (p.KEYWORD_ONLY, p.VAR_KEYWORD)]
+    parameters[places[0] : places[0]] = options
+    parameters = [p for p in parameters if p.kind is not p.VAR_KEYWORD]
+    function.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    return function
 
 
 def refuse_other(given: Any, wanted: type, name: str, instead: str) -> None:
-    """What is asked before a fit takes a `Problem`, what is asked after it takes a `Fit`.
+    """Functions before a fit take a `Problem`, those after it a `Fit`.
 
     **Raises:** `TypeError` for anything else.
     """
     if not isinstance(given, wanted):
         raise TypeError(f"{name} takes a {wanted.__name__}, as in {instead}; got {type(given).__name__}.")
-
-
-Names = Sequence[str] | Mapping[str, float | None]
-"""Names, or names with the standard deviation of a Gaussian prior around the initial guess (None: no prior)."""
 
 
 def checked_trials(system: System, trials: Sequence[Trial]) -> tuple[str, ...]:
@@ -124,9 +142,8 @@ def checked_names(system: System, what: str, given: Any, known: Sequence[str]) -
     return numbers
 
 
-class Starts(NamedTuple):
-    """How the windows' starts are made to satisfy the constraints: as `assemble` does with a dict that names what is
-    known, measured or unknown.
+class StartAssembly(NamedTuple):
+    """How the starts of windows are made to satisfy the constraints, by `assemble`.
 
     - `moved`: the coordinates that it moves, None for those that it moves of an array.
     - `quaternions`: places of every four Euler parameters that are named, which are brought to unit norm before.
@@ -138,57 +155,57 @@ class Starts(NamedTuple):
     guess: dict[str, float]
 
 
-def starts_found(system: System, trials: Sequence[Trial], unknown: Sequence[str]) -> Starts:
-    """What a trial does not say of coordinates, and how that is found.
+def start_assembly(system: System, trials: Sequence[Trial], unknown: Sequence[str]) -> StartAssembly:
+    """How coordinates that a trial does not give are computed.
 
-    **Raises:** `ValueError` for a trial that says nothing of a coordinate which is held in the others.
+    **Raises:** `ValueError` for a trial that says nothing of a coordinate which others fix.
     """
     by_trial = [{*trial.initial, *trial.measured, *unknown} for trial in trials]
     named = [c for c in system.coordinates if any(c in names for names in by_trial)]
     fours = [(four, {system.coordinates[i] for i in four}) for four in euler_parameters(system)]
-    quaternions = tuple(four for four, names in fours if all(names <= said for said in by_trial))
+    quaternions = tuple(four for four, names in fours if all(names <= known for known in by_trial))
     moved = found_of(system, named)[0]
     guess = found_of(system, [c for c in named if c not in unknown])[1]
     q = jnp.zeros(len(system.coordinates))
     if system.dependent_coordinates or not has_configuration_constraints(system, jnp.zeros(()), q):
-        return Starts(None, quaternions, guess)
+        return StartAssembly(None, quaternions, guess)
     for trial, names in zip(trials, by_trial, strict=True):
         missing = [c for c in named if c not in names]
         if missing:
             raise ValueError(
-                f"{trial.name} says nothing of {', '.join(missing)}, which is held where other trials start: name it "
+                f"{trial.name} says nothing of {', '.join(missing)}, which other trials fix at their start: name it "
                 f"in `initial`, or give {type(system).__name__} its `dependent_coordinates`."
             )
-    return Starts(None if len(named) == len(system.coordinates) else moved, quaternions, guess)
+    return StartAssembly(None if len(named) == len(system.coordinates) else moved, quaternions, guess)
 
 
-def nuisance_of(asked: ProblemSpec, channels: Sequence[str], driven: Sequence[str]) -> Nuisance:
-    """What is unknown beside the parameters; `driven` are inputs with samples."""
-    system = asked.system
+def nuisance_of(spec: ProblemSpec, channels: Sequence[str], sampled: Sequence[str]) -> Nuisance:
+    """What is unknown beside the parameters; `sampled` are inputs with samples."""
+    system = spec.system
     known = {
         "sensor_bias": channels,
         "sensor_gain": channels,
         "input_bias": system.inputs,
-        "input_gain": driven,
-        "input_delay": driven,
+        "input_gain": sampled,
+        "input_delay": sampled,
     }
     trial = {}
     for argument, names in known.items():
         where, kind = argument.split("_")
-        for name, deviation in checked_names(system, argument, getattr(asked, argument), names).items():
+        for name, deviation in checked_names(system, argument, getattr(spec, argument), names).items():
             trial[f"{kind} of {where}", name] = deviation
     turned = {system.coordinates[i] for four in euler_parameters(system) for i in four}
     independent = tuple(c for c in system.coordinates if c not in system.dependent_coordinates or c in turned)
-    start = checked_names(system, "unknown", asked.unknown, (*independent, *system.speeds, *system.states))
-    jump = checked_names(system, "defect_std", asked.defect_std or {}, tuple(start))
+    start = checked_names(system, "unknown", spec.unknown, (*independent, *system.speeds, *system.states))
+    defects = checked_names(system, "defect_std", spec.defect_std or {}, tuple(start))
     array = lambda numbers: jnp.asarray(np.array(list(numbers), float), jnp.result_type(float))  # noqa: E731
     return Nuisance(
         start=tuple(start),
         trial=tuple(trial),
-        has_defects=asked.defect_std is not None,
+        has_defects=spec.defect_std is not None,
         start_deviation=array(start.values()),
         trial_deviation=array(trial.values()),
-        jump=array(jump.get(name, float("inf")) for name in start),
+        defect_std=array(defects.get(name, float("inf")) for name in start),
     )
 
 
@@ -216,6 +233,14 @@ def reach_of(trials: Sequence[Trial], parameters: Parameters, nuisance: Nuisance
     return (late, early) if len(reaches) > 1 else None
 
 
+STEP_TOLERANCE = 0.05, 0.25
+"""By how much halving the step of integration may move all residuals together, of a window and of all windows: it
+bounds the bias of an estimate in its standard errors."""
+
+HALVINGS = 8
+"""Of a step between two samples, at most: what needs more is stiff or chaotic."""
+
+
 @dataclasses.dataclass(frozen=True)
 class Problem:
     """Trials, free parameters and nuisance values of one fit.
@@ -233,55 +258,49 @@ class Problem:
     specification: ProblemSpec
 
     @classmethod
-    def of(
-        cls,
-        system: System,
-        trials: Sequence[Trial] | Trial,
-        free: Any,
-        **options: Any,
-    ) -> Problem:
-        """Pose a fit. The arguments are those of `jaxkane.fit.fit`, from `unknown` to `simulation`."""
-        return cls.posed(ProblemSpec(system, free, **options), trials)
+    @with_options
+    def of(cls, system: System, trials: Sequence[Trial] | Trial, free: Any, **options: Any) -> Problem:
+        """The problem that `jaxkane.fit.fit` solves, with the same arguments."""
+        return cls.of_specification(ProblemSpec(system, free, **options), trials)
 
     @classmethod
-    def posed(cls, asked: ProblemSpec, trials: Sequence[Trial] | Trial) -> Problem:
-        """What is asked, of these trials."""
-        system, window, simulation = asked.system, asked.window, asked.simulation or Simulation()
-        trials = as_trials(trials)
+    def of_specification(cls, spec: ProblemSpec, trials: Sequence[Trial] | Trial) -> Problem:
+        system, simulation, trials = spec.system, spec.simulation or Simulation(), as_trials(trials)
         channels = checked_trials(system, trials)
-        driven = tuple(name for name in system.inputs if any(name in trial.inputs for trial in trials))
-        nuisance = nuisance_of(asked, channels, driven)
-        deviations = jnp.concatenate([nuisance.start_deviation, nuisance.trial_deviation])
-        of_noise = noise_of(system, asked.noise, deviations, window, asked.defect_std)
-        held = tuple(checked_names(system, "zero_order_hold", asked.zero_order_hold, system.inputs))
-        starts = starts_found(system, trials, nuisance.start)
-        parameters = parameters_of(system, asked.free, asked.noise, channels).with_priors(asked.priors or {})
+        sampled = tuple(name for name in system.inputs if any(name in trial.inputs for trial in trials))
+        nuisance = nuisance_of(spec, channels, sampled)
+        noise = None
+        if spec.noise is not None:
+            deviations = jnp.concatenate([nuisance.start_deviation, nuisance.trial_deviation])
+            noise = noise_of(system, spec.noise, deviations, spec.window)
+        starts = start_assembly(system, trials, nuisance.start)
+        parameters = parameters_of(system, spec.free, spec.noise, channels).with_priors(spec.priors or {})
         windows, slices = cut(
             system,
             trials,
-            window,
+            spec.window,
             channels,
             has_defects=nuisance.has_defects,
             reach=reach_of(trials, parameters, nuisance),
             step=simulation.step,
             guess=starts.guess,
         )
-        varying = any(np.ptp(x) > 0 for t in trials for x in t.inputs.values())
+        varying = any(np.ptp(x) > 0 for trial in trials for x in trial.inputs.values())
         model = Model(
             system=system,
             parameters=parameters,
             nuisance=nuisance,
-            settings=simulation.settings(windows.t[0], varying or of_noise is not None),
+            settings=simulation.settings(windows.t[0], varying or noise is not None),
             channels=channels,
-            driven=driven,
-            zero_order_hold=held,
+            sampled_inputs=sampled,
+            zero_order_hold=tuple(checked_names(system, "zero_order_hold", spec.zero_order_hold, system.inputs)),
             assembled=starts.moved,
             quaternions=starts.quaternions,
-            noise=of_noise,
+            noise=noise,
         )
-        if asked.processes:
+        if spec.processes:
             check_same(model, windows)
-        problem = cls(model, windows, windows.by_trial, trials, slices, asked)
+        problem = cls(model, windows, windows.by_trial, trials, slices, spec)
         problem.check_system(problem.start)
         return problem.finer(problem.start) if problem.chooses_steps else problem
 
@@ -298,38 +317,6 @@ class Problem:
     def cost_name(self) -> str:
         """For tables."""
         return "sum of squares" if self.model.noise is None else "-2 log likelihood"
-
-    @property
-    def chooses_steps(self) -> bool:
-        """Whether fixed steps of integration are halved until they are fine enough: where no step was given."""
-        given = self.specification.simulation
-        return step_halving.has_steps(self) and (given is None or given.step is None)
-
-    @property
-    def processes(self) -> bool:
-        return self.specification.processes
-
-    def finer(self, point: Unknowns) -> Problem:
-        """The problem with steps halved where that changes what is simulated at a point by more than a share of the
-        noise."""
-        return step_halving.finer(self, point)
-
-    @property
-    def step_tolerance(self) -> float:
-        """By how much halving the step may move all residuals of one window together, in standard deviations."""
-        return step_halving.step_tolerance(self)
-
-    def step_errors(self, point: Unknowns, now: np.ndarray | None = None) -> np.ndarray:
-        """By how much halving the step moves all residuals of every window (W,) together, in standard deviations; NaN
-        where a window is not simulated to its end, or where the step follows from tolerances.
-
-        `now`: what is simulated at the point, where that is known.
-        """
-        return step_halving.step_errors(self, point, now)
-
-    def with_steps(self, step: Array) -> Problem:
-        """The same problem with other steps of integration (W,) [s]; nothing is compiled anew."""
-        return dataclasses.replace(self, windows=eqx.tree_at(lambda w: w.step, self.windows, step))
 
     @property
     def system(self) -> System:
@@ -391,14 +378,60 @@ class Problem:
         residuals += (T if n.has_defects else int(seen.sum())) * finite(n.start_deviation) + T * finite(
             n.trial_deviation
         )
-        residuals += int(np.asarray(self.windows.linked)[seen].sum()) * finite(n.jump)
+        residuals += int(np.asarray(self.windows.linked)[seen].sum()) * finite(n.defect_std)
         residuals += int(seen.sum()) * len(self.model.norms)
         unknowns = len(self.parameters.entries) + T * len(n.trial) + int(seen.sum()) * len(n.start)
         return residuals, unknowns
 
+    def linearize(self, point: Unknowns) -> Linearization | None:
+        """Residuals and their exact derivatives, by forward mode through the simulation; None where the constraints
+        cannot be met at the start of a window."""
+        starts = self._starts(point)
+        if starts is None:
+            return None
+        blocks: Any = blocks_by_all_processes if self.specification.processes else blocks_of
+        return Linearization(*blocks(self.model, self.windows, self.by_trial, point, *starts))
+
+    def cost(self, point: Unknowns) -> float:
+        """Sum of squares, with process noise minus twice the log likelihood, without derivatives; NaN or infinite where
+        a window could not be simulated."""
+        costs = self._costs(point)
+        return float("nan") if costs is None else float(jnp.sum(costs[0]))
+
+    def simulated(self, point: Unknowns) -> np.ndarray:
+        """What the sensors would have measured (W, n_c, n_t), with process noise followed by its deviations (W, 2 n_c,
+        n_t); NaN where that cannot be simulated."""
+        costs = self._costs(point)
+        if costs is None:
+            number = 1 if self.model.noise is None else 2
+            return np.full(np.tile(self.windows.measured, (1, number, 1)).shape, np.nan)
+        return costs[1].with_deviations
+
+    def without_start(self, point: Unknowns) -> np.ndarray:
+        """Whether the constraints can be met nowhere near the start of a window (W,)."""
+        missing = []
+        for i in range(len(self.slices)):
+            windows, z = jax.tree.map(lambda x, i=i: x[i : i + 1], (self.windows, point.z))
+            alone = dataclasses.replace(self, windows=windows)
+            missing.append(alone._starts(Unknowns(point.x, point.b, z)) is None)
+        return np.array(missing)
+
+    def _costs(self, point: Unknowns) -> tuple[Array, Prediction] | None:
+        starts = self._starts(point)
+        if starts is None:
+            return None
+        costs: Any = costs_by_all_processes if self.specification.processes else costs_of
+        return costs(self.model, self.windows, point, starts[0])
+
+    def _starts(self, point: Unknowns) -> tuple[Array, Array] | None:
+        try:
+            return starts_of(self.model, self.windows, point)
+        except eqx.EquinoxRuntimeError:  # Newton's linear solver raises on what is not finite
+            return None
+
     def trajectories(self, point: Unknowns) -> list[Trajectory]:
         """The motion of every window, in the order of `slices`."""
-        rides = rides_of(self.model, self.windows, point, starts_of(self.model, self.windows, point)[0])
+        rides = trajectories_of(self.model, self.windows, point, starts_of(self.model, self.windows, point)[0])
         return [
             jax.tree.map(lambda x, i=i, n=n: x[i, :n] if x.ndim > 1 else x[i], rides)
             for i, (_, _, n) in enumerate(self.slices)
@@ -427,13 +460,13 @@ class Problem:
         return dataclasses.replace(self, windows=new)
 
     def with_trials(self, trials: Sequence[Trial] | Trial) -> Problem:
-        """The same question, asked of other trials."""
-        return Problem.posed(self.specification, trials)
+        """The same specification with other trials."""
+        return Problem.of_specification(self.specification, trials)
 
-    def asking(self, other: ProblemSpec) -> Problem:
-        """Another question, asked of the same trials, of which the same count, with the same steps of integration."""
+    def with_specification(self, spec: ProblemSpec) -> Problem:
+        """Another specification with the same trials, of which the same count, and the same steps of integration."""
         counted = np.unique(np.asarray(self.windows.trial)[self.active_windows])
-        return Problem.posed(other, self.trials).with_steps(self.windows.step).only(counted.tolist())
+        return Problem.of_specification(spec, self.trials).with_steps(self.windows.step).only(counted.tolist())
 
     def without_defects(self) -> Problem:
         """The same problem in which every window starts freely; nothing is compiled anew."""
@@ -443,4 +476,75 @@ class Problem:
     def with_priors(self, priors: Mapping[str, Prior]) -> Problem:
         """The same problem with priors (mean, standard deviation) of parameters by name; nothing is compiled anew."""
         model = eqx.tree_at(lambda m: m.parameters, self.model, self.parameters.with_priors(priors))
-        return dataclasses.replace(self, model=model, specification=self.specification.with_priors(priors))
+        spec = dataclasses.replace(self.specification, priors={**(self.specification.priors or {}), **priors})
+        return dataclasses.replace(self, model=model, specification=spec)
+
+    @property
+    def has_steps(self) -> bool:
+        """Whether something follows from fixed steps: the motion, or what noise adds to it."""
+        return self.model.settings.step is not None or self.model.noise is not None
+
+    @property
+    def chooses_steps(self) -> bool:
+        """Whether fixed steps of integration are halved until they are fine enough: where no step was given."""
+        simulation = self.specification.simulation
+        return self.has_steps and (simulation is None or simulation.step is None)
+
+    @property
+    def step_tolerance(self) -> float:
+        """By how much halving the step may move all residuals of one window together, in standard deviations."""
+        one, together = STEP_TOLERANCE
+        return min(one, together / len(self.slices) ** 0.5)
+
+    def with_steps(self, step: Array) -> Problem:
+        """The same problem with other steps of integration (W,) [s]; nothing is compiled anew."""
+        return dataclasses.replace(self, windows=eqx.tree_at(lambda w: w.step, self.windows, step))
+
+    def step_errors(self, point: Unknowns, now: np.ndarray | None = None) -> np.ndarray:
+        """By how much halving the step moves all residuals of every window (W,) together, in standard deviations; NaN
+        where a window is not simulated to its end, or where the step follows from tolerances.
+
+        `now`: what is simulated at the point, where that is known.
+        """
+        if not self.has_steps:
+            return np.full(len(self.slices), np.nan)
+        now = self.simulated(point) if now is None else now
+        return self._distance(now, self.with_steps(self.windows.step / 2).simulated(point))
+
+    def finer(self, point: Unknowns) -> Problem:
+        """The problem with steps halved where that changes what is simulated at a point by more than a share of the
+        noise.
+
+        An input that is linear between its samples has a kink at every sample, on which error control spends ten
+        steps; a step from kink to kink meets none. Measured (the rides of a steered bicycle, 100 Hz, 1 s): 1300 steps
+        at a tolerance of 1e-7 against 100 of Bosh3, which differ by 0.002 of the measurements' deviation.
+        """
+        problem, first, before = self, self.windows.step, self.simulated(point)
+        going, last = np.full(len(self.slices), True), np.full(len(self.slices), np.inf)
+        for halvings in range(HALVINGS):
+            half = jnp.where(jnp.asarray(going), problem.windows.step / 2, problem.windows.step)
+            after = problem.with_steps(half).simulated(point)
+            distance = self._distance(before, after)
+            going &= ~(distance <= self.step_tolerance)
+            # Where halving does not reduce the difference, no step is fine enough: the motion is chaotic, or ends.
+            going &= (halvings < 2) | (np.isfinite(distance) & (distance <= last / 2))
+            if not going.any():
+                break
+            problem = problem.with_steps(jnp.where(jnp.asarray(going), half, problem.windows.step))
+            before, last = np.where(going[:, None, None], after, before), distance
+        lost = ~np.all(np.isfinite(np.where(self._weights(before) > 0, before, 0.0)), axis=(1, 2))
+        return problem.with_steps(jnp.where(jnp.asarray(lost), first, problem.windows.step))
+
+    def _distance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """The norm (W,) of a difference of simulations, in standard deviations; infinite where one of the two ended
+        earlier, NaN where both did."""
+        weight = self._weights(a)
+        lost = [np.any((weight > 0) & ~np.isfinite(x), axis=(1, 2)) for x in (a, b)]
+        with np.errstate(invalid="ignore"):
+            norm = np.linalg.norm(np.where(weight > 0, (b - a) * weight, 0.0), axis=(1, 2))
+        return np.where(lost[0] & lost[1], np.nan, np.where(lost[0] | lost[1], np.inf, norm))
+
+    def _weights(self, simulated: np.ndarray) -> np.ndarray:
+        """One over the standard deviations of what `simulated` gives."""
+        weight = np.asarray(self.windows.weight)
+        return np.tile(weight, (1, simulated.shape[1] // weight.shape[1], 1))

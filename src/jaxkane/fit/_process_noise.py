@@ -69,16 +69,12 @@ class Disturbance(eqx.Module):
         return disturbed, State(jnp.zeros_like(state.q), row(self.speeds), x)
 
 
-def noise_of(system: System, given: Any, deviations: Any, window: Any, defect_std: Any) -> Noise | None:
-    """The process noise that a fit was given by name, checked; None for a fit of least squares. `deviations`
-    (n_z + n_b,): of a trial's unknowns."""
-    if given is None:
-        return None
+def noise_of(system: System, given: Any, deviations: Array, window: float | None) -> Noise:
+    """Process noise by name, checked. `deviations` (n_z + n_b,): of a trial's unknowns."""
     if not isinstance(given, Mapping):
-        raise TypeError(
-            f"`noise` is a dict of spectral densities by name, {{{system.speeds[0]!r}: 0.1}}; got {given!r}."
-        )
-    if window is not None or defect_std is not None:
+        example = f"{{{system.speeds[0]!r}: 0.1}}"
+        raise TypeError(f"`noise` is a dict of spectral densities by name, {example}; got {given!r}.")
+    if window is not None:
         raise ValueError(
             "`noise` and `window` are two ways to follow a motion that one start does not determine: a filter, which "
             "goes on from every measurement, and windows, each with a start of its own. Give one of them."

@@ -22,10 +22,10 @@ from . import _statistics as residuals
 from ._block_lsq import Blocks
 from ._identifiability import Identifiability, identifiability_at
 from ._io import described, read_state, tree_of, write_state
-from ._linearize import STEP_TOLERANCE, Linearization, all_of, cost
+from ._linearize import Linearization
 from ._model import Prediction, Unknowns
 from ._parameters import Parameters
-from ._problem import Problem, refuse_other
+from ._problem import STEP_TOLERANCE, Problem, refuse_other
 from ._statistics import ByTrial, ResidualTest, residual_test
 from ._tables import STATUS, nuisance_by_trial, summary, table, title
 
@@ -78,7 +78,7 @@ class Fit:
         errors = np.full(len(problem.slices), np.nan)
         if status != "interrupted":
             try:
-                errors = problem.step_errors(point, all_of(at.prediction))
+                errors = problem.step_errors(point, at.prediction.with_deviations)
             except KeyboardInterrupt:
                 status = "interrupted"
         return cls(problem, point, at, errors, tuple(history), status, method)
@@ -354,7 +354,7 @@ def load(path: str | os.PathLike[str], problem: Problem) -> Fit:
 
 def _refuse_changed(path: Path, problem: Problem, point: Unknowns, at: Linearization, versions: str) -> None:
     """`ValueError` where what the code computes today is not what was computed for the fit."""
-    now = cost(problem, point)
+    now = problem.cost(point)
     if not abs(now - at.cost) <= SAME_COST * at.squares:
         raise ValueError(
             f"{path}: the code has changed since this fit was saved (by {versions}), and {problem.cost_name} with it: "

@@ -17,7 +17,7 @@ from .._scalarjit.cache_key import jit
 from .._system.system import unpacked
 from . import _kalman as kalman
 from ._kalman import brought_back, filtered
-from ._linearize import each, starts_of
+from ._linearize import map_windows, starts_of
 from ._model import Model, Unknowns
 from ._problem import refuse_other
 from ._result import Fit
@@ -142,4 +142,4 @@ def _smoothed(model: Model, windows: Any, point: Unknowns, starts: Array, begin:
 
         return jax.vmap(at)(window.t, v, S)
 
-    return each(of_trial, (windows, point.b[windows.trial], starts, begin))
+    return map_windows(of_trial, (windows, point.b[windows.trial], starts, begin))

@@ -13,11 +13,10 @@ from tqdm import tqdm
 
 from .._common.lookup import hint, real_number
 from ._diagnostics import bad_channels
-from ._linearize import cost
+from ._fit import minimize, uninterrupted
 from ._model import Unknowns
 from ._nuisance import solve_nuisance
-from ._optimize import Optimizer, minimize, uninterrupted
-from ._optimizers import LeastSquares
+from ._optimizers import LeastSquares, Optimizer
 from ._problem import Problem, refuse_other
 from ._result import Fit
 from ._windows import Windows
@@ -116,7 +115,7 @@ def multi_start(
     drawn = rng.uniform(-spread, spread, (max(n, candidates or n), p))
     points = [eqx.tree_at(lambda q: q.x, problem.start, jnp.asarray(x, problem.windows.t.dtype)) for x in drawn]
     if len(points) > n:
-        costs = np.nan_to_num([cost(problem, point) for point in points], nan=np.inf)
+        costs = np.nan_to_num([problem.cost(point) for point in points], nan=np.inf)
         points = [points[i] for i in np.argsort(costs)[:n]]
     found, failures, untried = [], [], 0
     for i, point in enumerate(tqdm(points, disable=not progress, desc="initial guesses")):
@@ -230,7 +229,7 @@ def check_signs(fit: Fit) -> tuple[str, ...]:
         return ()
     notes, problem = [], fit.problem
     for i, name in enumerate(problem.system.inputs):
-        if name not in problem.model.driven:
+        if name not in problem.model.sampled_inputs:
             continue
         flipped = problem.windows.inputs.at[:, i].multiply(-1.0)
         notes += _if_better(fit, eqx.tree_at(lambda w: w.inputs, problem.windows, flipped), f"the input {name}")

@@ -9,9 +9,9 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
+from ._fit import minimize, uninterrupted
 from ._model import Unknowns
 from ._nuisance import Unsimulated, solve_nuisance
-from ._optimize import minimize, uninterrupted
 from ._optimizers import LeastSquares
 from ._problem import Problem, refuse_other
 from ._result import Fit
@@ -168,7 +168,7 @@ def costs_by_trial(problem: Problem, point: Unknowns) -> np.ndarray:
             others = problem.with_trials([problem.trials[k] for k in kept])
             costs[kept] = costs_by_trial(others, dataclasses.replace(others.start, x=point.x))
         return costs
-    value = at.prediction.value
+    value = at.prediction.cost
     costs = np.sum(np.asarray(at.blocks.R)[:, :, -1] ** 2, axis=1) if value is None else np.asarray(value)
     return np.bincount(np.asarray(problem.windows.trial), costs, minlength=len(problem.trials))
 

@@ -13,9 +13,9 @@ from ..catalog._entry import read_bicycle_file
 from ._declarations import Inertia, Prior
 from ._fit import solve
 from ._model import Unknowns
-from ._optimize import Optimizer
+from ._optimizers import GradientDescent, Optimizer
 from ._parameters import parameters_of
-from ._problem import Problem
+from ._problem import Problem, with_options
 from ._result import Fit
 from ._trial import Trial, as_trials
 
@@ -24,6 +24,7 @@ SIGMA = {"roll": 0.01, "steer": 0.02, "roll_rate": 0.1, "steer_rate": 0.2}
 """Standard deviations of a ride's channels where nothing better is known [rad, rad/s]."""
 
 
+@with_options
 def fit_bicycle(
     rides: Sequence[Trial] | Trial,
     bicycle: WhippleBicycle,
@@ -42,16 +43,19 @@ def fit_bicycle(
         fit_bicycle(rides, bicycle, free=("steer_damping",), input_bias=("roll_torque", "steer_torque"), window=1.0)
 
     **Arguments:** `rides`, `bicycle`, `free` and `options` as in `bicycle_problem`, of which the most used are
-    `unknown`, `window`, `input_bias`, `sensor_bias`, `priors` and `zero_order_hold`; the rest as in `fit`.
+    `unknown`, `window`, `input_bias`, `sensor_bias`, `priors` and `zero_order_hold`; the rest as in `fit`, with
+    `GradientDescent()` as the default `optimizer`.
 
     **Returns:** a `Fit`.
 
     **Raises:** `ValueError` for a ride without a speed, and what `fit` raises.
     """
     problem = bicycle_problem(rides, bicycle, free, **options)
+    optimizer = GradientDescent() if optimizer is None else optimizer
     return solve(problem, optimizer, steps, start, checkpoint, callback, progress)
 
 
+@with_options
 def bicycle_problem(
     rides: Sequence[Trial] | Trial,
     bicycle: WhippleBicycle,
