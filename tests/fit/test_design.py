@@ -7,7 +7,7 @@ from slopes import differences, slopes
 from systems import Track
 
 from jaxkane.fit import LeastSquares, Problem, Trial, design, minimize
-from jaxkane.fit._design import covariance_of, goal_of
+from jaxkane.fit._design import covariance_of, objective_of
 
 t = np.arange(0.0, 4.0, 0.1)
 SIGMA = {"x": 0.01}
@@ -73,8 +73,8 @@ def test_the_gradient_of_a_plan_against_differences():
     known = {name: np.asarray(x) for name, x in push(C, jnp.asarray(t)).items()}
     trial = Trial(t, {"x": 0.0 * t}, known, sigma=SIGMA, initial={"x": 0.1})
     problem = Problem.of(Track(), trial, ("gain", "drift"), **CHAIN)
-    goal = goal_of(problem, jnp.asarray(t), push, np.arange(2), "A", {"x": 0.5})
-    both = slopes(lambda c, _: goal(c, problem.model, problem.windows)[0], "forward")
+    objective = objective_of(problem, jnp.asarray(t), push, np.arange(2), "A", {"x": 0.5})
+    both = slopes(lambda c, _: objective(c, problem.model, problem.windows)[0], "forward")
     np.testing.assert_allclose(both(C)[0], differences(both, C, 1e-5), rtol=1e-5)
 
 

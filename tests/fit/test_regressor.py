@@ -442,7 +442,7 @@ def test_bad_data_are_refused_by_name():
         KinematicSamples(at.t, at.q, at.u, np.nan * at.u_dot)
     with pytest.raises(ValueError, match=r"`u` \(60,\)"):
         KinematicSamples(at.t, at.q, at.u[:, 0], at.u_dot)
-    with pytest.raises(ValueError, match="has 2 coordinates and 2 independent speeds; the instants have 1"):
+    with pytest.raises(ValueError, match="has 2 coordinates and 2 independent speeds; the samples have 1"):
         base_parameters(truth, KinematicSamples(at.t, at.q[:, :1], at.u, at.u_dot))
     with pytest.raises(ValueError, match="no input or state named torque3"):
         base_parameters(truth, KinematicSamples(at.t, at.q, at.u, at.u_dot, {"torque3": 0.0}))

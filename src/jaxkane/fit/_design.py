@@ -1,4 +1,4 @@
-"""Design of experiments: the information of a planned trial, and the input that maximizes it."""
+"""Optimal design of experiments: the Fisher information of a planned trial, and the input that maximizes it."""
 
 from __future__ import annotations
 
@@ -25,109 +25,13 @@ from ._problem import Problem
 from ._trial import Trial
 from ._windows import Windows, state_names
 
-Goal = Callable[[Any, Model, Windows], tuple[Array, tuple[Array, Windows, Array]]]
-"""Of coefficients, model and windows: the criterion, and with it the information about the scaled parameters (p, p),
-the windows, and what would be measured (W, n_c, n_t)."""
-
-
-def goal_of(
-    problem: Problem,
-    t: Array,
-    signals: Callable[[Any, Array], Mapping[str, Array]],
-    places: np.ndarray,
-    criterion: str,
-    limits: Mapping[str, float],
-) -> Goal:
-    """The criterion of optimal design, as a function that JAX can differentiate."""
-    point, chained = problem.start, problem.model.nuisance.has_defects
-    fixed = None if chained else starts_of(problem.model, problem.windows, point)
-    bounds = jnp.asarray([limits.get(c, np.inf) for c in problem.channels], t.dtype)
-    # Windows take their samples from the trial's; where a sample stands in it does not change.
-    where = jnp.searchsorted(t, problem.windows.t_input).clip(0, t.shape[0] - 1)
-
-    def goal(c: Any, model: Model, windows: Windows):
-        now, zero = signals(c, t), jnp.zeros_like(t)
-        samples = jnp.stack([now.get(name, zero)[where] for name in problem.system.inputs], axis=1)
-        windows = eqx.tree_at(lambda w: w.inputs, windows, samples)
-        windows = _one_motion(model, windows, point) if chained else windows
-        starts, starts_dot = starts_of(model, windows, point) if fixed is None else fixed
-        information, simulated = _information(model, windows, point, starts, starts_dot)
-        floor = 1e-12 * jnp.trace(information) * jnp.eye(information.shape[0], dtype=information.dtype)
-        part = jnp.linalg.inv(information + floor)[places][:, places]
-        value = jnp.linalg.slogdet(part)[1] if criterion == "D" else jnp.trace(part)
-        excess = jax.nn.relu(jnp.abs(simulated) / bounds[None, :, None] - 1.0)
-        return value + 100.0 * jnp.mean(excess**2), (information, windows, simulated)
-
-    return goal
-
-
-def _one_motion(model: Model, windows: Windows, point: Unknowns) -> Windows:
-    """Windows that each begin where the one before ends."""
-    first = jax.tree.map(lambda x: x[0], windows)
-
-    def go_on(start: Array, window: Windows) -> tuple[Array, Array]:
-        ride = model.simulate(window, start, point.b[0], point.x)
-        return packed(ride.state()), start
-
-    end, starts = jax.lax.scan(go_on, model.consistent(first, point.z[0], point.x), windows)
-    return eqx.tree_at(lambda w: (w.start, w.next_start), windows, (starts, jnp.append(starts[1:], end[None], axis=0)))
-
-
-def _information(
-    model: Model, windows: Windows, point: Unknowns, starts: Array, starts_dot: Array
-) -> tuple[Array, Array]:
-    """About the scaled parameters (p, p), the others eliminated, and what would be measured (W, n_c, n_t).
-
-    By normal equations, whose derivatives, unlike a QR decomposition's, always exist.
-    """
-    n_z, n_b, p = point.z.shape[1], point.b.shape[1], point.x.shape[0]
-    n_next = n_z if model.nuisance.has_defects else 0
-
-    def of_window(arguments):
-        window, z, b, start, start_dot = arguments
-        r, J, seen = jacobian_of(model, window, start, start_dot, z, b, point.x)
-        links = by_next(model, window, r.shape[0])[:, :n_next]
-        J = jnp.column_stack([J[:, :n_z], links, J[:, n_z:]])  # by [z, z_next, b, x]
-        return J.T @ J, seen.simulated
-
-    N, simulated = map_windows(of_window, (windows, point.z, point.b[windows.trial], starts, starts_dot))
-    # What a window and those before it say about [z_next, b, x] is known of [z, b, x] in the next.
-    places = np.r_[:n_next, n_z + n_next : n_z + n_next + n_b + p]
-
-    def go_on(known: Array, N: Array) -> tuple[Array, None]:
-        return _without(N.at[places[:, None], places[None, :]].add(known), n_z), None
-
-    known, _ = jax.lax.scan(go_on, jnp.zeros((places.size, places.size), N.dtype), N)
-    information = _without(known[n_next:, n_next:], n_b)
-    slopes = model.parameters.slopes(point.x)
-    to_x = jnp.linalg.solve(slopes, jnp.diag(jnp.linalg.norm(slopes, axis=1)))
-    return to_x.T @ information @ to_x, simulated
-
-
-def covariance_of(information: np.ndarray) -> np.ndarray:
-    """Its inverse (p, p), infinite for parameters of which it says nothing."""
-    s, V = np.linalg.eigh(information)
-    known = s > 1e-11 * s.max()
-    return infinite_along((V[:, known] / s[known]) @ V[:, known].T, V[:, ~known].T)
-
-
-def _without(N: Array, n: int) -> Array:
-    """The Schur complement that is left of (k, k) when the first n unknowns are eliminated."""
-    if n == 0:
-        return N
-    first, cross = N[:n, :n], N[:n, n:]
-    size = jnp.sqrt(jnp.diagonal(first) + jnp.finfo(N.dtype).tiny)
-    first = first / size[:, None] / size[None, :] + 1e-12 * jnp.eye(n, dtype=N.dtype)
-    cross = cross / size[:, None]
-    return N[n:, n:] - cross.T @ jnp.linalg.solve(first, cross)
-
 
 @dataclasses.dataclass(frozen=True)
 class Design:
     """A planned experiment, and the errors it would leave.
 
-    - `coefficients`: of the input; `inputs`: its samples (n_t,) by name; `trial`: the plan, with what the system would
-        do as its measurements.
+    - `coefficients`: of the input; `inputs`: its samples (n_t,) by name; `trial`: the plan, with the predicted motion
+        as its measurements.
     - `standard_errors`, `correlation`: of the parameters, for noise as in `sigma`, infinite where the plan has no
         information; `before`: the same at the start. They are those of a fit of `trial` with the same options.
     - `history`: of the criterion, with what exceeds the limits.
@@ -153,19 +57,15 @@ class Design:
     def correlation(self) -> np.ndarray:
         return _correlation(self.covariance)
 
-    @property
-    def correlation_before(self) -> np.ndarray:
-        return _correlation(self.covariance_before)
-
     def __str__(self) -> str:
         lines = [f"{'parameter':<22}{'std. error before':>18}{'after':>12}{'ratio':>8}"]
         for name, after in self.standard_errors.items():
             lines.append(f"{name:<22}{self.before[name]:>18.3g}{after:>12.3g}{after / self.before[name]:>8.2f}")
-        p = len(self.names)
-        worst = [
-            np.abs(c[~np.eye(p, dtype=bool)]).max(initial=0.0) for c in (self.correlation_before, self.correlation)
-        ]
-        return "\n".join([*lines, f"largest correlation: {worst[0]:.3f} before, {worst[1]:.3f} after"])
+        off_diagonal = ~np.eye(len(self.names), dtype=bool)
+        before, after = (
+            np.abs(_correlation(c)[off_diagonal]).max(initial=0.0) for c in (self.covariance_before, self.covariance)
+        )
+        return "\n".join([*lines, f"largest correlation: {before:.3f} before, {after:.3f} after"])
 
 
 def _correlation(covariance: np.ndarray) -> np.ndarray:
@@ -210,7 +110,7 @@ def design(
     - `rms`: root mean squares that inputs are scaled to, by name. `limits`: magnitudes that channels should not exceed.
     - `steps`, `rate`: of Adam on the coefficients.
 
-    **Returns:** a `Design` at the best coefficients seen; print it for a table.
+    **Returns:** a `Design` at the best coefficients of the search; print it for a table.
 
     **Raises:** `ValueError` for a name that is not free, another criterion, or a trial that cannot be simulated.
     """
@@ -227,11 +127,11 @@ def design(
     problem = Problem.of(system, plan.trial(coefficients), free, **options)
     if problem.model.settings.step is None:
         raise ValueError("`inputs` must vary in time where the search starts, or give `Simulation(step=...)`.")
-    goal = goal_of(problem, t, plan.signals, places, criterion, limits or {})
-    first, best, history = _descended(problem, goal, coefficients, steps, rate, progress)
+    objective = objective_of(problem, t, plan.signals, places, criterion, limits or {})
+    first, best, history = _minimized(problem, objective, coefficients, steps, rate, progress)
     scales = np.linalg.norm(np.asarray(problem.parameters.slopes(problem.start.x)), axis=1)
     before, after = (covariance_of(np.asarray(x.information)) * np.outer(scales, scales) for x in (first, best))
-    trial = plan.carried_out(problem, best)
+    trial = plan.predicted(problem, best)
     return Design(best.coefficients, trial.inputs, trial, names, after, before, history)
 
 
@@ -247,33 +147,32 @@ class _Plan:
 
     def signals(self, coefficients: Any, t: Array) -> dict[str, Array]:
         """Samples (n_t,) by name, scaled to their root mean squares."""
-        found = dict(self.inputs(coefficients, t))
+        signals = dict(self.inputs(coefficients, t))
         for name, size in self.rms.items():
-            found[name] = size * found[name] / jnp.sqrt(jnp.mean(found[name] ** 2))
-        return found
+            signals[name] = size * signals[name] / jnp.sqrt(jnp.mean(signals[name] ** 2))
+        return signals
 
     def trial(self, coefficients: Any, measured: Mapping[str, Any] | None = None) -> Trial:
         """The trial, by default as if all that is measured were zero."""
-        now = {name: np.asarray(x) for name, x in self.signals(coefficients, self.t).items()}
+        inputs = {name: np.asarray(x) for name, x in self.signals(coefficients, self.t).items()}
         zeros = {name: np.zeros(self.t.shape) for name in self.sigma}
-        return Trial(self.t, measured or zeros, now, sigma=self.sigma, initial=self.initial, name="plan")
+        return Trial(self.t, measured or zeros, inputs, sigma=self.sigma, initial=self.initial, name="plan")
 
-    def carried_out(self, problem: Problem, found: _Found) -> Trial:
-        """The trial with what the system would do as its measurements."""
-        rows = _joined(problem, [np.asarray(x) for x in found.simulated])
-        trial = self.trial(found.coefficients, dict(zip(problem.channels, rows, strict=True)))
+    def predicted(self, problem: Problem, best: _Iterate) -> Trial:
+        """The trial with the predicted motion as its measurements."""
+        rows = _joined(problem, [np.asarray(x) for x in best.simulated])
+        trial = self.trial(best.coefficients, dict(zip(problem.channels, rows, strict=True)))
         if not problem.model.nuisance.has_defects:
             return trial
         # Every window is known to begin where the motion is.
-        rides = dataclasses.replace(problem, windows=found.windows).trajectories(problem.start)
-        moves = _joined(problem, [np.concatenate([ride.q, ride.u, ride.x], axis=1).T for ride in rides])
-        known = dict(zip(state_names(problem.system), moves, strict=True))
-        return trial.with_initial_state(known)
+        rides = dataclasses.replace(problem, windows=best.windows).trajectories(problem.start)
+        states = _joined(problem, [np.concatenate([ride.q, ride.u, ride.x], axis=1).T for ride in rides])
+        return trial.with_initial_state(dict(zip(state_names(problem.system), states, strict=True)))
 
 
 @dataclasses.dataclass(frozen=True)
-class _Found:
-    """One step of the search: the criterion there, and what goes with it (see `goal_of`)."""
+class _Iterate:
+    """One step of the search: the criterion there, and what goes with it (see `Objective`)."""
 
     value: float
     coefficients: Any
@@ -282,10 +181,10 @@ class _Found:
     simulated: Array
 
 
-def _descended(
-    problem: Problem, goal: Goal, coefficients: Any, steps: int, rate: float, progress: bool
-) -> tuple[_Found, _Found, tuple[float, ...]]:
-    """The first and the best of what Adam found, and the history of the criterion.
+def _minimized(
+    problem: Problem, objective: Objective, coefficients: Any, steps: int, rate: float, progress: bool
+) -> tuple[_Iterate, _Iterate, tuple[float, ...]]:
+    """The first and the best iterate of Adam, and the history of the criterion.
 
     **Raises:** `ValueError` where the plan cannot be simulated at the start.
     """
@@ -293,30 +192,127 @@ def _descended(
     @eqx.filter_jit
     def gradient(c, model, windows):
         flat, unravel = ravel_pytree(c)
-        along = lambda flat: goal(unravel(flat), model, windows)  # noqa: E731
-        value, more = along(flat)
-        return value, unravel(jax.jacfwd(along, has_aux=True)(flat)[0]), more
+        of_flat = lambda flat: objective(unravel(flat), model, windows)  # noqa: E731
+        value, aux = of_flat(flat)
+        return value, unravel(jax.jacfwd(of_flat, has_aux=True)(flat)[0]), aux
 
-    descent = optax.adam(optax.cosine_decay_schedule(rate, max(steps, 1), 0.1))
-    memory, c, found = descent.init(coefficients), coefficients, []
+    adam = optax.adam(optax.cosine_decay_schedule(rate, max(steps, 1), 0.1))
+    state, c, history = adam.init(coefficients), coefficients, []
     first = best = None
     for _ in tqdm(range(steps + 1), disable=not progress, desc="design"):
-        value, slope, more = gradient(c, problem.model, problem.windows)
+        value, slope, aux = gradient(c, problem.model, problem.windows)
         if not np.isfinite(float(value)):
             break
-        now = _Found(float(value), c, *more)
-        first = now if first is None else first
-        best = now if best is None or now.value < best.value else best
-        found.append(now.value)
+        iterate = _Iterate(float(value), c, *aux)
+        first = first or iterate
+        best = iterate if best is None or iterate.value < best.value else best
+        history.append(iterate.value)
         with jax.numpy_dtype_promotion("standard"):
-            updates, memory = descent.update(slope, memory, c)
+            updates, state = adam.update(slope, state, c)
             c = optax.apply_updates(c, updates)
     if first is None or best is None:
         raise ValueError("The plan cannot be simulated where the search starts, or has no information at all.")
-    return first, best, tuple(found)
+    return first, best, tuple(history)
 
 
 def _joined(problem: Problem, of_windows: Sequence[np.ndarray]) -> np.ndarray:
     """Rows (m, n_t) of the whole trial from those of its windows."""
     pairs = zip(of_windows, problem.slices, strict=True)
     return np.concatenate([rows[:, :n] for rows, (_, _, n) in pairs], axis=1)
+
+
+Objective = Callable[[Any, Model, Windows], tuple[Array, tuple[Array, Windows, Array]]]
+"""Of coefficients, model and windows: the criterion, and with it the information about the scaled parameters (p, p),
+the windows, and what would be measured (W, n_c, n_t)."""
+
+
+def objective_of(
+    problem: Problem,
+    t: Array,
+    signals: Callable[[Any, Array], Mapping[str, Array]],
+    places: np.ndarray,
+    criterion: str,
+    limits: Mapping[str, float],
+) -> Objective:
+    """The criterion of optimal design, as a function that JAX can differentiate."""
+    point, is_one_motion = problem.start, problem.model.nuisance.has_defects
+    fixed = None if is_one_motion else starts_of(problem.model, problem.windows, point)
+    bounds = jnp.asarray([limits.get(c, np.inf) for c in problem.channels], t.dtype)
+    # Windows take their samples from the trial's, at places that do not change.
+    sample = jnp.searchsorted(t, problem.windows.t_input).clip(0, t.shape[0] - 1)
+
+    def objective(coefficients: Any, model: Model, windows: Windows):
+        inputs, zero = signals(coefficients, t), jnp.zeros_like(t)
+        samples = jnp.stack([inputs.get(name, zero)[sample] for name in problem.system.inputs], axis=1)
+        windows = eqx.tree_at(lambda w: w.inputs, windows, samples)
+        windows = _one_motion(model, windows, point) if is_one_motion else windows
+        starts, starts_dot = starts_of(model, windows, point) if fixed is None else fixed
+        information, simulated = _information(model, windows, point, starts, starts_dot)
+        floor = 1e-12 * jnp.trace(information) * jnp.eye(information.shape[0], dtype=information.dtype)
+        covariance = jnp.linalg.inv(information + floor)[places][:, places]
+        value = jnp.linalg.slogdet(covariance)[1] if criterion == "D" else jnp.trace(covariance)
+        excess = jax.nn.relu(jnp.abs(simulated) / bounds[None, :, None] - 1.0)
+        return value + 100.0 * jnp.mean(excess**2), (information, windows, simulated)
+
+    return objective
+
+
+def _one_motion(model: Model, windows: Windows, point: Unknowns) -> Windows:
+    """Windows that each begin where the one before ends."""
+    first = jax.tree.map(lambda x: x[0], windows)
+
+    def step(start: Array, window: Windows) -> tuple[Array, Array]:
+        ride = model.simulate(window, start, point.b[0], point.x)
+        return packed(ride.state()), start
+
+    end, starts = jax.lax.scan(step, model.consistent(first, point.z[0], point.x), windows)
+    return eqx.tree_at(lambda w: (w.start, w.next_start), windows, (starts, jnp.append(starts[1:], end[None], axis=0)))
+
+
+def _information(
+    model: Model, windows: Windows, point: Unknowns, starts: Array, starts_dot: Array
+) -> tuple[Array, Array]:
+    """About the scaled parameters (p, p), the others eliminated, and what would be measured (W, n_c, n_t).
+
+    By normal equations, whose derivatives, unlike a QR decomposition's, always exist.
+    """
+    n_z, n_b, p = point.z.shape[1], point.b.shape[1], point.x.shape[0]
+    n_next = n_z if model.nuisance.has_defects else 0
+
+    def of_window(arguments):
+        window, z, b, start, start_dot = arguments
+        r, J, prediction = jacobian_of(model, window, start, start_dot, z, b, point.x)
+        links = by_next(model, window, r.shape[0])[:, :n_next]
+        J = jnp.column_stack([J[:, :n_z], links, J[:, n_z:]])  # by [z, z_next, b, x]
+        return J.T @ J, prediction.simulated
+
+    N, simulated = map_windows(of_window, (windows, point.z, point.b[windows.trial], starts, starts_dot))
+    # The information of a window and those before it about [z_next, b, x] is that about [z, b, x] in the next.
+    places = np.r_[:n_next, n_z + n_next : n_z + n_next + n_b + p]
+
+    def step(known: Array, N: Array) -> tuple[Array, None]:
+        return _schur_complement(N.at[places[:, None], places[None, :]].add(known), n_z), None
+
+    known, _ = jax.lax.scan(step, jnp.zeros((places.size, places.size), N.dtype), N)
+    information = _schur_complement(known[n_next:, n_next:], n_b)
+    slopes = model.parameters.slopes(point.x)
+    to_x = jnp.linalg.solve(slopes, jnp.diag(jnp.linalg.norm(slopes, axis=1)))
+    return to_x.T @ information @ to_x, simulated
+
+
+def covariance_of(information: np.ndarray) -> np.ndarray:
+    """The inverse (p, p), with infinite variances of parameters about which there is no information."""
+    s, V = np.linalg.eigh(information)
+    known = s > 1e-11 * s.max()
+    return infinite_along((V[:, known] / s[known]) @ V[:, known].T, V[:, ~known].T)
+
+
+def _schur_complement(N: Array, n: int) -> Array:
+    """Of the information (k, k), the first n unknowns eliminated."""
+    if n == 0:
+        return N
+    first, cross = N[:n, :n], N[:n, n:]
+    size = jnp.sqrt(jnp.diagonal(first) + jnp.finfo(N.dtype).tiny)
+    first = first / size[:, None] / size[None, :] + 1e-12 * jnp.eye(n, dtype=N.dtype)
+    cross = cross / size[:, None]
+    return N[n:, n:] - cross.T @ jnp.linalg.solve(first, cross)

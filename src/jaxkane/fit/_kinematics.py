@@ -1,4 +1,9 @@
-"""Coordinates, speeds and accelerations at instants: of a simulation, or of measurements by splines."""
+"""Coordinates, speeds and accelerations at instants: of a simulation, or of measurements by splines.
+
+All channels of a trial have knots of one spacing: their derivatives pass the same frequencies, and the spacing is how
+far from an end or a gap they are good. (The knots that `scipy.interpolate.make_splrep` chooses differ from channel to
+channel and crowd beside gaps.)
+"""
 
 from __future__ import annotations
 
@@ -19,12 +24,12 @@ from .._system.system import System
 from ._trial import Trial
 
 DEGREE = 5
-_MOST_OF_A_SAMPLE = 4.0  # knots are no closer than so many samples
+_MIN_SAMPLES = 4.0  # between two knots
 _RATIO = 1.25  # between spacings that are tried
 
 
 @jit
-def speeds_and_rates(system, t, q, q_dot, q_ddot):
+def _speeds_and_rates(system, t, q, q_dot, q_ddot):
     """Independent speeds and their rates (n, n_u), from the coordinates' rates, which are affine in them."""
     zero = jnp.zeros(len(system.speeds), q.dtype)
 
@@ -41,25 +46,23 @@ def speeds_and_rates(system, t, q, q_dot, q_ddot):
 def max_spacing(trial: Trial, channels: Mapping[str, np.ndarray]) -> float:
     """The largest spacing [s] of knots at which every channel is met within its standard deviation."""
     span = trial.t[-1] - trial.t[0]
-    spacing, least = span / 2, _MOST_OF_A_SAMPLE * float(np.median(np.diff(trial.t)))
+    spacing, smallest = span / 2, _MIN_SAMPLES * float(np.median(np.diff(trial.t)))
     for name, y in channels.items():
         seen = np.isfinite(y)
-        while spacing > least:
-            misfit = (spline(trial, name, y, spacing)(trial.t[seen]) - y[seen]) / trial.sigma[name][seen]
-            if np.mean(misfit**2) <= 1.0:
+        while spacing > smallest:
+            residuals = (spline(trial, name, y, spacing)(trial.t[seen]) - y[seen]) / trial.sigma[name][seen]
+            if np.mean(residuals**2) <= 1.0:
                 break
             spacing /= _RATIO
-    return max(spacing, least)
+    return max(spacing, smallest)
 
 
 def spline(trial: Trial, name: str, y: np.ndarray, spacing: float) -> Any:
-    """The spline of least squares, whose knots are as far apart; without those between which nothing was measured."""
+    """The spline of least squares with knots of this spacing, without those between which nothing was measured."""
     seen = np.isfinite(y)
     t, y = trial.t[seen], y[seen]
     if len(t) < 3 * (DEGREE + 1):
-        raise ValueError(
-            f"{trial.name}: {name} has {len(t)} samples; {3 * (DEGREE + 1)} are the least to take accelerations from."
-        )
+        raise ValueError(f"{trial.name}: {name} has {len(t)} samples; accelerations need at least {3 * (DEGREE + 1)}.")
     steps = np.abs(np.diff(y))
     usual = np.median(steps)
     if usual < 0.8 and np.any(np.abs(steps - 2 * np.pi) < 0.2 + 2 * usual):
@@ -92,7 +95,7 @@ def covered(t: np.ndarray, channels: Mapping[str, np.ndarray], spacing: float) -
 
 @dataclasses.dataclass(frozen=True)
 class KinematicSamples:
-    """KinematicSamples of one or several motions, for `base_parameters` and `first_estimate`.
+    """Coordinates, speeds and accelerations at instants of motions, for `base_parameters` and `first_estimate`.
 
         KinematicSamples(t, q, u, u_dot, {"torque": torque})
 
@@ -162,38 +165,29 @@ def kinematic_samples(system: System, motions: Motions, *, spacing: float | None
     """
     if isinstance(motions, (KinematicSamples, Trial, Trajectory)):
         motions = [motions]
-    found = [_of_one(system, motion, spacing) for motion in motions]
-    if not found:
+    parts = [_of_one(system, motion, spacing) for motion in motions]
+    if not parts:
         raise ValueError("There is no motion: give a Trial, a Trajectory, or KinematicSamples.")
-    n_q, n_u = len(system.coordinates), len(system.speeds)
-    for one in found:
-        if (one.q.shape[1], one.u.shape[1]) != (n_q, n_u):
+    n_q, n_u, known = len(system.coordinates), len(system.speeds), (*system.inputs, *system.states)
+    for part in parts:
+        if (part.q.shape[1], part.u.shape[1]) != (n_q, n_u):
             raise ValueError(
-                f"{type(system).__name__} has {n_q} coordinates and {n_u} independent speeds; the instants have "
-                f"{one.q.shape[1]} and {one.u.shape[1]}."
+                f"{type(system).__name__} has {n_q} coordinates and {n_u} independent speeds; the samples have "
+                f"{part.q.shape[1]} and {part.u.shape[1]}."
             )
-        known = (*system.inputs, *system.states)
-        refuse_unknown(one.inputs, known, f"{type(system).__name__} has no input or state named", "it has")
-        lacking = [name for name in system.states if name not in one.inputs]
-        if lacking:
+        refuse_unknown(part.inputs, known, f"{type(system).__name__} has no input or state named", "it has")
+        missing = [name for name in system.states if name not in part.inputs]
+        if missing:
             raise ValueError(
-                f"{type(system).__name__}: loads may follow {', '.join(lacking)}, of which the instants say nothing: "
-                "give its values among the `inputs` of KinematicSamples, or measure it."
+                f"{type(system).__name__}: loads may follow {', '.join(missing)}, which the samples lack: give its "
+                "values among the `inputs` of KinematicSamples, or measure it."
             )
-    if len(found) == 1:
-        return found[0]
-    joined = lambda of: np.concatenate([of(one) for one in found])  # noqa: E731
-    return KinematicSamples(
-        joined(lambda one: one.t),
-        joined(lambda one: one.q),
-        joined(lambda one: one.u),
-        joined(lambda one: one.u_dot),
-        {name: joined(lambda one, name=name: one.inputs.get(name, 0.0 * one.t)) for name in known},
-        np.unique(
-            np.concatenate([1000 * i + np.unique(one.trial, return_inverse=True)[1] for i, one in enumerate(found)]),
-            return_inverse=True,
-        )[1],
-    )
+    if len(parts) == 1:
+        return parts[0]
+    joined = {name: np.concatenate([getattr(part, name) for part in parts]) for name in ("t", "q", "u", "u_dot")}
+    inputs = {name: np.concatenate([part.inputs.get(name, 0.0 * part.t) for part in parts]) for name in known}
+    pairs = np.concatenate([np.column_stack([np.full(len(part), i), part.trial]) for i, part in enumerate(parts)])
+    return KinematicSamples(**joined, inputs=inputs, trial=np.unique(pairs, axis=0, return_inverse=True)[1].ravel())
 
 
 def _of_one(system: System, motion: Any, spacing: float | None) -> KinematicSamples:
@@ -215,8 +209,7 @@ def _of_trajectory(system: System, ride: Trajectory) -> KinematicSamples:
     there = np.all(np.isfinite(np.column_stack([t, q, u])), axis=1)
     if there.sum() < 3 * (DEGREE + 1):
         raise ValueError(
-            f"A trajectory of {there.sum()} times; {3 * (DEGREE + 1)} are the least to take accelerations from: save "
-            "more of them."
+            f"A trajectory of {there.sum()} times: accelerations need at least {3 * (DEGREE + 1)}, save more of them."
         )
     u_dot = np.full(u.shape, np.nan)
     u_dot[there] = make_interp_spline(t[there], u[there], DEGREE)(t[there], 1)
@@ -241,7 +234,7 @@ def _of_trial(system: System, trial: Trial, spacing: float | None) -> KinematicS
     inputs |= {name: splines[name](trial.t) for name in system.states if name in splines}
     at = lambda order: np.column_stack([splines[name](trial.t, order) for name in system.coordinates])  # noqa: E731
     q, q_dot, q_ddot = at(0), at(1), at(2)
-    u, u_dot = (np.array(x) for x in speeds_and_rates(system, *map(jnp.asarray, (trial.t, q, q_dot, q_ddot))))
+    u, u_dot = (np.array(x) for x in _speeds_and_rates(system, *map(jnp.asarray, (trial.t, q, q_dot, q_ddot))))
     for i, name in enumerate(system.speeds):
         if name in splines:
             u[:, i], u_dot[:, i] = splines[name](trial.t), splines[name](trial.t, 1)

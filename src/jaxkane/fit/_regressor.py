@@ -48,13 +48,13 @@ class Regressor(eqx.Module):
         return f"Regressor(shape={self.matrix.shape}: {', '.join(self.names)}{about})"
 
 
-def values_by_name(system: System) -> tuple[str, ...]:
+def input_names(system: System) -> tuple[str, ...]:
     """What a system's loads read by name: inputs, and states of the first order."""
     return (*system.inputs, *system.states)
 
 
-class Chosen(eqx.Module):
-    """What has columns: bodies of a system, and entries (leaf, place) of other parameters."""
+class RegressorSpec(eqx.Module):
+    """Which parameters have columns: those of bodies of a system, and entries (leaf, place) of other parameters."""
 
     described: Described
     places: tuple[tuple[int, int], ...] = eqx.field(static=True)
@@ -73,9 +73,9 @@ class Chosen(eqx.Module):
     def units(self) -> tuple[str, ...]:
         return (*(UNITS[i] for part in self.described.parts for i in part.kind), *self.own_units)
 
-    def of(self, system: System) -> Chosen:
+    def of(self, system: System) -> RegressorSpec:
         """The same of a system with other values."""
-        return eqx.tree_at(lambda c: c.described.system, self, system)
+        return eqx.tree_at(lambda spec: spec.described.system, self, system)
 
     def values(self, t: Array, q: Array) -> Array:
         """The parameters themselves, which are the same at all times and coordinates."""
@@ -84,13 +84,13 @@ class Chosen(eqx.Module):
         return jnp.concatenate([of_bodies, self.own().astype(q.dtype)])
 
     def own(self) -> Array:
-        """Of the other parameters."""
+        """The values of the parameters that belong to no body."""
         leaves = jax.tree.leaves(self.system)
         entries = [jnp.ravel(leaves[leaf])[place] for leaf, place in self.places]
         return jnp.stack(entries) if entries else jnp.zeros(0, jnp.result_type(float))
 
     def with_values(self, values: Array) -> System:
-        """The system with other values of the other parameters."""
+        """The system with other values of the parameters that belong to no body."""
         leaves, structure = jax.tree.flatten(self.system)
         for i, (leaf, place) in enumerate(self.places):
             flat = jnp.ravel(leaves[leaf]).at[place].set(values[i].astype(leaves[leaf].dtype))
@@ -98,31 +98,31 @@ class Chosen(eqx.Module):
         return jax.tree.unflatten(structure, leaves)
 
     def at(self, t: Array, q: Array, u: Array, inputs: Mapping[str, Array], u_dot: Array) -> Regressor:
-        return self.carried_at(t, q, u, inputs, u_dot)[0]
+        return self.with_kinematics(t, q, u, inputs, u_dot)[0]
 
-    def carried_at(
+    def with_kinematics(
         self, t: Array, q: Array, u: Array, inputs: Mapping[str, Array], u_dot: Array
     ) -> tuple[Regressor, Carried]:
         parts = self.described.parts
-        now, own = carried(self.described, t, q, u, inputs, u_dot), self.own().astype(q.dtype)
-        Y, values = columns_of(now, parts), self.values(t, q)
+        kinematics, own = carried(self.described, t, q, u, inputs, u_dot), self.own().astype(q.dtype)
+        Y, values = columns_of(kinematics, parts), self.values(t, q)
         along = lambda own: unbalanced(self.with_values(own), t, q, u, inputs, u_dot)  # noqa: E731
         if self.places:
             Y = jnp.concatenate([Y, jax.jacfwd(along)(own)], axis=1)
         # Y pi - tau = -(F_r + F*_r), at any accelerations
         forces = Y @ values - along(own)
         about = tuple((part.name, part.about) for part in parts)
-        return Regressor(Y, values, forces, self.names, self.units, about, self.system.speeds), now
+        return Regressor(Y, values, forces, self.names, self.units, about, self.system.speeds), kinematics
 
 
-def chosen_of(system: System, bodies: Bodies, parameters: Names) -> Chosen:
+def regressor_spec(system: System, bodies: Bodies, parameters: Names) -> RegressorSpec:
     """**Raises:** `ValueError` for names that are none, or given twice."""
     check_is_system(system)
     parameters = (parameters,) if isinstance(parameters, str) or callable(parameters) else tuple(parameters)
     places, names, units = [], [], []
     for where in parameters:
-        chosen, leaves = find_leaves(system, where)
-        for i in chosen:
+        indices, leaves = find_leaves(system, where)
+        for i in indices:
             path, leaf = leaves[i]
             for place, index in enumerate(np.ndindex(leaf.shape)):
                 places.append((i, place))
@@ -131,98 +131,97 @@ def chosen_of(system: System, bodies: Bodies, parameters: Names) -> Chosen:
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise ValueError(f"`parameters` names {', '.join(twice)} twice.")
-    found = Chosen(described(system, bodies), tuple(places), tuple(names), tuple(units))
-    if not found.names:
+    spec = RegressorSpec(described(system, bodies), tuple(places), tuple(names), tuple(units))
+    if not spec.names:
         raise ValueError(f"{type(system).__name__}: no body with a mass is named in `bodies`, and no `parameters`.")
-    return found
+    return spec
 
 
 @jit
-def regressor_at(chosen: Chosen, t, q, u, inputs, u_dot):
-    return chosen.carried_at(t, q, u, inputs, u_dot)
+def regressor_at(spec: RegressorSpec, t, q, u, inputs, u_dot):
+    return spec.with_kinematics(t, q, u, inputs, u_dot)
 
 
-# ---- whether the equations are linear in what was chosen
+# ---- whether the equations are linear in the parameters that have columns
 
 
-_CHECKED = Cache()  # structures, with what is chosen
+_CHECKED = Cache()  # structures, with the parameters that have columns
 
 
-def check_linear(chosen: Chosen, t: Any, q: Any) -> None:
+def check_linear(spec: RegressorSpec, t: Any, q: Any) -> None:
     """Refuse what would make tau or Y depend on the parameters themselves; once for each structure and choice."""
-    key = (structure_of(chosen.system), chosen.described.parts, chosen.places)
+    key = (structure_of(spec.system), spec.described.parts, spec.places)
     if _CHECKED.known(key, False):
         return
     # What is differentiated alone has a value; what is traced has none.
     value = lambda x: jax.lax.stop_gradient(x) if isinstance(x, Tracer) else x  # noqa: E731
-    system, t, q = jax.tree.map(value, (chosen.system, t, q))
+    system, t, q = jax.tree.map(value, (spec.system, t, q))
     with concretely():
-        _CHECKED.keep(key, _Linearity(chosen, system, t, q).check())
+        _CHECKED.keep(key, _Linearity(spec, system, t, q).check())
 
 
 class _Linearity:
     """The equations at a trial state, with other values of one parameter after another."""
 
-    def __init__(self, chosen: Chosen, system: System, t: Any, q: Any):
+    def __init__(self, spec: RegressorSpec, system: System, t: Any, q: Any):
         rng = np.random.default_rng(0)
         self.system, t, q = at_random_point((system, t, q), rng)
         self.name = type(system).__name__
         # Of the bodies that are named every parameter: what is known of them moves with the others.
-        every = described(system, [part.name for part in chosen.described.parts])
-        self.chosen = eqx.tree_at(lambda c: c.described, chosen, every)
-        self.chosen_columns = np.array([name in chosen.names for name in self.chosen.names], bool)
-        self.of_bodies = np.arange(len(self.chosen_columns)) < len(self.chosen_columns) - len(chosen.places)
+        every = described(system, [part.name for part in spec.described.parts])
+        self.spec = eqx.tree_at(lambda s: s.described, spec, every)
+        self.columns = np.array([name in spec.names for name in self.spec.names], bool)
+        self.of_bodies = np.arange(len(self.columns)) < len(self.columns) - len(spec.places)
         dtype = q.dtype
         q = (np.nan_to_num(q) + rng.uniform(-0.1, 0.1, q.shape)).astype(dtype)  # beside what is often zero
         n = len(system.speeds)
         rows = [jnp.asarray(rng.uniform(0.5, 1.5, n) * rng.choice((-1.0, 1.0), n), dtype) for _ in range(2)]
-        inputs = {name: jnp.asarray(0.7, dtype) for name in values_by_name(system)}
+        inputs = {name: jnp.asarray(0.7, dtype) for name in input_names(system)}
         self.state = jnp.asarray(t, dtype), jnp.asarray(q), rows[0], inputs, rows[1]
         self.tolerance = float(jnp.finfo(dtype).eps) ** 0.5
 
-    def read(self, system: System) -> tuple[dict[str, np.ndarray], np.ndarray]:
-        found, now = jax.device_get(regressor_at(self.chosen.of(system), *self.state))
-        Y, values = found.matrix, found.values
-        known = ~self.chosen_columns
+    def evaluate(self, system: System) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        equations, k = jax.device_get(regressor_at(self.spec.of(system), *self.state))
+        Y, values, tau, known = equations.matrix, equations.values, equations.forces, ~self.columns
         pieces = {
             "Y": Y,
-            "tau": found.forces,
+            "tau": tau,
             "pi": values[self.of_bodies],
-            "own": values[self.chosen_columns & self.of_bodies],
-            "right": found.forces - Y[:, known] @ values[known],
+            "own": values[self.columns & self.of_bodies],
+            "right": tau - Y[:, known] @ values[known],
             "of bodies": Y[:, self.of_bodies],
-            "moving": np.concatenate([x.ravel() for x in (now.V, now.W, now.a, now.alpha, now.omega)]),
+            "moving": np.concatenate([x.ravel() for x in (k.V, k.W, k.a, k.alpha, k.omega)]),
         }
-        return pieces, now.g
+        return pieces, k.g
 
     def check(self) -> bool:
         """**Returns:** whether there were finite numbers to judge by."""
-        now, g = self.read(self.system)
-        if not all(np.all(np.isfinite(x)) for x in now.values()):
+        pieces, g = self.evaluate(self.system)
+        if not all(np.all(np.isfinite(x)) for x in pieces.values()):
             return False
         self._check_weights(g)
-        for path, is_own, changes in self._changes(now):
+        for path, is_own, changes in self._changes(pieces):
             if is_own:
-                self._judge_own(leaf_name(path), changes)
+                self._check_own(leaf_name(path), changes)
             elif "pi" in changes and "moving" not in changes:
-                self._judge_of_body(leaf_name(path), changes)
+                self._check_of_body(leaf_name(path), changes)
         return True
 
-    def _changes(self, now: Mapping[str, np.ndarray]) -> Iterator[tuple[Any, bool, set[str]]]:
-        """What changes with each number of the system; those of the other parameters first."""
+    def _changes(self, pieces: Mapping[str, np.ndarray]) -> Iterator[tuple[Any, bool, set[str]]]:
+        """What changes with each number of the system; those of the parameters of no body first."""
         with_path, structure = jax.tree_util.tree_flatten_with_path(self.system)
         leaves = [leaf for _, leaf in with_path]
-        size = np.abs(now["Y"]).max() + np.abs(now["tau"]).max()
-        own = list(self.chosen.places)
-        others = [(i, place) for i, leaf in enumerate(leaves) for place in range(np.size(leaf))]
-        for i, place in [*own, *(each for each in others if each not in own)]:
+        size = np.abs(pieces["Y"]).max() + np.abs(pieces["tau"]).max()
+        own = list(self.spec.places)
+        every = [(i, place) for i, leaf in enumerate(leaves) for place in range(np.size(leaf))]
+        for i, place in [*own, *(one for one in every if one not in own)]:
             path, leaf = with_path[i]
-            moved = np.array(leaf)
-            moved.flat[place] = 1.3 * moved.flat[place] + (0.1 if moved.flat[place] >= 0 else -0.1)
-            other = [*leaves[:i], jnp.asarray(moved), *leaves[i + 1 :]]
-            then, _ = self.read(jax.tree.unflatten(structure, other))
-            changes = {k for k in now if self._differs(then[k], now[k], size if k in ("tau", "right") else 0.0)}
-            yield path, (i, place) in own, changes | ({"mass"} if i in self.chosen.described.leaves else set())
+            changed = np.array(leaf)
+            changed.flat[place] = 1.3 * changed.flat[place] + (0.1 if changed.flat[place] >= 0 else -0.1)
+            system = jax.tree.unflatten(structure, [*leaves[:i], jnp.asarray(changed), *leaves[i + 1 :]])
+            after, _ = self.evaluate(system)
+            changes = {k for k, x in pieces.items() if self._differs(after[k], x, size * (k in ("tau", "right")))}
+            yield path, (i, place) in own, changes | ({"mass"} if i in self.spec.described.leaves else set())
 
     def _differs(self, x: np.ndarray, y: np.ndarray, size: float) -> bool:
         """Whether a number, or a column of a matrix, has changed by more than rounding."""
@@ -232,7 +231,7 @@ class _Linearity:
         size = np.maximum(size, own + 1e-6 * np.abs(y).max())
         return not bool(np.all(np.abs(x - y) <= self.tolerance * size))
 
-    def _judge_own(self, parameter: str, changes: set[str]) -> None:
+    def _check_own(self, parameter: str, changes: set[str]) -> None:
         if "own" in changes:
             raise ValueError(
                 f"{self.name}: {parameter} belongs to a body that has columns of its own: leave it out of "
@@ -245,7 +244,7 @@ class _Linearity:
                 "of a stiffness and the angle at rest, is linear in one of them alone."
             )
 
-    def _judge_of_body(self, parameter: str, changes: set[str]) -> None:
+    def _check_of_body(self, parameter: str, changes: set[str]) -> None:
         if "of bodies" in changes:
             raise ValueError(
                 f"{self.name}: with another {parameter}, which moves no point but a mass centre, the weight by mass "
@@ -265,7 +264,7 @@ class _Linearity:
     def _check_weights(self, g: np.ndarray) -> None:
         """A weight that is written as a number, of a mass that is one too, cannot be distinguished from other loads."""
         weightless = ~np.any(g != 0, axis=1)
-        lone = [part.name for part, none in zip(self.chosen.described.parts, weightless, strict=True)
+        lone = [part.name for part, none in zip(self.spec.described.parts, weightless, strict=True)
                 if none and part.has_number]  # fmt: skip
         if lone and not weightless.all():
             raise ValueError(
@@ -313,7 +312,7 @@ def regressor(
     are not linear, or which belongs to a body of its own columns; where loads that are no weight at a body's mass
     centre depend on its mass or inertia, so that tau would too.
     """
-    chosen = chosen_of(system, bodies, parameters)
+    spec = regressor_spec(system, bodies, parameters)
     name = type(system).__name__
     refuse_incomplete(system, q, u)
     q = as_array(q, system.coordinates, f"{name}: q")
@@ -322,7 +321,7 @@ def regressor(
     check_time(name, t)
     t = jnp.asarray(t, q.dtype)
     checked_values(system, inputs)
-    given = {name: jnp.asarray((inputs or {}).get(name, 0.0), q.dtype) for name in values_by_name(system)}
+    values = {name: jnp.asarray((inputs or {}).get(name, 0.0), q.dtype) for name in input_names(system)}
     check_system(system, t, q)
-    check_linear(chosen, t, q)
-    return regressor_at(chosen, t, q, u, given, u_dot)[0]
+    check_linear(spec, t, q)
+    return regressor_at(spec, t, q, u, values, u_dot)[0]
