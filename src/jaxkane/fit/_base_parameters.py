@@ -18,7 +18,7 @@ from .._kane.regressor import Bodies
 from .._scalarjit.cache_key import jit
 from .._system.parameters import leaf_name
 from .._system.system import System
-from ._covariance import infinite_along
+from ._covariance import infinite_along, jackknife_covariance
 from ._identifiability import combination
 from ._kinematics import KinematicSamples, Motions, kinematic_samples
 from ._regressor import Names, Regressor, RegressorSpec, check_linear, input_names, regressor_spec
@@ -440,17 +440,19 @@ def _least_squares(A: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndar
 def _covariance(A: np.ndarray, residuals: np.ndarray, s: np.ndarray, trial: np.ndarray, given: bool) -> np.ndarray:
     """Along each direction (m, m), infinite where nothing is known: formal where the deviations are `given` or there
     are few samples; else robust to correlation within blocks, equal stretches of the trials."""
-    with np.errstate(divide="ignore"):
-        inverse = 1.0 / s
     length, block, first = max(len(trial) // _BLOCKS, 1), np.zeros(len(trial), int), 0
     for one in np.unique(trial):
         rows = np.flatnonzero(trial == one)
         block[rows] = first + np.arange(len(rows)) // length
         first = block[rows].max() + 1
+    known, k = s > 0, int(np.sum(s > 0))
+    covariance = np.diag(np.where(known, 0.0, np.inf))
     if given or len(trial) < 5 * _BLOCKS or first == 1:
-        return np.diag(inverse**2)
-    scores = np.zeros((first, len(s)))
-    np.add.at(scores, block, np.einsum("inm,in->im", A, residuals))
-    known = np.where(np.isfinite(inverse), inverse, 0.0)
-    moved = scores * known**2
-    return first / (first - 1) * moved.T @ moved + np.diag(np.where(np.isfinite(inverse), 0.0, np.inf))
+        covariance[known, known] = s[known] ** -2.0
+        return covariance
+    parts = [A[block == g][:, :, known].reshape(-1, k) for g in range(first)]
+    information = np.array([part.T @ part for part in parts])
+    scores = np.array([part.T @ residuals[block == g].ravel() for g, part in enumerate(parts)])
+    places = np.tile(np.arange(k), (first, 1))
+    covariance[np.ix_(known, known)] = jackknife_covariance(information, scores, places, np.zeros((k, k)))
+    return covariance
