@@ -108,6 +108,7 @@ def test_few_files_see_the_integrator():
         "settings",
         "step_control",
         "events",
+        "status",
         "diffrax_compat",
     }
     assert {path.stem for path in users if "diffrax._" in path.read_text()} == {

@@ -20,7 +20,7 @@ from ._integrate.queries import speed_rates as speed_rates
 from ._integrate.queries import state_rates as state_rates
 from ._integrate.queries import velocities as velocities
 from ._integrate.simulate import simulate as simulate
-from ._integrate.trajectory import Status as Status
+from ._integrate.status import Status as Status
 from ._integrate.trajectory import Trajectory as Trajectory
 from ._kane.assembly import assemble as assemble
 from ._kane.constraints import best_dependent_speeds as best_dependent_speeds

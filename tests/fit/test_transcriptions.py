@@ -223,7 +223,7 @@ def test_process_noise_is_taken_for_what_it_is():
 def test_the_delay_of_what_is_held():
     t = np.arange(0.0, 4.0, 0.1)
     push = {"push": np.round(np.sin(2.0 * t))}
-    held = {"push": jk.Samples(t + 0.033, push["push"], hold=True)}
+    held = {"push": jk.Samples(t + 0.033, push["push"], zero_order_hold=True)}
     ride = jk.simulate(TRUTH, jk.assemble(TRUTH, {"x": 0.2}), t, held)
     noise = np.random.default_rng(3).normal(0.0, 1e-3, t.size)
     trial = Trial(t, {"x": ride["x"] + noise}, push, sigma=1e-3, initial={"x": 0.2})
@@ -320,18 +320,20 @@ class Pulled(jk.System):
         return (jk.Force((inputs["right"] - inputs["left"]) * motion.N.x, motion["cart"]),)
 
 
-@pytest.mark.parametrize(("options", "kinks", "anew"), [({}, 11, False), ({"input_delay": ["left"]}, 2 * 11, True)])
-def test_inputs_that_share_their_times_share_their_kinks(options, kinks, anew, monkeypatch):
-    import jaxkane._integrate.integrate as ride
+@pytest.mark.parametrize(("options", "kinks", "restart"), [({}, 11, False), ({"input_delay": ["left"]}, 2 * 11, True)])
+def test_inputs_that_share_their_times_share_their_kinks(options, kinks, restart, monkeypatch):
+    from jaxkane._integrate import integrate
 
-    seen, original = [], ride.kinks_of
-    monkeypatch.setattr(ride, "kinks_of", lambda *a, **more: seen.append(original(*a, **more)) or seen[-1])
+    seen, original = [], integrate.discontinuities_of
+    monkeypatch.setattr(
+        integrate, "discontinuities_of", lambda *a, **options: seen.append(original(*a, **options)) or seen[-1]
+    )
     t = np.linspace(0.0, 1.0, 11)
     trial = Trial(t, {"x": 0.1 * t**2}, {"left": np.sin(t), "right": np.cos(t)}, sigma=0.1)
     problem = Problem.of(Pulled(), trial, "mass", simulation=Simulation(rtol=1e-6), **options)
     window = jax.tree.map(lambda x: x[0], problem.windows)
     jax.eval_shape(problem.model.simulate, window, window.start, problem.start.b[0], problem.start.x)
-    assert [(each.times.shape[0], each.anew) for each in seen] == [(kinks, anew)]
+    assert [(each.times.shape[0], each.restart) for each in seen] == [(kinks, restart)]
 
 
 @pytest.mark.slow

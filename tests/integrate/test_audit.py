@@ -93,7 +93,7 @@ def test_quadrature_is_exact_for_polynomials_at_uneven_times():
 
 
 KNOTS = np.linspace(0.0, 2.0, 21)
-TORQUE = jk.Samples(KNOTS, np.random.default_rng(5).normal(size=21), hold=True)
+TORQUE = jk.Samples(KNOTS, np.random.default_rng(5).normal(size=21), zero_order_hold=True)
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ TORQUE = jk.Samples(KNOTS, np.random.default_rng(5).normal(size=21), hold=True)
     [
         TORQUE,
         pytest.param(jk.Samples(KNOTS, TORQUE.values), marks=pytest.mark.slow),
-        pytest.param(jk.Samples(KNOTS + 0.0334, TORQUE.values, hold=True), marks=pytest.mark.slow),
+        pytest.param(jk.Samples(KNOTS + 0.0334, TORQUE.values, zero_order_hold=True), marks=pytest.mark.slow),
         pytest.param(lambda t, s: TORQUE(t - 0.05) - 0.3 * s["theta1_dot"], marks=pytest.mark.slow),
     ],
     ids=["held", "linear", "between the times", "in a function"],
@@ -117,7 +117,7 @@ def test_the_work_of_inputs_with_kinks_and_jumps(torque):
 
 @pytest.mark.slow
 def test_jumps_between_the_times_are_not_blamed_on_the_motion():
-    torque = {"shoulder_torque": jk.Samples(KNOTS, TORQUE.values, hold=True)}
+    torque = {"shoulder_torque": jk.Samples(KNOTS, TORQUE.values, zero_order_hold=True)}
     audit = jk.audit(*run("DoublePendulum", 2.0, 6, torque, rtol=1e-11, atol=1e-11))
     assert audit.ok
     assert "save more times" in str(audit)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._integrate.inputs import kinks_of
-from jaxkane._integrate.integrate import Now
+from jaxkane._integrate.inputs import discontinuities_of
 
 ts = np.linspace(0.0, 1.0, 6)
 values = np.array([1.0, -2.0, 0.5, 3.0, -1.0, 4.0])
@@ -36,7 +35,7 @@ def place(t, delay):
 
 
 def end(delay, adjoint="auto"):
-    push = jk.Samples(ts + delay, values, hold=True)
+    push = jk.Samples(ts + delay, values, zero_order_hold=True)
     return jk.simulate(Cart(), jk.State([0.0], [0.0]), [0.0, 0.5, 1.0], {"push": push}, adjoint=adjoint)["place"]
 
 
@@ -52,7 +51,7 @@ def test_the_exact_motion_and_its_derivative_by_a_delay():
 
 
 def test_steps_of_one_length_that_end_at_the_samples():
-    push = jk.Samples(ts, values, hold=True)
+    push = jk.Samples(ts, values, zero_order_hold=True)
     ride = jk.simulate(Cart(), jk.State([0.0], [0.0]), ts, {"push": push}, step=0.1, solver=diffrax.Bosh3())
     np.testing.assert_allclose(ride["place"], [place(t, 0.0) for t in ts], atol=1e-13)
     np.testing.assert_array_equal(ride["push"], values)
@@ -61,17 +60,17 @@ def test_steps_of_one_length_that_end_at_the_samples():
 
 
 def test_what_is_no_hold_is_refused():
-    with pytest.raises(TypeError, match="`hold` is True or False, got 'zero'"):
-        jk.Samples(ts, values, hold="zero")
+    with pytest.raises(TypeError, match="`zero_order_hold` is True or False, got 'zero'"):
+        jk.Samples(ts, values, zero_order_hold="zero")
 
 
 def push_of(form, delay, hold):
     """An input that acts a delay later, in one of the ways in which a user may write it."""
-    samples, late = jk.Samples(ts, values, hold=hold), jk.Samples(ts + delay, values, hold=hold)
+    samples, late = jk.Samples(ts, values, zero_order_hold=hold), jk.Samples(ts + delay, values, zero_order_hold=hold)
     return {
         "direct": {"push": late},
         "moved": {"push": lambda t, s: 1.0 * late(t)},
-        "made inside": {"push": lambda t, s: jk.Samples(ts + delay, values, hold=hold)(t)},
+        "made inside": {"push": lambda t, s: jk.Samples(ts + delay, values, zero_order_hold=hold)(t)},
         "asked earlier": {"push": lambda t, s: samples(t - delay)},
         "compiled": {"push": jax.jit(lambda t, s: samples(t - delay))},
         "module": {"push": Earlier(samples, delay)},
@@ -94,8 +93,8 @@ class Earlier(eqx.Module):
 
 @pytest.mark.parametrize("form", FORMS)
 def test_kinks_of_samples_that_a_function_calls(form):
-    state_of = lambda t, y: Now(y[:1], y[1:], None, t, Cart())  # noqa: E731
-    kinks = kinks_of(push_of(form, 0.03, True), {}, jnp.array(0.1), jnp.zeros(2), state_of, False)
+    state = jk.State(jnp.zeros(1), jnp.zeros(1))
+    kinks = discontinuities_of(Cart(), push_of(form, 0.03, True), {}, jnp.array(0.1), state, fixed=False)
     np.testing.assert_allclose(np.unique(np.round(kinks.times, 12)), ts + 0.03, rtol=1e-14)
     assert kinks.jumps
 
@@ -139,7 +138,7 @@ class Blown(Cart):
 def test_samples_of_a_description_have_derivatives_by_their_times():
     rtol, h = 1e-8, 1e-6
     slope = (place(1.0, 0.03 + h) - place(1.0, 0.03 - h)) / (2 * h)
-    found = by_delay(lambda d: end_with(Blown(jk.Samples(ts + d, values, hold=True)), None))
+    found = by_delay(lambda d: end_with(Blown(jk.Samples(ts + d, values, zero_order_hold=True)), None))
     np.testing.assert_allclose(found, (place(1.0, 0.03), slope), rtol=rtol)
 
 
@@ -176,7 +175,7 @@ def test_calls_of_samples_that_steps_cannot_follow_are_refused(push, options, me
         jk.simulate(Cart(), jk.State([0.0], [0.0]), [0.0, 0.5, 1.0], {"push": push}, **options)
 
 
-samples_held = jk.Samples(ts, values, hold=True)
+samples_held = jk.Samples(ts, values, zero_order_hold=True)
 
 
 @pytest.mark.parametrize("f", ["linear", "held", pytest.param("motion", marks=pytest.mark.slow)])
@@ -185,7 +184,7 @@ def test_memory_goes_with_the_number_of_samples(f):
     n, per_sample = 3000, 1000
 
     def values_at(t, y):
-        samples = jk.Samples(t, y, hold=f == "held")
+        samples = jk.Samples(t, y, zero_order_hold=f == "held")
         if f != "motion":
             return jax.vmap(samples)(t)
         return jk.simulate(Cart(), jk.State([0.0], [0.0]), t, {"push": samples})

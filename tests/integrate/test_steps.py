@@ -11,44 +11,7 @@ import jaxkane as jk
 from jaxkane._integrate import diffrax_compat as loops
 from jaxkane._integrate import integrate as ride
 from jaxkane._integrate.settings import settings_for
-from jaxkane._integrate.step_control import ErrorController
 from jaxkane._scalarjit.function import ScalarFunction
-
-
-def van_der_pol(controller):
-    return diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda t, y, mu: jnp.stack([y[1], mu * (1 - y[0] ** 2) * y[1] - y[0]])),
-        diffrax.Tsit5(),
-        0.0,
-        12.0,
-        0.1,
-        jnp.array([2.0, 0.0]),
-        5.0,  # stiff enough for steps of all lengths, of which some are taken back
-        stepsize_controller=controller,
-    )
-
-
-def test_steps_by_error_are_those_of_diffrax():
-    expected = van_der_pol(diffrax.PIDController(rtol=1e-6, atol=1e-8))
-    found = van_der_pol(ErrorController(jnp.array([1e-6, 1e-8, 1e-12])))
-    assert {k: int(v) for k, v in found.stats.items()} == {k: int(v) for k, v in expected.stats.items()}
-    assert found.stats["num_rejected_steps"] > 10
-    np.testing.assert_allclose(found.ys, expected.ys, rtol=1e-11, atol=1e-11)
-
-
-def test_a_step_shorter_than_the_shortest_ends_the_solution():
-    blows_up = diffrax.ODETerm(lambda t, y, args: y**2)  # y = 1 / (1 - t)
-    found = diffrax.diffeqsolve(
-        blows_up,
-        diffrax.Tsit5(),
-        0.0,
-        2.0,
-        0.1,
-        jnp.array([1.0]),
-        stepsize_controller=ErrorController(jnp.array([1e-6, 1e-8, 1e-9])),
-        throw=False,
-    )
-    assert found.result == diffrax.RESULTS.dt_min_reached
 
 
 def test_a_solver_without_an_estimate_of_its_error_asks_for_a_step():

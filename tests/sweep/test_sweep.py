@@ -93,7 +93,7 @@ def test_what_is_refused():
 def test_a_member_knows_where_its_input_jumps():
     """So that its audit integrates the work from jump to jump."""
     rtol, ts = 1e-6, np.linspace(0.0, 1.0, 41)
-    torque = jk.Samples(np.linspace(0.0, 1.0, 6), np.random.default_rng(2).normal(size=6), hold=True)
+    torque = jk.Samples(np.linspace(0.0, 1.0, 6), np.random.default_rng(2).normal(size=6), zero_order_hold=True)
     state = jk.State(np.array([0.5, -0.2]), np.linspace(0.0, 1.0, 4).reshape(2, 2))
     rides = jk.sweep.sweep(DoublePendulum(), state, ts, {"elbow_torque": torque})
     assert jk.audit(DoublePendulum(), rides.member(1)).energy_balance < rtol

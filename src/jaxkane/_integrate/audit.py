@@ -386,17 +386,17 @@ def audit(system: System, trajectory: Trajectory) -> Audit:
 
 def _pieces(system: System, trajectory: Trajectory, reached: np.ndarray) -> Pieces | None:
     """The motion between kinks and jumps of its inputs, where it has any."""
-    sides = trajectory.sides
-    if sides is None:
+    kinks = trajectory.discontinuities
+    if kinks is None:
         return None
     t, q, u = (np.asarray(x)[reached] for x in (trajectory.t, trajectory.q, trajectory.u))
     near = 64 * np.finfo(t.dtype).eps * np.abs(t).max()
-    pieces = Pieces(np.asarray(t, float), np.asarray(sides.times, float), near)
+    pieces = Pieces(np.asarray(t, float), np.asarray(kinks.times, float), near)
     if not pieces.inner.size:
         return None
     values = {name: np.asarray(x)[reached][pieces.places] for name, x in trajectory.values.items()}
-    if sides.inputs:
-        before, after = ({name: np.asarray(x)[reached] for name, x in inputs.items()} for inputs in sides.inputs)
+    if kinks.inputs:
+        before, after = ({name: np.asarray(x)[reached] for name, x in inputs.items()} for inputs in kinks.inputs)
         values |= {name: pieces.of(before[name], after[name]) for name in before}
     input_rates = {name: pieces.rate(values[name]) for name in trajectory.inputs}
     powers = powers_along(system, *(x[pieces.places] for x in (t, q, u)), values, input_rates)

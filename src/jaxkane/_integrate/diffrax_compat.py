@@ -1,7 +1,4 @@
-"""Loops and explicit Runge-Kutta methods of diffrax that compile in less time.
-
-Knows what of its insides is used here.
-"""
+"""Loops of diffrax that know their times, and its Runge-Kutta methods with unrolled stages: both compile faster."""
 
 from __future__ import annotations
 
@@ -18,7 +15,7 @@ import numpy as np
 from jaxtyping import Array
 
 
-class _Known(diffrax.AbstractAdjoint):
+class _KnownTimes(diffrax.AbstractAdjoint):
     """A loop that knows its sample times to rise, and that the step size controller ends it.
 
     diffrax checks the times while it runs, and finds by a hundred operations which time is a hundred rounding errors
@@ -39,19 +36,19 @@ class _Known(diffrax.AbstractAdjoint):
         return super().loop(**always, terms=terms.term, saveat=saveat, init_state=init_state, **rest)  # type: ignore[safe-super]
 
 
-class _Forward(_Known, diffrax.ForwardMode):
+class _Forward(_KnownTimes, diffrax.ForwardMode):
     pass
 
 
-class _Reverse(_Known, diffrax.RecursiveCheckpointAdjoint):
+class _Reverse(_KnownTimes, diffrax.RecursiveCheckpointAdjoint):
     pass
 
 
-class _Both(_Known, diffrax.DirectAdjoint):
+class _Both(_KnownTimes, diffrax.DirectAdjoint):
     pass
 
 
-_KNOWN = {
+_WITH_KNOWN_TIMES = {
     diffrax.ForwardMode: _Forward,
     diffrax.RecursiveCheckpointAdjoint: _Reverse,
     diffrax.DirectAdjoint: _Both,
@@ -69,20 +66,21 @@ def _is_as_expected() -> bool:
     return "save_state" in state and saved == {"saveat_ts_index", "ts", "ys", "save_index"} and "term" in term
 
 
-def saveat_and_adjoint(ts: Array, adjoint: diffrax.AbstractAdjoint, anew: bool = False) -> dict[str, Any]:
-    """What `diffeqsolve` is asked for that is to keep the states at rising times (n_t,), and the last one: `adjoint`
-    and `saveat`. `anew`: as diffrax does it, for an adjoint of the user, or a progress meter that asks for the end.
+_AS_EXPECTED = _is_as_expected()
+
+
+def saveat_and_adjoint(ts: Array, adjoint: diffrax.AbstractAdjoint, as_given: bool = False) -> dict[str, Any]:
+    """Arguments of `diffeqsolve` that keep the states at rising times (n_t,), and the last one.
+
+    `as_given`: the adjoint as it is, as one of the user is, too: for a progress meter, which asks for the last time.
     """
-    known = None if anew or not _AS_EXPECTED else _KNOWN.get(type(adjoint))
-    end = diffrax.SubSaveAt(t1=True)
-    samples = diffrax.SubSaveAt(ts=ts) if known is None else end
+    known = None if as_given or not _AS_EXPECTED else _WITH_KNOWN_TIMES.get(type(adjoint))
+    last = diffrax.SubSaveAt(t1=True)
+    samples = diffrax.SubSaveAt(ts=ts) if known is None else last
     return {
         "adjoint": adjoint if known is None else known(**vars(adjoint), ts=ts),
-        "saveat": diffrax.SaveAt(subs=(samples, end), controller_state=True),
+        "saveat": diffrax.SaveAt(subs=(samples, last), controller_state=True),
     }
-
-
-_AS_EXPECTED = _is_as_expected()
 
 
 class UnrolledERK(diffrax.AbstractAdaptiveSolver[Any]):

@@ -20,7 +20,7 @@ from .._scalarjit.components import Component
 from .._scalarjit.function import ScalarFunction
 from .._scalarjit.linear import as_vector, determinant
 from .._system.system import State, System, unpacked
-from .trajectory import Status, reason
+from .status import REASONS, Status
 
 
 class Crossing(eqx.Module):
@@ -59,8 +59,8 @@ def first_crossing(
     at 0 passes it if it leaves in its direction; without a direction, nothing passes zero at 0.
     """
     ends = zip(g0, slope0, g1, slope1, direction, strict=True)
-    found = [_first_crossing(*(jnp.asarray(x, g0.dtype) for x in end)) for end in ends]
-    return jnp.stack(found) if found else jnp.zeros_like(g0)
+    places = [_first_crossing(*(jnp.asarray(x, g0.dtype) for x in end)) for end in ends]
+    return jnp.stack(places) if places else jnp.zeros_like(g0)
 
 
 def _first_crossing(g0: Array, slope0: Array, g1: Array, slope1: Array, direction: Array) -> Array:
@@ -123,20 +123,19 @@ def events_of(system: System, t: Array, state: State) -> Events:
     def named(t: Array, q: Array, u_all: Array) -> dict[str, Any]:
         return _events(system, t, tuple(q), tuple(u_all), q.dtype)
 
-    program, found = jax.make_jaxpr(named, return_shape=True)(t, state.q, u_all)
-    directions = tuple(e.direction if isinstance(e, Crossing) else 0 for e in found.values())
-    return Events(tuple(found), directions, any(depends_on(program, [2])))
+    program, events = jax.make_jaxpr(named, return_shape=True)(t, state.q, u_all)
+    directions = tuple(e.direction if isinstance(e, Crossing) else 0 for e in events.values())
+    return Events(tuple(events), directions, any(depends_on(program, [2])))
 
 
 def _events(system: System, t: Component, q: Any, u_all: Any, dtype: Any) -> dict[str, Any]:
-    found = system.events(t, q, u_all)
-    if not isinstance(found, Mapping):
-        raise TypeError(f"{type(system).__name__}.events returns quantities by name, a dict; got {found!r}.")
-    reasons = {reason(code, ()) for code in Status if code < Status.EVENT}
-    taken = [name for name in found if name.replace("_", " ") in reasons]
-    if taken:
-        raise ValueError(f"{type(system).__name__}: an event is called {taken[0]!r}, the reason of another end.")
-    return {name: _as_float(name, found[name], dtype) for name in sorted(found)}
+    events = system.events(t, q, u_all)
+    if not isinstance(events, Mapping):
+        raise TypeError(f"{type(system).__name__}.events returns quantities by name, a dict; got {events!r}.")
+    reserved = [name for name in events if name.replace("_", " ") in REASONS]
+    if reserved:
+        raise ValueError(f"{type(system).__name__}: an event is called {reserved[0]!r}, the reason of another end.")
+    return {name: _as_float(name, events[name], dtype) for name in sorted(events)}
 
 
 def _as_float(name: str, event: Any, dtype: Any) -> Any:
@@ -151,46 +150,48 @@ def _as_float(name: str, event: Any, dtype: Any) -> Any:
     return value.astype(dtype)
 
 
-class Watched(NamedTuple):
-    """All events (n,), their time derivatives (n,) along the motion, and det C_dep: where that vanishes, the dependent
-    speeds no longer follow from the independent ones."""
+class EventValues(NamedTuple):
+    """What may end a motion, at one time: all events (n,), their time derivatives (n,) along the motion, and a `bound`
+    that nothing may pass: det C_dep. Where that vanishes, the independent speeds do not determine the dependent."""
 
     values: Array
     rates: Array
-    determinant: Array
+    bound: Array
 
 
 @ScalarFunction
-def watched(system: System, t: Component, y: Array, y_dot: Array | None) -> Watched:
-    """What may end a motion, of a packed state. `y_dot`: None where no event reads speeds."""
+def event_values(system: System, t: Component, y: Array, y_dot: Array | None) -> EventValues:
+    """Those of a packed state. `y_dot`: None where no event reads speeds."""
     state, like = unpacked(system, y), y
-    now = KaneEquations(system, t, state.q, state.u)
-    det = determinant(now.C_dep) if now.k else 1.0
-    u_all_dot: Any = (0.0,) * len(now.u_all)
+    equations = KaneEquations(system, t, state.q, state.u)
+    det = determinant(equations.C_dep) if equations.k else 1.0
+    u_all_dot: Any = (0.0,) * len(equations.u_all)
     if y_dot is not None:
         u_dot = tuple(unpacked(system, y_dot).u)
-        u_all_dot = (*u_dot, *now.dependent_accelerations(u_dot))
+        u_all_dot = (*u_dot, *equations.dependent_accelerations(u_dot))
 
     def read(t: Component, q: Any, u_all: Any) -> Array:
         events = _events(system, t, q, u_all, like.dtype).values()
         return as_vector([e.value if isinstance(e, Crossing) else e for e in events], like)
 
-    at, along = (now.t, now.q, now.u_all), (1.0, now.q_dot, u_all_dot)
-    values, rates = jax.jvp(read, *(jax.tree.map(lambda x: jnp.asarray(x, like.dtype), xs) for xs in (at, along)))
-    return Watched(values, rates, as_vector([det], like)[0])
+    point, direction = (equations.t, equations.q, equations.u_all), (1.0, equations.q_dot, u_all_dot)
+    as_like = lambda xs: jax.tree.map(lambda x: jnp.asarray(x, like.dtype), xs)  # noqa: E731
+    values, rates = jax.jvp(read, as_like(point), as_like(direction))
+    return EventValues(values, rates, as_vector([det], like)[0])
 
 
-class End(NamedTuple):
-    """Where a motion ended: `t` [s], the packed state `y`, and whether both move smoothly with what they come from."""
+class EventPoint(NamedTuple):
+    """Where an event ended a motion: `t` [s], the packed state `y`, and whether both move smoothly with what they come
+    from."""
 
     t: Array
     y: Array
     smooth: Array
 
 
-def at_zero(
+def locate_event(
     system: System, t: Array, y: Array, which: Array, happened: Array, rates: Any, reach: Array, events: Events
-) -> End:
+) -> EventPoint:
     """The instant beside `t` at which the event `which` vanishes, with derivatives up to the second order.
 
         t_end = t - g / g_dot,   y_end = y + (t_end - t) y_dot,   twice
@@ -205,8 +206,8 @@ def at_zero(
     def stage(carry: Any, k: Array):
         (t, y), step, smooth = carry
         y_dot = rates(t, y)
-        watching = watched(system, t, y, y_dot if events.read_speeds else None)
-        g, g_dot = watching.values[which], watching.rates[which]
+        quantities = event_values(system, t, y, y_dot if events.read_speeds else None)
+        g, g_dot = quantities.values[which], quantities.rates[which]
         # Beside the first point, where to go; there halfway, by the rates in the middle; and there again.
         is_small = jnp.abs(g) <= jnp.abs(g_dot) * reach
         newton = -g / jnp.where(happened & is_small & (g_dot != 0), g_dot, jnp.ones_like(g_dot))
@@ -220,51 +221,31 @@ def at_zero(
     first = (t, y)
     start = (first, jnp.zeros_like(t), jnp.array(True))
     ((t, y), _, smooth), _ = jax.lax.scan(stage, start, np.arange(3))  # pyright: ignore[reportArgumentType]
-    return End(t, y, smooth)
-
-
-class Quantities(NamedTuple):
-    """What may end a motion, at one time: `values` (n,) and their `rates` (n,), and a `bound` that nothing may pass."""
-
-    values: Array
-    rates: Array
-    bound: Array
+    return EventPoint(t, y, smooth)
 
 
 class Limits(eqx.Module):
-    """What ends a motion: its `end` [s], and quantities in these `directions` (see `first_crossing`).
+    """What ends a motion: its `end` [s], and events in these `directions` (see `first_crossing`).
 
-    `numbers` (3,) [s]: how far behind a crossing the last step may end (`resolution`); what is no time (`rounding`);
-    and a step that is not halved at the bound (`shortest`).
+    `tolerances` (3,) [s]: how far behind a crossing the last step may end; which times differ by rounding alone; and a
+    step that is not halved at the bound.
     """
 
     directions: tuple[int, ...] = eqx.field(static=True)
     end: Array
-    numbers: Array
-
-    @property
-    def resolution(self) -> Array:
-        return self.numbers[0]
-
-    @property
-    def rounding(self) -> Array:
-        return self.numbers[1]
-
-    @property
-    def shortest(self) -> Array:
-        return self.numbers[2]
+    tolerances: Array
 
 
 class EventState(NamedTuple):
-    """The state of a controller that stops: that of its inner controller; the quantities at the step's start; which one
-    ended the motion, as a float, -1 for none and n for the bound; the end of a step that was taken back, else
-    -infinity; and the end of the first step over the bound, else infinity."""
+    """The state of an `EventController`: that of its `inner` controller; the quantities at the `start` of the step; the
+    `status` of the motion, as a float: `COMPLETED` unless an event or the bound ended it; the end of a step that was
+    rejected for an event, else -infinity; and the end of the first step over the bound, else infinity."""
 
     inner: Any
-    start: Quantities | None
-    which: Array
-    until: Array
-    last: Array
+    start: EventValues | None
+    status: Array
+    rejected_end: Array
+    over_bound: Array
 
 
 class EventController(diffrax.AbstractStepSizeController[Any, Any]):
@@ -281,11 +262,11 @@ class EventController(diffrax.AbstractStepSizeController[Any, Any]):
     A step over the bound is halved; where it is as short as the shortest, the motion ends before it. It also ends where
     the first step over the bound did, if shorter ones do not pass it: so near to it, what is found is by chance.
 
-    `watch`: (t, y, args) -> `Quantities`; None where there are none.
+    `quantities`: (t, y, args) -> `EventValues`; None where there are none.
     """
 
     controller: diffrax.AbstractStepSizeController[Any, Any]
-    watch: Callable[..., Quantities] | None
+    quantities: Callable[..., EventValues] | None
     first: Array
     limits: Limits
 
@@ -294,10 +275,10 @@ class EventController(diffrax.AbstractStepSizeController[Any, Any]):
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):  # type: ignore[override]
         end, inner = self.controller.init(terms, t0, t1, y0, self.first, args, func, error_order)
-        start = self._watched(t0, y0, args)
+        start = self._values(t0, y0, args)
         if start is not None:
-            start = _begun(self.limits, start)
-        return end, EventState(inner, start, *(jnp.full_like(t0, x) for x in (-1.0, -jnp.inf, jnp.inf)))
+            start = _without_rounding(self.limits, start)
+        return end, EventState(inner, start, *(jnp.full_like(t0, x) for x in (Status.COMPLETED, -jnp.inf, jnp.inf)))
 
     def adapt_step_size(self, t0: Any, t1: Any, y0, y1_candidate, args, y_error, error_order, controller_state):  # type: ignore[override]
         state: EventState = controller_state
@@ -305,19 +286,18 @@ class EventController(diffrax.AbstractStepSizeController[Any, Any]):
             t0, t1, y0, y1_candidate, args, y_error, error_order, state.inner
         )
         keep, next_t0, next_t1, jumped, inner, result = following
-        now = self._watched(t1, y1_candidate, args)
         step = Step(t0, t1, next_t0, next_t1, jnp.asarray(keep))
-        found = _decision(self.limits, state._replace(inner=None), now, step)
-        state = found.state._replace(inner=_where(found.unchanged, state.inner, inner))
-        result = diffrax.RESULTS.where(found.again, diffrax.RESULTS.successful, result)
-        result = diffrax.RESULTS.where(found.ends, diffrax.RESULTS.event_occurred, result)
-        result = diffrax.RESULTS.where(found.lost, diffrax.RESULTS.dt_min_reached, result)
-        return found.keep, found.next_t0, found.next_t1, jumped, state, result
+        decision = _decide(self.limits, state._replace(inner=None), self._values(t1, y1_candidate, args), step)
+        state = decision.state._replace(inner=_where(decision.inner_unchanged, state.inner, inner))
+        result = diffrax.RESULTS.where(decision.repeat, diffrax.RESULTS.successful, result)
+        result = diffrax.RESULTS.where(decision.ends, diffrax.RESULTS.event_occurred, result)
+        result = diffrax.RESULTS.where(decision.fails, diffrax.RESULTS.dt_min_reached, result)
+        return decision.keep, decision.next_t0, decision.next_t1, jumped, state, result
 
-    def _watched(self, t: Any, y: Any, args: Any) -> Quantities | None:
+    def _values(self, t: Any, y: Any, args: Any) -> EventValues | None:
         # Where steps end has no derivative, and compiling one would take its time.
-        still = lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x  # noqa: E731
-        return None if self.watch is None else self.watch(*jax.tree.map(still, (t, y, args)))
+        constant = lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x  # noqa: E731
+        return None if self.quantities is None else self.quantities(*jax.tree.map(constant, (t, y, args)))
 
 
 class Step(NamedTuple):
@@ -331,112 +311,116 @@ class Step(NamedTuple):
 
 
 class _Decision(NamedTuple):
-    """What becomes of a step: whether it is kept; the next one; whether it is made `again`; `ends` the motion; is
-    `lost`, since a quantity is no number behind it; whether the inner controller's state is `unchanged`; and the state
-    that follows."""
+    """What becomes of a step: whether it is kept; the next one; whether it is to `repeat`; `ends` the motion; `fails`,
+    since a quantity is no number behind it; whether the inner controller's state stays; and the state that follows."""
 
     keep: Array
     next_t0: Array
     next_t1: Array
-    again: Array
+    repeat: Array
     ends: Array
-    lost: Array
-    unchanged: Array
+    fails: Array
+    inner_unchanged: Array
     state: EventState
 
 
 @ScalarFunction
-def _begun(limits: Limits, start: Quantities) -> Quantities:
+def _without_rounding(limits: Limits, start: EventValues) -> EventValues:
     # What would have vanished within a rounding error of the start is on zero there.
-    on_zero = jnp.abs(start.values) <= jnp.abs(start.rates) * limits.rounding
+    _, rounding, _ = limits.tolerances
+    on_zero = jnp.abs(start.values) <= jnp.abs(start.rates) * rounding
     return start._replace(values=jnp.where(on_zero, jnp.zeros_like(start.values), start.values))
 
 
 @ScalarFunction
-def _decision(limits: Limits, state: EventState, now: Quantities | None, step: Step) -> _Decision:
+def _decide(limits: Limits, state: EventState, end: EventValues | None, step: Step) -> _Decision:
     # One function of scalars: as a hundred operations it would be as many programs, and half of XLA's work.
-    # What is left of a step that was taken back is gone at once: a fixed step stays on its grid.
-    going_on = step.keep & (step.t1 < state.until)
-    step = step._replace(next_t1=jnp.where(going_on, state.until, step.next_t1))
-    none = jnp.zeros_like(step.keep)
-    found = _Decision(step.keep, step.next_t0, step.next_t1, none, none, none, going_on, state)
-    if now is not None:
-        found = _watching(limits, state, now, step, going_on)
+    # The rest of a rejected step follows at once: a fixed step stays on its grid.
+    resumes = step.keep & (step.t1 < state.rejected_end)
+    step = step._replace(next_t1=jnp.where(resumes, state.rejected_end, step.next_t1))
+    false = jnp.zeros_like(step.keep)
+    decision = _Decision(step.keep, step.next_t0, step.next_t1, false, false, false, resumes, state)
+    if end is not None:
+        decision = _decide_by_events(limits, state, end, step, resumes)
     # As diffrax does it, a last step is none of a rounding error, and one that was not kept is halved.
-    near = found.next_t1 > limits.end - 100 * jnp.finfo(limits.end.dtype).eps * jnp.abs(limits.end)
-    last = jnp.where(found.keep, limits.end, found.next_t0 + 0.5 * (limits.end - found.next_t0))
-    arrived = found.keep & (found.next_t0 >= limits.end)
-    return found._replace(next_t1=jnp.where(near, last, found.next_t1), ends=found.ends | arrived)
+    near = decision.next_t1 > limits.end - 100 * jnp.finfo(limits.end.dtype).eps * jnp.abs(limits.end)
+    last = jnp.where(decision.keep, limits.end, decision.next_t0 + 0.5 * (limits.end - decision.next_t0))
+    arrived = decision.keep & (decision.next_t0 >= limits.end)
+    return decision._replace(next_t1=jnp.where(near, last, decision.next_t1), ends=decision.ends | arrived)
 
 
-def _watching(limits: Limits, state: EventState, now: Quantities, step: Step, going_on: Array) -> _Decision:
+def _decide_by_events(limits: Limits, state: EventState, end: EventValues, step: Step, resumes: Array) -> _Decision:
     start: Any = state.start
+    resolution, _, shortest = limits.tolerances
     t0, t1 = jax.lax.stop_gradient((step.t0, step.t1))
     h, kept = t1 - t0, step.keep
-    unknown = kept & functools.reduce(operator.or_, [x != x for x in now.values], jnp.array(False))
-    lost = unknown & (h <= limits.resolution)
+    unknown = kept & functools.reduce(operator.or_, [x != x for x in end.values], jnp.array(False))
+    fails = unknown & (h <= resolution)
     kept &= ~unknown
-    first, x = _first(limits, start, now, h)
+    event, x = _first_event(limits, start, end, h)
     crossed = kept & (x <= 1)
-    over = kept & (start.bound * now.bound < 0)
-    at_bound = (over & (h <= limits.shortest)) | (kept & ~over & (t1 >= state.last))
-    at_start = crossed & (x == 0) & ~over
-    there = crossed & ((1 - x) * h <= limits.resolution) & ~over & ~at_start & ~at_bound
-    at_start &= ~at_bound
-    again = ((crossed | over) & ~there & ~at_start & ~at_bound) | (unknown & ~lost)
-    beyond = jnp.where(over | unknown, 0.5 * h, jnp.minimum(x, 1.0) * h + 0.5 * limits.resolution)
-    taken_back = again | at_start | at_bound | lost
-    which = jnp.where(there | at_start, first, jnp.where(at_bound, float(len(limits.directions)), state.which))
+    over = kept & (start.bound * end.bound < 0)
+    at_bound = (over & (h <= shortest)) | (kept & ~over & (t1 >= state.over_bound))
+    at_start = crossed & (x == 0) & ~over & ~at_bound
+    at_end = crossed & ((1 - x) * h <= resolution) & ~over & (x != 0) & ~at_bound
+    repeat = ((crossed | over) & ~at_end & ~at_start & ~at_bound) | (unknown & ~fails)
+    beyond = jnp.where(over | unknown, 0.5 * h, jnp.minimum(x, 1.0) * h + 0.5 * resolution)
+    rejected = repeat | at_start | at_bound | fails
+    status = jnp.where(at_bound, float(Status.SINGULAR_SPEEDS), state.status)
     return _Decision(
-        keep=step.keep & ~taken_back,
-        next_t0=jnp.where(taken_back, step.t0, step.next_t0),
-        next_t1=jnp.where(again, t0 + beyond, step.next_t1),
-        again=again,
-        ends=there | at_start | at_bound,
-        lost=lost,
-        unchanged=going_on | taken_back,
+        keep=step.keep & ~rejected,
+        next_t0=jnp.where(rejected, step.t0, step.next_t0),
+        next_t1=jnp.where(repeat, t0 + beyond, step.next_t1),
+        repeat=repeat,
+        ends=at_end | at_start | at_bound,
+        fails=fails,
+        inner_unchanged=resumes | rejected,
         state=EventState(
             inner=None,
-            start=_where(kept & ~taken_back, now, start),
-            which=which,
-            until=jnp.where(again & ~over, jnp.maximum(state.until, t1), state.until),
-            last=jnp.where(over, jnp.minimum(state.last, t1), state.last),
+            start=_where(kept & ~rejected, end, start),
+            status=jnp.where(at_end | at_start, float(Status.EVENT) + event, status),
+            rejected_end=jnp.where(repeat & ~over, jnp.maximum(state.rejected_end, t1), state.rejected_end),
+            over_bound=jnp.where(over, jnp.minimum(state.over_bound, t1), state.over_bound),
         ),
     )
 
 
-def _first(limits: Limits, start: Quantities, now: Quantities, h: Array) -> tuple[Array, Array]:
+def _first_event(limits: Limits, start: EventValues, end: EventValues, h: Array) -> tuple[Array, Array]:
     """Which quantity passes zero first in a step, and where in [0, 1]; infinite if none does."""
-    direction = jnp.asarray(limits.directions, h.dtype)
+    direction, (_, rounding, _) = jnp.asarray(limits.directions, h.dtype), limits.tolerances
     # Where a quantity has no rate, as a norm at zero, the chord has to do.
-    chord = now.values - start.values
-    slopes = [jnp.where(jnp.abs(rates) < jnp.inf, h * rates, chord) for rates in (start.rates, now.rates)]
-    x = first_crossing(start.values, slopes[0], now.values, slopes[1], direction)
+    chord = end.values - start.values
+    slopes = [jnp.where(jnp.abs(rates) < jnp.inf, h * rates, chord) for rates in (start.rates, end.rates)]
+    x = first_crossing(start.values, slopes[0], end.values, slopes[1], direction)
     # What is to vanish within a rounding error behind the step vanishes at its end.
-    coming = (now.values * now.rates < 0) & (direction * now.rates >= 0)
-    coming &= jnp.abs(now.values) <= jnp.abs(now.rates) * limits.rounding
+    coming = (end.values * end.rates < 0) & (direction * end.rates >= 0)
+    coming &= jnp.abs(end.values) <= jnp.abs(end.rates) * rounding
     x = jnp.where(coming, jnp.minimum(x, 1.0), x)
-    first, where = jnp.full_like(h, -1.0), jnp.full_like(h, jnp.inf)
+    event, place = jnp.full_like(h, -1.0), jnp.full_like(h, jnp.inf)
     for i in reversed(range(len(limits.directions))):
-        nearer = x[i] <= where
-        first, where = jnp.where(nearer, float(i), first), jnp.where(nearer, x[i], where)
-    return first, where
+        nearer = x[i] <= place
+        event, place = jnp.where(nearer, float(i), event), jnp.where(nearer, x[i], place)
+    return event, place
 
 
-class AdaptiveToStops(EventController, diffrax.AbstractAdaptiveStepSizeController[Any, Any]):
-    """`EventController` around a controller with tolerances, which implicit solvers ask for."""
+class InnerTolerances(diffrax.AbstractAdaptiveStepSizeController[Any, Any]):
+    """The tolerances of a controller are those of its inner one; implicit solvers ask for them."""
 
     @property
     def rtol(self) -> Any:  # type: ignore[override]
-        return self.controller.rtol  # pyright: ignore[reportAttributeAccessIssue]
+        return self.controller.rtol  # type: ignore[attr-defined]
 
     @property
     def atol(self) -> Any:  # type: ignore[override]
-        return self.controller.atol  # pyright: ignore[reportAttributeAccessIssue]
+        return self.controller.atol  # type: ignore[attr-defined]
 
     @property
     def norm(self) -> Any:  # type: ignore[override]
-        return self.controller.norm  # pyright: ignore[reportAttributeAccessIssue]
+        return self.controller.norm  # type: ignore[attr-defined]
+
+
+class AdaptiveEventController(EventController, InnerTolerances):
+    """An `EventController` around a controller with tolerances."""
 
 
 def _where(condition: Any, x: Any, y: Any) -> Any:

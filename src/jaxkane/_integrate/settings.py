@@ -1,10 +1,10 @@
-"""How to integrate, and what a simulation is given: options, times and states, checked. Knows no mechanics."""
+"""How to integrate: the options of `simulate`, checked, and the mode in which a motion will be differentiated."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._kane.arguments import by_names, check_is_system, refuse_incomplete
 from .._scalarjit.compat import (
     MISSING,
     Tracer,
@@ -25,11 +24,6 @@ from .._scalarjit.compat import (
     new_primitive,
     nothing_is_traced,
 )
-from .._system.system import State, System
-from .inputs import real_array, samples_of
-
-SCALARS_UP_TO = 64
-"""Beyond so many numbers an array is none for a program of scalars."""
 
 ADJOINTS = {
     "auto": diffrax.RecursiveCheckpointAdjoint,
@@ -40,7 +34,7 @@ ADJOINTS = {
 
 
 class Settings(eqx.Module):
-    """How to integrate: what `simulate` was given, with its defaults filled in.
+    """The options of `simulate`, with their defaults filled in.
 
     Tolerances and the step are numbers, or arrays where they may change without another compilation.
     """
@@ -72,11 +66,19 @@ def settings_for(
     rising: bool = False,
 ) -> Settings:
     """The options of `simulate`, with defaults that follow the type of the times; `rising`: whether these are known to
-    rise, as they do where `checked_times` saw their values."""
-    _check_kinds(solver, adjoint, project=project, progress=progress)
+    rise, as where `checked_times` saw their values.
+
+    **Raises:** `ValueError` or `TypeError` for options that are no such, and for those that contradict one another.
+    """
+    _check_types(solver, adjoint, project=project, progress=progress)
+    solver = diffrax.Tsit5() if solver is None else solver
     if step is not None and not (rtol is None and atol is None):
         raise ValueError(
             "`step` fixes the steps of integration, `rtol` and `atol` let them follow the error: give one."
+        )
+    if step is None and not isinstance(solver, diffrax.AbstractAdaptiveSolver):
+        raise ValueError(
+            f"{type(solver).__name__} estimates no error, which the steps would follow: give them, as in step=1e-3."
         )
     default = 1e-8 if ts.dtype == jnp.float64 else 1e-5
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
@@ -93,7 +95,7 @@ def settings_for(
     return Settings(
         rtol=default if rtol is None else float(rtol),
         atol=default if atol is None else float(atol),
-        solver=diffrax.Tsit5() if solver is None else solver,
+        solver=solver,
         step=step,
         adjoint=ADJOINTS[adjoint]() if isinstance(adjoint, str) else adjoint,
         max_steps=max_steps,
@@ -104,8 +106,7 @@ def settings_for(
     )
 
 
-def _check_kinds(solver: Any, adjoint: Any, **flags: Any) -> None:
-    """Refuse options of the wrong type. **Raises:** `TypeError`, or `ValueError` for the name of no adjoint."""
+def _check_types(solver: Any, adjoint: Any, **flags: Any) -> None:
     if isinstance(adjoint, str):
         if adjoint not in ADJOINTS:
             raise ValueError(f"`adjoint` is one of {', '.join(ADJOINTS)}, or a diffrax adjoint; got {adjoint!r}.")
@@ -123,118 +124,40 @@ def _check_kinds(solver: Any, adjoint: Any, **flags: Any) -> None:
             raise TypeError(f"`{label}` is True or False, got {value!r}.")
 
 
-def refuse_held(solver: Any, signals: Any) -> None:
-    """Refuse steps of one length over the jumps of held inputs, for a solver that asks for the right-hand side at the
-    end of a step: what is held has the next value there."""
-    tableau = getattr(solver, "tableau", None)
-    asks = True if tableau is None else np.any((np.asarray(tableau.c) == 1) & (np.asarray(tableau.b_sol)[1:] != 0))
-    if asks and any(x.hold for x in samples_of(signals)):
-        raise ValueError(
-            f"Steps of one length and an input under a zero-order hold: {type(solver).__name__} reads the end of a "
-            "step, where the next sample begins. Use solver=diffrax.Bosh3(); or leave out `step`, and the steps end "
-            "where the input jumps."
-        )
+def _check_number(label: str, value: Any, is_allowed: Callable[[float], bool], allowed: str) -> None:
+    try:
+        number = math.nan if isinstance(value, (bool, np.bool_, str)) else float(value)
+    except (TypeError, ValueError):
+        number = math.nan
+    if not (math.isfinite(number) and is_allowed(number)):
+        raise ValueError(f"`{label}` must be {allowed}; got {value!r}.")
 
 
-def of_any_accuracy(settings: Settings, dtype: Any) -> Settings:
+def with_array_tolerances(settings: Settings, dtype: Any) -> Settings:
     """The same, whose tolerances and step are arguments of a program, and no part of it."""
-    numbers = {name: getattr(settings, name) for name in ("rtol", "atol", "step")}
 
     def array(x: Any) -> Any:
         # A number goes by way of NumPy, which compiles nothing for it.
         return x.astype(dtype) if isinstance(x, jax.Array) else jax.device_put(np.asarray(x, dtype))
 
-    return dataclasses.replace(settings, **{name: x if x is None else array(x) for name, x in numbers.items()})
+    values = {name: getattr(settings, name) for name in ("rtol", "atol", "step")}
+    return dataclasses.replace(settings, **{name: x if x is None else array(x) for name, x in values.items()})
 
 
-def _check_number(label: str, value: Any, fits: Callable[[float], bool], what: str) -> None:
-    try:
-        number = math.nan if isinstance(value, (bool, np.bool_, str)) else float(value)
-    except (TypeError, ValueError):
-        number = math.nan
-    if not (math.isfinite(number) and fits(number)):
-        raise ValueError(f"`{label}` must be {what}; got {value!r}.")
-
-
-def checked_times(ts: Any, dtype: Any) -> Array:
-    """Times as an array of a state's type. **Raises:** `ValueError` unless finite, increasing, and two at least."""
-    ts = real_array(ts, "`ts`", dtype)
-    if ts.ndim != 1 or ts.shape[0] < 2:
-        raise ValueError(f"`ts` must be at least two times in an array of shape (n_t,), got the shape {ts.shape}.")
-    if not isinstance(ts, Tracer):
-        steps: Any = np.diff(np.asarray(ts))
-        if not np.all(np.isfinite(steps)):
-            raise ValueError("`ts` holds times that are not finite.")
-        if not np.all(steps > 0):
-            i = int(np.argmax(steps <= 0))
-            raise ValueError(f"`ts` must increase: ts[{i}] = {float(ts[i]):.6g} is followed by {float(ts[i + 1]):.6g}.")
-    return ts
-
-
-def checked_state(system: System, state: Any) -> State:
-    """A state of the right shape for a system."""
-    check_is_system(system)
-    name = type(system).__name__
-    if not isinstance(state, State):
-        raise TypeError(
-            f"{name}: the state must be a jaxkane.State(q, u), as assemble gives it; got {type(state).__name__}."
-        )
-    state = as_state(system, state)
-    parts = [("q", state.q, system.coordinates), ("u", state.u, system.speeds), ("x", state.x, system.states)]
-    for label, value, names in parts:
-        if value is not None and value.shape != (len(names),):
-            raise ValueError(
-                f"{name}: state.{label} must have the shape ({len(names)},) for {', '.join(names)}; got {value.shape}."
-                + (" For a batch use jaxkane.sweep or jax.vmap." if value.ndim > 1 else "")
-            )
-    return state
-
-
-def as_state(system: System, state: State) -> State:
-    """A state in arrays, of one in dicts by name. What is left out is zero.
-
-    **Raises:** `ValueError` for an unknown name, a dependent coordinate left out, a dependent speed that is named.
-    """
-    refuse_incomplete(system, state.q, state.u)
-    title = type(system).__name__
-    x: Any = {} if state.x is None and system.states else state.x
-    if not system.states and x is not None and np.size(x):
-        raise ValueError(f"{title} has no states of the first order, but state.x is {x!r}.")
-    parts: list[Any] = [("q", state.q, system.coordinates), ("u", state.u, system.speeds)]
-    parts += [("x", x, system.states)] if system.states else []
-    found: list[Any] = []
-    for label, values, names in parts:
-        if isinstance(values, Mapping):
-            values = by_names(values, names, f"{title}: state.{label}")
-            values = values.astype(found[0].dtype) if found else values
-        if not hasattr(values, "shape"):
-            raise TypeError(f"{title}: state.{label} is an array of numbers, or a dict by name; got {values!r}.")
-        found.append(values)
-    return State(*found)
-
-
-def goes_forward(values: Any) -> bool:
-    """Whether a derivative in forward mode is under way by any of the arrays in `values`."""
-    return any(map(is_moved_forward, jax.tree.leaves(values)))
-
-
-def in_its_mode(settings: Settings, adjoint: Any, given: Any) -> tuple[Settings, Any]:
-    """The settings for a derivative in forward mode that is under way, where `adjoint` leaves the choice; and what is
-    given to a motion, guarded where that is for reverse mode."""
-    if adjoint == "auto" and goes_forward(given):
+def resolve_adjoint(settings: Settings, adjoint: Any, arguments: Any) -> tuple[Settings, Any]:
+    """The settings for a derivative in forward mode that is under way, where `adjoint` is "auto"; and the arguments of
+    a motion, guarded where that is for reverse mode."""
+    if adjoint == "auto" and any(map(is_moved_forward, jax.tree.leaves(arguments))):
         settings = dataclasses.replace(settings, adjoint=ADJOINTS["forward"]())
     if isinstance(settings.adjoint, ADJOINTS["reverse"]) and not nothing_is_traced():
-        given = for_reverse_mode(given)
-    return settings, given
+        arguments = _for_reverse_mode(arguments)
+    return settings, arguments
 
 
-def for_reverse_mode(values: Any) -> Any:
+def _for_reverse_mode(values: Any) -> Any:
     """`values`, whose derivative in forward mode is an error that says what to do; in reverse mode it is untouched.
 
-    A motion whose steps are taken back (`adjoint="reverse"`) can be differentiated in reverse mode alone. A program
-    that was traced before, as by `jax.jit`, meets forward mode when JAX comes to compile its derivative.
-
-    **Raises:** `TypeError`, there.
+    A program that was traced before, as by `jax.jit`, meets forward mode when JAX comes to compile its derivative.
     """
     if any(map(is_moved_forward_below, jax.tree.leaves(values))):
         _refuse()

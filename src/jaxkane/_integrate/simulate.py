@@ -1,14 +1,16 @@
-"""`simulate`: what is asked for, checked, and integrated by `ride`. Knows neither mechanisms nor solvers."""
+"""`simulate`: its arguments, checked, and the motion that `solve` makes of them."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from typing import Any, Literal
 
 import diffrax
 import numpy as np
+from jaxtyping import Array
 
-from .._kane.arguments import is_concrete
+from .._kane.arguments import by_names, check_is_system, is_concrete, refuse_incomplete
 from .._kane.checks import check_system, with_possible_bodies
 from .._kane.constraints import check_state
 from .._kane.equations import diagnosis
@@ -17,10 +19,11 @@ from .._scalarjit.cache_key import captured_tracers
 from .._scalarjit.compat import Tracer, nothing_is_traced
 from .._scalarjit.components import Inputs
 from .._system.system import State, System
-from .inputs import as_signals, with_one_times
-from .integrate import inputs_at, refuse_captured, solve
-from .settings import ADJOINTS, checked_state, checked_times, in_its_mode, of_any_accuracy, settings_for
-from .trajectory import Status, Trajectory
+from .inputs import as_signals, inputs_at, real_array, share_times
+from .integrate import refuse_captured, solve
+from .settings import ADJOINTS, resolve_adjoint, settings_for, with_array_tolerances
+from .status import Status
+from .trajectory import Trajectory
 
 
 def simulate(
@@ -89,22 +92,76 @@ def simulate(
         progress=progress,
         rising=not isinstance(ts, Tracer),
     )
-    given = (system, state, ts, with_one_times(signals)), captured_tracers(signals)
-    settings, (parts, closures) = in_its_mode(settings, adjoint, given)
+    arguments = (system, state, ts, share_times(signals)), captured_tracers(signals)
+    settings, (arguments, closures) = resolve_adjoint(settings, adjoint, arguments)
     name_of_adjoint = type(settings.adjoint).__name__
     if nothing_is_traced() and isinstance(settings.adjoint, ADJOINTS["reverse"]):
         # A motion that nobody can differentiate is compiled without what its derivative would need: the same numbers.
         settings = dataclasses.replace(settings, adjoint=ADJOINTS["forward"]())
-    ride = solve(*parts, of_any_accuracy(settings, ts.dtype), closures=closures)
-    ride = dataclasses.replace(ride, adjoint=name_of_adjoint)
-    if is_concrete(ride.status) and int(ride.status) == Status.NO_SOLUTION:
-        inputs_now = values_of(system, state.x, inputs_at(system, signals, ts[0], state))
+    trajectory = solve(*arguments, with_array_tolerances(settings, ts.dtype), closures=closures)
+    trajectory = dataclasses.replace(trajectory, adjoint=name_of_adjoint)
+    if is_concrete(trajectory.status) and int(trajectory.status) == Status.NO_SOLUTION:
+        values = values_of(system, state.x, inputs_at(system, signals, ts[0], state))
         raise ValueError(
-            diagnosis(system, ts[0], state.q, state.u, inputs_now) or _UNSOLVED.format(type(system).__name__)
+            diagnosis(system, ts[0], state.q, state.u, values)
+            or f"{type(system).__name__}: the solver cannot take a first step: accelerations, rates or events are not "
+            "finite beside the first state."
         )
-    return ride
+    return trajectory
 
 
-_UNSOLVED = (
-    "{}: the solver cannot take a first step: accelerations, rates or events are not finite beside the first state."
-)
+def checked_times(ts: Any, dtype: Any) -> Array:
+    """Times as an array of a state's type. **Raises:** `ValueError` unless finite, increasing, and two at least."""
+    ts = real_array(ts, "`ts`", dtype)
+    if ts.ndim != 1 or ts.shape[0] < 2:
+        raise ValueError(f"`ts` must be at least two times in an array of shape (n_t,), got the shape {ts.shape}.")
+    if not isinstance(ts, Tracer):
+        steps: Any = np.diff(np.asarray(ts))
+        if not np.all(np.isfinite(steps)):
+            raise ValueError("`ts` holds times that are not finite.")
+        if not np.all(steps > 0):
+            i = int(np.argmax(steps <= 0))
+            raise ValueError(f"`ts` must increase: ts[{i}] = {float(ts[i]):.6g} is followed by {float(ts[i + 1]):.6g}.")
+    return ts
+
+
+def checked_state(system: System, state: Any) -> State:
+    """A state of the right shape for a system."""
+    check_is_system(system)
+    name = type(system).__name__
+    if not isinstance(state, State):
+        raise TypeError(
+            f"{name}: the state must be a jaxkane.State(q, u), as assemble gives it; got {type(state).__name__}."
+        )
+    state = as_state(system, state)
+    parts = [("q", state.q, system.coordinates), ("u", state.u, system.speeds), ("x", state.x, system.states)]
+    for label, value, names in parts:
+        if value is not None and value.shape != (len(names),):
+            raise ValueError(
+                f"{name}: state.{label} must have the shape ({len(names)},) for {', '.join(names)}; got {value.shape}."
+                + (" For a batch use jaxkane.sweep or jax.vmap." if value.ndim > 1 else "")
+            )
+    return state
+
+
+def as_state(system: System, state: State) -> State:
+    """A state in arrays, of one in dicts by name. What is left out is zero.
+
+    **Raises:** `ValueError` for an unknown name, a dependent coordinate left out, a dependent speed that is named.
+    """
+    refuse_incomplete(system, state.q, state.u)
+    title = type(system).__name__
+    x: Any = {} if state.x is None and system.states else state.x
+    if not system.states and x is not None and np.size(x):
+        raise ValueError(f"{title} has no states of the first order, but state.x is {x!r}.")
+    parts: list[Any] = [("q", state.q, system.coordinates), ("u", state.u, system.speeds)]
+    parts += [("x", x, system.states)] if system.states else []
+    arrays: list[Any] = []
+    for label, values, names in parts:
+        if isinstance(values, Mapping):
+            values = by_names(values, names, f"{title}: state.{label}")
+            values = values.astype(arrays[0].dtype) if arrays else values
+        if not hasattr(values, "shape"):
+            raise TypeError(f"{title}: state.{label} is an array of numbers, or a dict by name; got {values!r}.")
+        arrays.append(values)
+    return State(*arrays)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 from typing import Any
 
 import equinox as eqx
@@ -13,31 +12,10 @@ from .._common.lookup import by_name
 from .._kane.arguments import check_is_system
 from .._scalarjit.compat import Tracer
 from .._system.system import State, System, names_of
+from .status import Status, advice, reason
 
 
-class Status(enum.IntEnum):
-    """How a simulation ended. Codes from `EVENT` on are events of the system, in the order of the alphabet."""
-
-    COMPLETED = 0
-    """Reached the last time."""
-    SINGULAR_SPEEDS = 1
-    """The dependent speeds are no longer determined by the independent ones: det C_dep passed zero."""
-    STEP_TOO_SMALL = 2
-    """The solver could not go on: the step fell below its minimum, as it does when something becomes infinite."""
-    MAX_STEPS = 3
-    """The solver took `max_steps` steps before the last time."""
-    INVALID = 4
-    """A parameter or an initial value was not finite, a positive parameter was not positive, a body had a mass or an
-    inertia that no body has, or the coordinates violated a configuration constraint: nothing was solved."""
-    INTERRUPTED = 5
-    """A sweep was stopped before it came to this member."""
-    NO_SOLUTION = 6
-    """The equations have no finite solution at the first state: a speed that no mass moves with, angles that lock,
-    constraints that cannot be solved for the dependent speeds. One simulation alone raises an error that says which."""
-    EVENT = 10
-
-
-class Sides(eqx.Module):
+class InputDiscontinuities(eqx.Module):
     """Where inputs that are samples have kinks and jumps: at `times` (n,) [s]. Where there are jumps, `inputs` (n_t,)
     by name just before and just after each time of the trajectory."""
 
@@ -60,7 +38,7 @@ class Trajectory(eqx.Module):
         last time or by an event, whose time moves with what it follows from; otherwise their derivatives are NaN.
     - `stats`: numbers of steps taken, accepted and rejected. `adjoint`: how it is differentiated.
     - `units`: pairs of a name and its unit, as the system declares them.
-    - `sides`: where inputs have kinks and jumps, and their values on both sides, for `audit`; else None.
+    - `discontinuities`: where inputs have kinks and jumps, and their values on both sides, for `audit`; else None.
     """
 
     t: Float[Array, "*batch n_t"]
@@ -78,7 +56,7 @@ class Trajectory(eqx.Module):
     adjoint: str = eqx.field(static=True)
     units: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
     end: State | None = None
-    sides: Sides | None = None
+    discontinuities: InputDiscontinuities | None = None
 
     def __getitem__(self, name: str) -> Float[Array, "*batch n_t"]:
         groups = zip(self.names, (self.q, self.u, self.u_dep, self.x), strict=True)
@@ -110,26 +88,7 @@ class Trajectory(eqx.Module):
             return f"Trajectory(shape={self.t.shape})"
         steps = int(self.stats["steps"])
         text = f"Trajectory({self.t.shape[-1]} times to {float(self.t_end):.6g} s in {steps} steps: {self.reason})"
-        advice = _advice(int(self.status), self.reason)
-        return f"{text}. {advice}" if advice else text
-
-
-def reason(code: int, events: tuple[str, ...]) -> str:
-    """A status code in words."""
-    if code >= Status.EVENT:
-        return events[code - Status.EVENT].replace("_", " ")
-    return Status(code).name.lower().replace("_", " ")
-
-
-def _advice(code: int, reason: str) -> str:
-    if reason.startswith("gimbal lock"):
-        return "Angles lock there: describe the orientation with Euler parameters, or with another sequence of angles."
-    advice = {
-        Status.SINGULAR_SPEEDS: "Choose other dependent speeds: see jaxkane.best_dependent_speeds(system, t, q).",
-        Status.STEP_TOO_SMALL: "Something becomes infinite or jumps: look at the last times that were reached.",
-        Status.MAX_STEPS: "Raise max_steps (a sample of an input takes a step); or look for what is stiff or jumps.",
-    }
-    return advice.get(Status(code), "") if code < Status.EVENT else ""
+        return f"{text}. {advice(int(self.status), self.events)}".removesuffix(". ")
 
 
 def refuse_other_system(label: str, system: System, trajectory: Any) -> None:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from .._integrate.inputs import with_one_times
+from .._integrate.inputs import share_times
 from .._integrate.integrate import solve
 from .._kane.constraints import configuration_residual, has_configuration_constraints, projected
 from .._system.system import System, packed, unpacked
@@ -214,7 +214,7 @@ def _flow(model: Any, system: System, calibration: Any, window: Windows, v: Arra
     settings = model.settings
     if settings.step is not None:
         settings = dataclasses.replace(settings, step=ts[1] - ts[0])
-    signals = with_one_times(model.signals(window, b, calibration))
+    signals = share_times(model.signals(window, b, calibration))
     ride = solve(system, unpacked(system, v[:n]), ts, signals, settings, disturbance)
     return (jnp.concatenate([packed(ride.state()), b]), model.simulated(ride, b, calibration)), ride.status
 

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from .._common.lookup import real_number
-from .._integrate.inputs import Samples, with_one_times
+from .._integrate.inputs import Samples, share_times
 from .._integrate.integrate import solve
 from .._integrate.settings import Settings, settings_for
 from .._integrate.trajectory import Trajectory
@@ -230,7 +230,7 @@ class Model(eqx.Module):
         """One window's motion."""
         system, calibration = self.parameters.apply(self.system, x)
         settings = self.settings if self.settings.step is None else dataclasses.replace(self.settings, step=window.step)
-        signals = with_one_times(self.signals(window, b, calibration))
+        signals = share_times(self.signals(window, b, calibration))
         return solve(system, unpacked(system, start), window.t, signals, settings)
 
     def signals(self, window: Windows, b: Array, calibration: Calibration) -> dict[str, Any]:
@@ -256,7 +256,7 @@ class Model(eqx.Module):
                 if name in self.zero_order_hold and delayed and self.settings.step is not None:
                     signals[name] = Ramps(times, values, 2.0 * window.step)
                 else:
-                    signals[name] = Samples(times, values, hold=name in self.zero_order_hold)
+                    signals[name] = Samples(times, values, zero_order_hold=name in self.zero_order_hold)
             elif ("bias of input", name) in self.nuisance.trial or ("offset of input", name) in calibration:
                 signals[name] = bias
         return signals

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .._integrate.trajectory import Status, reason
+from .._integrate.status import Status, reason
 from ._block_lsq import Eliminated, eliminate
 from ._linearize import Linearization
 from ._model import Unknowns

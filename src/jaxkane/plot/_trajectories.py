@@ -9,7 +9,8 @@ import numpy as np
 
 from .._common.lookup import as_names, hint, label_of, refuse_unknown
 from .._integrate.audit import Audit
-from .._integrate.trajectory import Status, Trajectory
+from .._integrate.status import Status
+from .._integrate.trajectory import Trajectory
 from .._system.system import in_degrees, refuse_no_angle, unit_of, units_of
 
 SOFT = "0.55"  # a grey that is seen on white and on black

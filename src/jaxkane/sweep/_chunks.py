@@ -31,7 +31,7 @@ GROUP = 32
 
 class Part(eqx.Module):
     """What comes back of some members: `values` are what `reduce` made of a ride, or its (q, u, u_dep,
-    x, inputs, outputs, end, sides)."""
+    x, inputs, outputs, end, discontinuities)."""
 
     values: Any
     status: Any
@@ -63,7 +63,7 @@ class Job(eqx.Module):
         start = with_possible_bodies(system, self.ts[0], start)
         ride = solve(system, start, self.ts, signals, self.settings, closures=self.closures)
         if self.reduce is None:
-            values = (ride.q, ride.u, ride.u_dep, ride.x, ride.inputs, ride.outputs, ride.end, ride.sides)
+            values = (ride.q, ride.u, ride.u_dep, ride.x, ride.inputs, ride.outputs, ride.end, ride.discontinuities)
         else:
             values = jax.tree.map(jnp.asarray, self.reduce(ride))
         return Part(values, ride.status, ride.t_end, ride.stats, ride.names, ride.events, ride.adjoint, ride.units)

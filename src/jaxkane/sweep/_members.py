@@ -13,7 +13,7 @@ import numpy as np
 
 from .._common.lookup import not_there
 from .._integrate.inputs import Samples, as_signals
-from .._integrate.settings import as_state, checked_state
+from .._integrate.simulate import as_state, checked_state
 from .._kane.arguments import is_concrete
 from .._kane.assembly import assemble
 from .._kane.checks import check_system

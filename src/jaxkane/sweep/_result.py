@@ -10,8 +10,8 @@ import jax
 import numpy as np
 
 from .._common.lookup import not_there
-from .._integrate.trajectory import Status, Trajectory, reason
-from .._scalarjit.compat import Tracer
+from .._integrate.status import Status, reason
+from .._integrate.trajectory import Trajectory
 from ._chunks import Part
 from ._members import Table
 
@@ -45,12 +45,12 @@ class Sweep(eqx.Module):
         shaped = jax.tree.map(lambda x: x.reshape(*table.shape, *x.shape[1:]), part)
         ride = None
         if not reduced:
-            q, u, u_dep, x, inputs, outputs, end, sides = shaped.values
+            q, u, u_dep, x, inputs, outputs, end, discontinuities = shaped.values
             spread: Any = np.broadcast_to if isinstance(q, np.ndarray) else jax.numpy.broadcast_to
             t = spread(ts if isinstance(ts, Tracer) else np.asarray(ts), (*table.shape, ts.shape[0]))
             arrays: list[Any] = [t, q, u, u_dep, x, inputs, outputs, shaped.status, shaped.t_end, shaped.stats]
             static = {"names": part.names, "events": part.events, "adjoint": part.adjoint, "units": part.units}
-            ride = Trajectory(*arrays, **static, end=end, sides=sides)
+            ride = Trajectory(*arrays, **static, end=end, discontinuities=discontinuities)
         values = shaped.values if reduced else None
         return cls(ride, values, shaped.status, shaped.t_end, shaped.stats, table, part.events)
 

@@ -14,8 +14,10 @@ import numpy as np
 from tqdm import tqdm
 
 from .._integrate.integrate import refuse_captured
-from .._integrate.settings import as_state, checked_times, in_its_mode, settings_for
-from .._integrate.trajectory import Status, Trajectory
+from .._integrate.settings import resolve_adjoint, settings_for
+from .._integrate.simulate import as_state, checked_times
+from .._integrate.status import Status
+from .._integrate.trajectory import Trajectory
 from .._kane.arguments import is_concrete
 from .._scalarjit.cache_key import captured_tracers
 from .._scalarjit.components import Inputs
@@ -101,7 +103,7 @@ def sweep(
         if folder is not None or client is not None:
             raise ValueError("sweep: `folder` and `client` cannot be used inside jit, grad or vmap.")
         given = members, shared, ts, closures
-        settings, (members, shared, ts, closures) = in_its_mode(settings, options.get("adjoint", "auto"), given)
+        settings, (members, shared, ts, closures) = resolve_adjoint(settings, options.get("adjoint", "auto"), given)
         job = Job(shared, ts, settings, reduce, job.mesh, closures)
         return Sweep.of(job.solve(members, n), found, ts, reduce is not None)
 
