@@ -135,7 +135,7 @@ def controller_of(
         # which no step would end where a sample of an input stands.
         step = (1.0 + jnp.finfo(times.end.dtype).eps ** 0.5) * settings.step
         return EventController(diffrax.ConstantStepSize(), may_end, step, limits)
-    controller: Any = diffrax.PIDController(rtol=settings.rtol, atol=settings.atol, dtmin=times.shortest)
+    controller: Any = diffrax.PIDController(settings.rtol, settings.atol, dtmin=times.shortest, force_dtmin=False)
     if discontinuities is not None:
         controller = ClipToDiscontinuities(controller, discontinuities.times, discontinuities.restart, end=times.end)
     return AdaptiveEventController(controller, may_end, times.first, limits)
