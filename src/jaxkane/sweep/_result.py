@@ -12,6 +12,7 @@ import numpy as np
 from .._common.lookup import not_there
 from .._integrate.status import Status, reason
 from .._integrate.trajectory import Trajectory
+from .._scalarjit.compat import Tracer
 from ._chunks import Part
 from ._members import Table
 
