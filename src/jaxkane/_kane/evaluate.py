@@ -78,17 +78,17 @@ def unit(n: int, r: int) -> Row:
 
 
 class DescriptionEvaluator:
-    """What the description of a system says, at any time, coordinates and speeds.
+    """The description of a system, at any time, coordinates and speeds.
 
-    `read` gives parts of it as components, from a record of the description; `motion` reads the description itself.
+    `read` gives parts of it as components, from one trace of the description; `motion` evaluates the method itself.
     """
 
     def __init__(self, system: System, inputs: Mapping[str, Component] | None = None):
         self.system = system
         self.name = type(system).__name__
-        if several := in_batches(system):
+        if batched := in_batches(system):
             raise ValueError(
-                f"{self.name}: {', '.join(several)} has more axes than it was declared with. For a batch of systems "
+                f"{self.name}: {', '.join(batched)} has more axes than it was declared with. For a batch of systems "
                 "use jax.vmap, or jaxkane.sweep.sweep for their motions."
             )
         self.n, self.k = len(system.speeds), len(system.dependent_speeds)
@@ -116,49 +116,55 @@ class DescriptionEvaluator:
 
     def residuals(self, t: Component, q: Row, u: Row) -> Row:
         """Velocity residuals c(t, q, u), one for each dependent speed."""
-        rolling = self.read("rolling", t, q, u)
-        if len(rolling) == self.k:
-            return rolling  # the configuration constraints, if there are any, are integrals of these
+        c = self.read("velocity_residuals", t, q, u)
+        if len(c) == self.k:
+            return c  # the configuration constraints, if there are any, are integrals of these
         h, h_dot = jvp(lambda t, *q: self.configuration(t, q), (t, *q), (1.0, *self.rates(t, q, u)))
-        if len(rolling) + len(h) != self.k:
+        if len(c) + len(h) != self.k:
             names = ", ".join(self.system.dependent_speeds) or "none"
             raise ValueError(
-                f"{self.name}: {self.k} dependent speeds are named ({names}), but there are {len(rolling)} velocity "
+                f"{self.name}: {self.k} dependent speeds are named ({names}), but there are {len(c)} velocity "
                 f"residuals in its motion and {len(h)} configuration constraints. Name as many dependent speeds as "
                 "there are velocity residuals; or as many as both together, and the constraints' rates are added."
             )
-        return (*rolling, *h_dot)
+        return (*c, *h_dot)
 
 
 class EvaluatedDescription:
-    """What a description says at one time, coordinates and speeds, in parts that are components."""
+    """A description at one time, coordinates and speeds, in parts that are components."""
 
-    def __init__(self, reading: DescriptionEvaluator, t: Component, q: Row, u: Row):
-        self.reading, self.t, self.q, self.u = reading, t, q, u
+    parts = ("rates", "configuration", "velocity_residuals", "bodies", "orientations")
+    parts += ("velocities", "momenta", "frame_velocities", "forces")
+
+    def __init__(self, evaluator: DescriptionEvaluator, t: Component, q: Row, u: Row):
+        self.evaluator, self.t, self.q, self.u = evaluator, t, q, u
+
+    def all_parts(self) -> dict[str, Any]:
+        return {part: getattr(self, part)() for part in self.parts}
 
     @functools.cached_property
     def motion(self) -> Motion:
-        return self.reading.motion(self.t, self.q, self.u)
+        return self.evaluator.motion(self.t, self.q, self.u)
 
     @functools.cached_property
     def loads(self) -> tuple[Load, ...]:
-        # `loads` makes points of its own from the speeds that it is given. No exact zero may divide there.
+        # `loads` makes points of its own from these speeds. No exact zero may divide there.
         dtype = jnp.result_type(*([x for x in (*self.q, *self.u) if not is_exact(x)] or [float]))
         u = tuple(jnp.asarray(x, dtype) if is_exact(x) else x for x in self.u)
-        return self.reading.loads_at(self.t, self.q, u, self.motion)
+        return self.evaluator.loads_at(self.t, self.q, u, self.motion)
 
     def rates(self) -> Row:
         """q_dot (n_q,)."""
-        q_dot = self.reading.system.q_dot(self.t, self.q, self.u)
-        return as_row(q_dot, self.reading.system.coordinates, f"{self.reading.name}.q_dot")
+        system = self.evaluator.system
+        return as_row(system.q_dot(self.t, self.q, self.u), system.coordinates, f"{self.evaluator.name}.q_dot")
 
     def configuration(self) -> Row:
         """Residuals (h,) of the configuration constraints."""
-        residuals = self.reading.system.configuration_constraints(self.t, self.q)
-        return flatten_residuals(residuals, f"{self.reading.name}: the residuals of configuration_constraints")
+        residuals = self.evaluator.system.configuration_constraints(self.t, self.q)
+        return flatten_residuals(residuals, f"{self.evaluator.name}: the residuals of configuration_constraints")
 
-    def rolling(self) -> Row:
-        """The velocity residuals of the motion itself."""
+    def velocity_residuals(self) -> Row:
+        """Those of the motion itself."""
         return self.motion.constraints
 
     def bodies(self) -> list[tuple[Component, Rows]]:
@@ -179,9 +185,13 @@ class EvaluatedDescription:
         return bodies, [load.velocity.components for load in self.loads]
 
     def momenta(self) -> list[tuple[Row, Row]]:
-        return [_momenta(body) for body in self.motion.bodies]
+        """p = m v and H = I . omega of the bodies."""
+        return [
+            (scale3(b.mass, b.center.velocity.components), matvec(b.inertia, b.angular_velocity.components_in(b.frame)))
+            for b in self.motion.bodies
+        ]
 
-    def turning(self) -> list[tuple[Row, Row]]:
+    def frame_velocities(self) -> list[tuple[Row, Row]]:
         """Angular velocities of the frames in which the bodies' momenta stand."""
         frames = [(body.center.velocity.frame, body.frame) for body in self.motion.bodies]
         return [(a.angular_velocity.components, b.angular_velocity.components) for a, b in frames]
@@ -189,6 +199,12 @@ class EvaluatedDescription:
     def forces(self) -> list[Row]:
         """The loads' vectors, in the frames of the velocities that they act on."""
         return [load.vector.components_in(load.velocity.frame) for load in self.loads]
+
+
+@ScalarFunction
+def _parts(system: System, components: Any) -> dict[str, Any]:
+    inputs, t, q, u = components
+    return EvaluatedDescription(DescriptionEvaluator(system, inputs), t, q, u).all_parts()
 
 
 def turning_bodies(motion: Motion) -> list[Body]:
@@ -201,31 +217,17 @@ def frames_of(motion: Motion, loads: Iterable[Load] = ()) -> list[Frame]:
     starts = [*(body.frame for body in motion.bodies), *motion.frames.values()]
     vectors = (*(body.center for body in motion.bodies), *motion.points.values(), *loads)
     starts += [x.velocity.frame for x in vectors]
-    seen: dict[Frame, None] = {}
+    frames: dict[Frame, None] = {}
     for start in starts:
         frame: Frame | None = start
-        while frame is not None and frame.parent is not None and frame not in seen:
-            seen[frame] = None
+        while frame is not None and frame.parent is not None and frame not in frames:
+            frames[frame] = None
             frame = frame.parent
-    return list(seen)
-
-
-@ScalarFunction
-def _parts(system: System, components: Any) -> dict[str, Any]:
-    inputs, t, q, u = components
-    said = EvaluatedDescription(DescriptionEvaluator(system, inputs), t, q, u)
-    parts = "rates configuration rolling bodies orientations velocities momenta turning forces"
-    return {part: getattr(said, part)() for part in parts.split()}
-
-
-def _momenta(body: Body) -> tuple[Row, Row]:
-    p = scale3(body.mass, body.center.velocity.components)
-    H = matvec(body.inertia, body.angular_velocity.components_in(body.frame))
-    return p, H
+    return list(frames)
 
 
 def structure_of(system: System) -> tuple[Any, ...]:
-    """What a description is, apart from the values of its parameters."""
+    """A description, apart from the values of its parameters."""
     return (version_of(system), jax.tree.structure(system), *(np.shape(x) for x in jax.tree.leaves(system)))
 
 
@@ -237,8 +239,8 @@ def dtype_of(system: System) -> Any:
 
 
 def at_random_point(tree: tuple[System, Any, Any], rng: np.random.Generator) -> tuple[System, Any, Any]:
-    """Numbers for what is traced: positive parameters, small coordinates; arrays of length 1, as axes and quaternions
-    are, and unit matrices."""
+    """A random test point for what is traced: positive parameters, small coordinates; arrays of length 1, as axes and
+    quaternions are, and unit matrices."""
     system, t, q = tree
 
     def parameter(x: Any) -> Any:

@@ -9,10 +9,10 @@ With p_i = m_i v_i, H_i = I_i . omega_i and d/dt in the inertial frame (Kamman, 
     F*_r = -sum_i V_ir . dp_i/dt + W_ir . dH_i/dt                   inertia, at u_dot = 0
     M u_dot = f = F_r + F*_r
 
-Partial velocities, C and the time derivatives are read off the description by `jax.jvp`. Only the directions that
+`jax.jvp` of the description gives partial velocities, C and the time derivatives. Only the directions that
 are needed are pushed: the residuals along every speed, the bodies along the n independent columns of [1; J].
 
-A few speeds are written out so, as scalars. For many, sums over bodies for every pair of speeds would be of order
+For a few speeds this is written out, as scalars. For many, sums over bodies for every pair of speeds would be of order
 n^2 b. Then f and the columns of M are found without partial velocities, each in order b: vectors that stand on bodies
 are projected onto all speeds at once by the transpose of the map u -> (v, omega), which `jax.vjp` gives.
 """
@@ -38,7 +38,7 @@ from .evaluate import DescriptionEvaluator, jvp, transposed, unit
 
 
 class KaneEquations(DescriptionEvaluator):
-    """A system at one time, with its coordinates and independent speeds, and what its description says there.
+    """Kane's equations of a system at a state: one time, coordinates and independent speeds.
 
     `u_dep`, `q_dot` and the columns of `J` are formed at once, since everything else needs them.
     """
@@ -49,16 +49,16 @@ class KaneEquations(DescriptionEvaluator):
         self.q = as_row(q, system.coordinates, f"{self.name}: q")
         self.u = as_row(u, system.speeds, f"{self.name}: u")
         self.C_ind, self.C_dep, c0 = self._constraint_rows()
+        # J = -C_dep^-1 C_ind,   u_dep = -C_dep^-1 (C_ind u + c0)
         known = [add(x, y) for x, y in zip(matvec(self.C_ind, self.u), c0, strict=True)]
         *columns, u_dep = solve(self.C_dep, *zip(*self.C_ind, strict=True), known) if self.k else [()] * (self.n + 1)
-        self.J = [_negative(column) for column in columns]  # n columns of (k,)
+        self.J = [_negative(column) for column in columns]  # n columns (k,)
         self.u_dep = _negative(u_dep)
         self.u_all = (*self.u, *self.u_dep)
         self.q_dot = self.rates(self.t, self.q, self.u_all)
 
-    def loads(self, motion: Motion, u: Row | None = None) -> tuple[Load, ...]:
-        """The loads, at the speeds of this instant or at others."""
-        return self.loads_at(self.t, self.q, self.u_all if u is None else u, motion)
+    def loads(self, motion: Motion) -> tuple[Load, ...]:
+        return self.loads_at(self.t, self.q, self.u_all, motion)
 
     def along_speeds(self, f: Callable[[Row], Any], direction: Row) -> Any:
         """The derivative of `f(u)` along a direction of speeds, at u = 0: all of it, since f is affine in them."""
@@ -81,19 +81,14 @@ class KaneEquations(DescriptionEvaluator):
         rows = tuple(zip(*along, strict=True))
         return [row[:n] for row in rows], [row[n:] for row in rows], c0
 
-    # What Kane's equations are made of.
-
     def partials(self) -> list[tuple[list, list]]:
         """For each independent speed: the partial velocities (V, W) of the bodies, and those of the loads."""
-
+        # V_ir = dv_i/du_r,  W_ir = domega_i/du_r, along the columns of [1; J]
         return [self.along_speeds(self.velocities, (*unit(self.n, r), *self.J[r])) for r in range(self.n)]
 
     def velocities(self, u: Row) -> tuple[list, list]:
         """Velocities (v, omega) of the bodies, and those that the loads act on, at speeds `u`."""
         return self.read("velocities", self.t, self.q, u)
-
-    def body_velocities(self, u: Row) -> list:
-        return self.velocities(u)[0]
 
     def momenta(self, u: Row) -> list[tuple[Row, Row]]:
         return self.read("momenta", self.t, self.q, u)
@@ -109,7 +104,7 @@ class KaneEquations(DescriptionEvaluator):
     def mass_times(self, direction: Row) -> Row:
         """M times a direction of the independent speeds: the momenta along it, onto all speeds. Order b, not n b."""
         along = self.along_speeds(self.momenta, self.with_dependent(direction))
-        return self.onto_speeds(self.body_velocities, along)
+        return self.onto_speeds(lambda u: self.velocities(u)[0], along)
 
     def forcing(self) -> Row:
         """f of M u_dot = f, without partial velocities: all vectors onto all speeds at once."""
@@ -138,19 +133,18 @@ class KaneEquations(DescriptionEvaluator):
         `u_dot` (n + k,) of the independent and the dependent speeds; by default u_dot = 0 and `bias`.
         """
         momenta = lambda t, *q: self.read("momenta", t, q, self.u_all)  # noqa: E731
-        now, drift = jvp(momenta, (self.t, *self.q), (1.0, *self.q_dot))
+        values, rates = jvp(momenta, (self.t, *self.q), (1.0, *self.q_dot))
         if u_dot is None and self.k:
             u_dot = (*(0.0,) * self.n, *self.bias())
-        turning = None if u_dot is None else self.along_speeds(self.momenta, u_dot)
-        rates = []
-        for i, frames in enumerate(self.read("turning", self.t, self.q, self.u_all)):
-            # dx/dt in N = derivative of the components + omega x
-            rate = []
-            for j, angular_velocity in enumerate(frames):
-                x_dot = drift[i][j] if turning is None else add3(drift[i][j], turning[i][j])
-                rate.append(add3(x_dot, cross(angular_velocity, now[i][j])))
-            rates.append(tuple(rate))
-        return rates
+        if u_dot is not None:
+            along = self.along_speeds(self.momenta, u_dot)
+            rates = [tuple(map(add3, *pair)) for pair in zip(rates, along, strict=True)]
+        # dx/dt in N = derivative of the components + omega x
+        frames = self.read("frame_velocities", self.t, self.q, self.u_all)
+        return [
+            tuple(add3(x_dot, cross(omega, x)) for x_dot, omega, x in zip(*each, strict=True))
+            for each in zip(rates, frames, values, strict=True)
+        ]
 
     def active_forces(self, partials: list) -> Row:
         # F_r = sum F . V_r + T . W_r
@@ -160,9 +154,9 @@ class KaneEquations(DescriptionEvaluator):
     def force_components(self) -> list[Row]:
         return self.read("forces", self.t, self.q, self.u_all)
 
-    def inertia_forces(self, partials: list) -> Row:
+    def inertia_forces(self, partials: list, u_dot: Row | None = None) -> Row:
         # F*_r = -sum_i V_ir . dp_i/dt + W_ir . dH_i/dt
-        rates = self.momentum_rates()
+        rates = self.momentum_rates(u_dot)
         return tuple(
             mul(-1.0, total(add(dot(V, p), dot(W, H)) for (V, W), (p, H) in zip(bodies, rates, strict=True)))
             for bodies, _ in partials
@@ -187,8 +181,9 @@ class KaneEquations(DescriptionEvaluator):
     def equations(self) -> tuple[list[list[Component]], Row]:
         """M and f of M u_dot = f."""
         partials = self.partials()
-        pairs = zip(self.active_forces(partials), self.inertia_forces(partials), strict=True)
-        return self.mass_matrix(partials), tuple(add(a, b) for a, b in pairs)
+        # f = F_r + F*_r
+        f = tuple(map(add, self.active_forces(partials), self.inertia_forces(partials)))
+        return self.mass_matrix(partials), f
 
     def accelerations(self) -> Row:
         return solve_positive(*self.equations())
@@ -201,7 +196,7 @@ def _negative(row: Sequence[Component]) -> Row:
 def motion_rates(
     system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]
 ) -> tuple[Float[Array, " n_q"], Float[Array, " n"]]:
-    """q_dot and u_dot: the right-hand side, from arrays that are known to fit."""
+    """q_dot and u_dot: the right-hand side, from arrays that were checked."""
     if is_written_out(len(system.speeds)):
         return _motion_rates(system, t, q, u, inputs)
     q_dot, M, f = rates_and_equations(system, t, q, u, inputs)
@@ -211,7 +206,7 @@ def motion_rates(
 def rates_and_equations(
     system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]
 ) -> tuple[Float[Array, " n_q"], Float[Array, "n n"], Float[Array, " n"]]:
-    """q_dot, M and f of M u_dot = f, from arrays that are known to fit."""
+    """q_dot, M and f of M u_dot = f, from arrays that were checked."""
     if is_written_out(len(system.speeds)):
         return _equations_written_out(system, t, q, u, inputs)
     # The columns of M are one program, whose lanes are the directions.
@@ -223,7 +218,7 @@ def rates_and_equations(
 def accelerations_and_mass_matrix(
     system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """u_dot and M, from arrays that are known to fit."""
+    """u_dot and M, from arrays that were checked."""
     if is_written_out(len(system.speeds)):
         return _accelerations_and_mass_matrix(system, t, q, u, inputs)
     _, M, f = rates_and_equations(system, t, q, u, inputs)
@@ -232,15 +227,15 @@ def accelerations_and_mass_matrix(
 
 @ScalarFunction
 def _motion_rates(system, t, q, u, inputs):
-    now = KaneEquations(system, t, q, u, inputs)
-    return as_vector(now.q_dot, q), as_vector(now.accelerations(), q)
+    kane = KaneEquations(system, t, q, u, inputs)
+    return as_vector(kane.q_dot, q), as_vector(kane.accelerations(), q)
 
 
 @ScalarFunction
 def _equations_written_out(system, t, q, u, inputs):
-    now = KaneEquations(system, t, q, u, inputs)
-    M, f = now.equations()
-    return as_vector(now.q_dot, q), stack(M).astype(q.dtype), as_vector(f, q)
+    kane = KaneEquations(system, t, q, u, inputs)
+    M, f = kane.equations()
+    return as_vector(kane.q_dot, q), stack(M).astype(q.dtype), as_vector(f, q)
 
 
 @ScalarFunction
@@ -251,11 +246,11 @@ def _accelerations_and_mass_matrix(system, t, q, u, inputs):
 
 @ScalarFunction
 def _rates_and_forcing(system, t, q, u, inputs):
-    now = KaneEquations(system, t, q, u, inputs)
-    return as_vector(now.q_dot, q), as_vector(now.forcing(), q)
+    kane = KaneEquations(system, t, q, u, inputs)
+    return as_vector(kane.q_dot, q), as_vector(kane.forcing(), q)
 
 
 @ScalarFunction
 def _mass_times(system, t, q, u, inputs, direction):
-    now = KaneEquations(system, t, q, u, inputs)
-    return as_vector(now.mass_times(as_row(direction, system.speeds, "direction")), q)
+    kane = KaneEquations(system, t, q, u, inputs)
+    return as_vector(kane.mass_times(as_row(direction, system.speeds, "direction")), q)

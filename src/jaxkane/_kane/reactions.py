@@ -12,12 +12,12 @@ dependent speeds, and the residuals c = C_ind u + C_dep u_dep + C_aux u_aux + c0
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax.numpy as jnp
 
 from .._scalarjit.cache_key import jit
-from .._scalarjit.components import Component, Triple, add, dot, mul
+from .._scalarjit.components import Component, Triple, add, dot, mul, total
 from .._scalarjit.function import ScalarFunction
 from .._scalarjit.linear import as_vector, solve
 from .._system.kinematics import Frame, Point, auxiliary_speed
@@ -43,8 +43,7 @@ def forces_now(system, t, q, u, inputs):
 
 @ScalarFunction
 def _multipliers(system, t, q, u, inputs, u_dot):
-    multipliers = Reactions(system, t, q, u, inputs, u_dot).multipliers
-    return as_vector(multipliers, q)
+    return as_vector(Reactions(system, t, q, u, inputs, u_dot).multipliers, q)
 
 
 @ScalarFunction
@@ -54,17 +53,10 @@ def _forces(system, t, q, u, inputs, u_dot):
     return vectors | {name: jnp.asarray(x, dtype=q.dtype) for name, x in kane.forces_of_auxiliary_speeds()}
 
 
-class _Forces(NamedTuple):
-    """Along N.x, N.y, N.z."""
-
-    transmitted: Row  # on what is built from a point or a frame
-    of_residuals: Row  # of the constraint residuals that depend on its motion
-
-
 class Reactions(KaneEquations):
-    """An instant of the motion with its accelerations `u_dot` (n,), and the multipliers of its residuals.
+    """Kane's equations at a state and its accelerations `u_dot` (n,), with the multipliers of the residuals.
 
-    The accelerations are given: they are a program of their own, which for many speeds calls into libraries.
+    The accelerations are an argument: they are a program of their own, which for many speeds calls into libraries.
     """
 
     def __init__(self, system: System, t: Any, q: Any, u: Any, inputs: InputValues, u_dot: Any):
@@ -72,7 +64,7 @@ class Reactions(KaneEquations):
         self.description: Motion = self.motion(self.t, self.q, self.u_all)
         u_dot = as_row(u_dot, system.speeds, f"{self.name}: u_dot")
         u_dep_dot = self.dependent_accelerations(u_dot)
-        self.momentum = self.momentum_rates((*u_dot, *u_dep_dot))
+        self.momentum_derivatives = self.momentum_rates((*u_dot, *u_dep_dot))
         self.load_vectors = self.force_components()
         # R_dep + C_dep^T lambda = 0
         directions = [unit(self.n + self.k, self.n + r) for r in range(self.k)]
@@ -80,18 +72,18 @@ class Reactions(KaneEquations):
         self.multipliers: Row = solve(tuple(zip(*self.C_dep, strict=True)), R)[0] if self.k else ()
 
     def read(self, part: str, t: Component, q: Row, u: Row) -> Any:
-        # The description itself: a record knows neither auxiliary velocities nor auxiliary speeds.
+        # The description itself: its trace knows neither auxiliary velocities nor auxiliary speeds.
         return getattr(EvaluatedDescription(self, t, q, u), part)()
 
     def unbalanced(self, partial: Any) -> Component:
         """R = sum F . V + T . W - V . dp/dt - W . dH/dt along one direction."""
         bodies, columns = partial
-        total: Component = 0.0
-        for V, F in zip(columns, self.load_vectors, strict=True):
-            total = add(total, dot(V, F))
-        for (V, W), (p_dot, H_dot) in zip(bodies, self.momentum, strict=True):
-            total = add(total, mul(-1.0, add(dot(V, p_dot), dot(W, H_dot))))
-        return total
+        active = [dot(V, F) for V, F in zip(columns, self.load_vectors, strict=True)]
+        inertia = [
+            mul(-1.0, add(dot(V, p_dot), dot(W, H_dot)))
+            for (V, W), (p_dot, H_dot) in zip(bodies, self.momentum_derivatives, strict=True)
+        ]
+        return total([*active, *inertia])
 
     def power_of_prescribed_motions(self) -> Component:
         """Power [W] of what drives velocities that are left when all speeds are zero, and of moving constraints.
@@ -105,13 +97,12 @@ class Reactions(KaneEquations):
     def forces_of_parts(self) -> Iterator[tuple[str, Row]]:
         """Forces at the named points, moments at the named frames."""
         for name, point in self.description.points.items():
-            if self.is_cut(point):
-                yield name, self.along_axes(point).transmitted
-            elif self.k:
-                yield name, self.along_axes(point).of_residuals
+            is_cut = self._is_cut(point)
+            if is_cut or self.k:
+                yield name, self._force(point, transmitted=is_cut)
         for name, frame in self.description.frames.items():
             if frame.parent is not None:
-                yield name, self.along_axes(frame).transmitted
+                yield name, self._force(frame, transmitted=True)
 
     def forces_of_auxiliary_speeds(self) -> Iterator[tuple[str, Component]]:
         names = self.system.auxiliary_speeds
@@ -122,16 +113,15 @@ class Reactions(KaneEquations):
             R = self.unbalanced(self.along_speeds(self.velocities, direction))
             yield name, mul(-1.0, add(R, dot(C_aux, self.multipliers)))
 
-    def along_axes(self, part: Point | Frame) -> _Forces:
-        """Three auxiliary speeds of a point or a frame, along N.x, N.y and N.z."""
-        of_residuals, transmitted = [], []
+    def _force(self, part: Point | Frame, transmitted: bool) -> Row:
+        """By three auxiliary speeds of a point or a frame, along N.x, N.y and N.z: the force that is `transmitted` to
+        what is built from it, or that of the constraint residuals that depend on its motion."""
         still = (0.0,) * (self.n + self.k)
-        for axis in range(3):
-            Q = dot(self._auxiliary_residuals(part, axis), self.multipliers)
-            partial = self._along_auxiliary(part, axis, lambda: self.velocities(still))
-            of_residuals.append(Q)
-            transmitted.append(mul(-1.0, add(self.unbalanced(partial), Q)))
-        return _Forces(tuple(transmitted), tuple(of_residuals))
+        Q = [dot(self._auxiliary_residuals(part, axis), self.multipliers) for axis in range(3)]
+        if transmitted:
+            partials = [self._along_auxiliary(part, axis, lambda: self.velocities(still)) for axis in range(3)]
+            Q = [mul(-1.0, add(self.unbalanced(partial), x)) for partial, x in zip(partials, Q, strict=True)]
+        return tuple(Q)
 
     def _auxiliary_residuals(self, part: Point | Frame, axis: int) -> Row:
         """C_aux: how the residuals change with a auxiliary velocity; constraints of the configuration, with a
@@ -139,7 +129,7 @@ class Reactions(KaneEquations):
         if not self.k:
             return ()
         still = (0.0,) * (self.n + self.k)
-        rows = self._along_auxiliary(part, axis, lambda: self.read("rolling", self.t, self.q, still))
+        rows = self._along_auxiliary(part, axis, lambda: self.read("velocity_residuals", self.t, self.q, still))
         if len(rows) < self.k:
             configuration = lambda: self.configuration(self.t, self.q)  # noqa: E731
             rows = (*rows, *self._along_auxiliary(part, axis, configuration, displace=True))
@@ -148,14 +138,14 @@ class Reactions(KaneEquations):
     def _along_auxiliary(self, part: Point | Frame, axis: int, read: Callable[[], Any], displace: bool = False) -> Any:
         """The derivative of what `read` reads, along a auxiliary velocity (or displacement) of a point or a frame."""
 
-        def reading(row: Row) -> Any:
-            moving: Triple = tuple(row[0] if i == axis else 0.0 for i in range(3))  # type: ignore[assignment]
-            with auxiliary_speed(part, **{"displacement" if displace else "velocity": moving}):
+        def displaced(row: Row) -> Any:
+            along: Triple = tuple(row[0] if i == axis else 0.0 for i in range(3))  # type: ignore[assignment]
+            with auxiliary_speed(part, **{"displacement" if displace else "velocity": along}):
                 return read()
 
-        return self.along_speeds(reading, (1.0,))
+        return self.along_speeds(displaced, (1.0,))
 
-    def is_cut(self, point: Point) -> bool:
+    def _is_cut(self, point: Point) -> bool:
         """Whether bodies are built from a point, which is not itself held by a residual."""
         if any(point.velocity is residual for residual in self.description.residuals):
             return False

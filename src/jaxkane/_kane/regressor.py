@@ -1,7 +1,8 @@
-"""Bodies with parameters in a regressor, and what they add to Kane's equations, which are linear in them."""
+"""Kane's equations as a regressor: the columns of the bodies' parameters, in which the equations are linear."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -14,10 +15,10 @@ from jaxtyping import Array, Float
 from .._common.lookup import as_names, refuse_unknown
 from .._scalarjit.cache_key import Cache
 from .._scalarjit.compat import concretely, depends_on
-from .._scalarjit.components import ZERO3, Component, add, add3, dot, is_zero, mul, sub, total
+from .._scalarjit.components import ZERO3, Component, add, add3, is_zero, mul
 from .._scalarjit.function import ScalarFunction
 from .._scalarjit.linear import as_vector, stack
-from .._system.bodies import UNNAMED, Body, Force
+from .._system.bodies import UNNAMED, Body, Force, parallel_axis
 from .._system.kinematics import Point, Vector
 from .._system.motion import Motion
 from .._system.system import System
@@ -34,23 +35,22 @@ Bodies = str | Sequence[str] | Mapping[str, str | Sequence[str]] | None
 """Names of bodies, or with each the names of its parameters that are columns; None for all."""
 
 
-class Part(NamedTuple):
-    """A body with parameters of its own in a regressor: its place among the motion's bodies, and which parameters it
-    can have."""
+class BodyParameters(NamedTuple):
+    """A body with parameters of its own in a regressor: its place among the motion's bodies, and its parameters."""
 
     place: int
     name: str
     about: str  # name of the point that the first moment and the inertia are about
-    kind: tuple[int, ...] = tuple(range(10))  # of the ten
+    indices: tuple[int, ...] = tuple(range(10))  # of the ten
     axis: int | None = None  # about which it spins in its frame: both moments of inertia across are one
-    has_number: bool = False  # its mass is a number of the description, and no parameter
+    has_constant_mass: bool = False  # its mass is a number of the description, and no parameter
 
     @property
     def basis(self) -> np.ndarray:
-        """(10, k): what one of each parameter is of the ten."""
-        columns = np.eye(10)[:, list(self.kind)]
-        if self._across in self.kind:
-            columns[4:7, self.kind.index(self._across)] = [i != self.axis for i in range(3)]
+        """(10, k): each parameter as a combination of the ten."""
+        columns = np.eye(10)[:, list(self.indices)]
+        if self._across in self.indices:
+            columns[4:7, self.indices.index(self._across)] = [i != self.axis for i in range(3)]
         return columns
 
     @property
@@ -59,81 +59,78 @@ class Part(NamedTuple):
 
     @property
     def names(self) -> tuple[str, ...]:
-        return tuple(f"{self.name}.{'Iacross' if i == self._across else TEN[i]}" for i in self.kind)
+        return tuple(f"{self.name}.{'Iacross' if i == self._across else TEN[i]}" for i in self.indices)
+
+    def only(self, names: Sequence[str] | str) -> BodyParameters:
+        """With these of its parameters alone."""
+        names = as_names(names)
+        known = [name.rpartition(".")[2] for name in self.names]
+        refuse_unknown(names, known, f"`bodies`: {self.name} has no parameter", "it has")
+        chosen = [i for i, name in zip(self.indices, known, strict=True) if name in names]
+        return self._replace(indices=tuple(chosen))
 
 
-class Described(eqx.Module):
+class RegressorModel(eqx.Module):
     """A system, and its bodies that have parameters in a regressor. `leaves`: of those that the bodies' masses read."""
 
     system: System
-    parts: tuple[Part, ...] = eqx.field(static=True)
+    bodies: tuple[BodyParameters, ...] = eqx.field(static=True)
     leaves: tuple[int, ...] = eqx.field(static=True)
 
 
 def origin_of(body: Body) -> tuple[Point, list[Vector]]:
     """The farthest point from which the mass centre was built inside its body, as a joint, and the way from there."""
+    # Where a body spins in its frame, only points of the axis are fixed in both.
+    turns = not body.is_particle and body.angular_velocity is body.frame.angular_velocity
     point, way = body.center, []
-    while point._base is not None and _is_fixed_in(point, body):
+    for base in [*point.chain()][1:]:
+        relative = point._relative_motion
+        is_fixed = relative is not None and relative.frame is body.frame
+        if not (turns and is_fixed and all(map(is_zero, relative.velocity.components))):  # type: ignore[union-attr]
+            break
         way.append(point._offset)
-        point = point._base
+        point = base
     return point, way
 
 
-def _is_fixed_in(point: Point, body: Body) -> bool:
-    relative = point._relative_motion
-    still = relative is not None and relative.frame is body.frame and all(map(is_zero, relative.velocity.components))
-    turns = not body.is_particle and body.angular_velocity is body.frame.angular_velocity
-    return still and turns  # where a body spins in its frame, only points of the axis are fixed in both
+_BODIES = Cache()  # by structure
 
 
-_PARTS = Cache()  # by structure
-
-
-def described(system: System, bodies: Bodies) -> Described:
+def regressor_model(system: System, bodies: Bodies) -> RegressorModel:
     """A system and those of its bodies that are named, by default all that have a mass.
 
     **Raises:** `ValueError` for a name that is no body's, or no parameter's that it can have, and for a body that spins
     in its frame about no axis of it.
     """
-    parts, leaves = _PARTS.get(structure_of(system), lambda: _read_parts(system))
-    given = bodies
+    chosen, leaves = _BODIES.get(structure_of(system), lambda: _bodies_of(system))
     if bodies is not None:
-        bodies = as_names(bodies)
-        named = [part.name for part in parts]
-        refuse_unknown(bodies, named, f"{type(system).__name__} has no body with a mass named", "it has")
-        twice = sorted({name for name in bodies if bodies.count(name) > 1})
+        names, parameters = as_names(bodies), bodies if isinstance(bodies, Mapping) else {}
+        known = [body.name for body in chosen]
+        refuse_unknown(names, known, f"{type(system).__name__} has no body with a mass named", "it has")
+        twice = sorted({name for name in names if names.count(name) > 1})
         if twice:
             raise ValueError(f"`bodies` names {', '.join(twice)} twice.")
-        of_bodies = given if isinstance(given, Mapping) else {}
-        parts = tuple(_chosen_of(part, of_bodies.get(part.name)) for part in parts if part.name in bodies)
-    skew = [part.name for part in parts if part.axis == SKEW]
+        chosen = tuple(
+            body if parameters.get(body.name) is None else body.only(parameters[body.name])
+            for body in chosen
+            if body.name in names
+        )
+    skew = [body.name for body in chosen if body.axis == SKEW]
     if skew:
         raise ValueError(
             f"{type(system).__name__}: the body {skew[0]!r} turns in its frame, and not about one of the frame's axes "
             "alone: which moments of inertia it may have there cannot be said. Give it a frame that turns with it, or "
             "name the others in `bodies`."
         )
-    return Described(system, parts, leaves)
+    return RegressorModel(system, chosen, leaves)
 
 
-def _chosen_of(part: Part, names: Sequence[str] | None) -> Part:
-    """A part with only some of its parameters."""
-    if names is None:
-        return part
-    names = as_names(names)
-    known = [name.rpartition(".")[2] for name in part.names]
-    refuse_unknown(names, known, f"`bodies`: {part.name} has no parameter", "it has")
-    if part.axis is None:
-        return part._replace(kind=tuple(i for i in part.kind if TEN[i] in names))
-    return part._replace(kind=tuple(i for i, name in zip(part.kind, known, strict=True) if name in names))
-
-
-def _read_parts(system: System) -> tuple[tuple[Part, ...], tuple[int, ...]]:
-    """The parts, and the numbers of the leaves that the masses read."""
+def _bodies_of(system: System) -> tuple[tuple[BodyParameters, ...], tuple[int, ...]]:
+    """The bodies with a mass, and the numbers of the leaves that the masses read."""
     leaves, structure = jax.tree.flatten(system)
     motions: list[Motion] = []
 
-    def read(leaves: Any, t: Any, q: Any, u: Any) -> tuple[list[Any], list[Any]]:
+    def masses_and_spins(leaves: Any, t: Any, q: Any, u: Any) -> tuple[list[Any], list[Any]]:
         motion = DescriptionEvaluator(jax.tree.unflatten(structure, leaves)).motion(t, tuple(q), tuple(u))
         motions[:] = [motion]
         bodies = [body for body in motion.bodies if not is_zero(body.mass)]
@@ -144,21 +141,32 @@ def _read_parts(system: System) -> tuple[tuple[Part, ...], tuple[int, ...]]:
     number = jax.ShapeDtypeStruct((), dtype_of(system))
     n_u = len(system.speeds) + len(system.dependent_speeds)
     rows = [[number] * n for n in (len(system.coordinates), n_u)]
-    program = jax.make_jaxpr(lambda *args: read(*args)[0])(leaves, number, *rows)
+    program = jax.make_jaxpr(lambda *args: masses_and_spins(*args)[0])(leaves, number, *rows)
     (motion,) = motions
     bodies = [(i, body) for i, body in enumerate(motion.bodies) if not is_zero(body.mass)]
-    own = [body.angular_velocity is not body.frame.angular_velocity and not body.is_particle for _, body in bodies]
     axes: list[int | None] = [None] * len(bodies)
-    if any(own):
-        spins = _at_trial_numbers(lambda *args: read(*args)[1], system, n_u)
-        axes = [_axis(spin) if has else None for has, spin in zip(own, spins, strict=True)]
+    spinning = [b.angular_velocity is not b.frame.angular_velocity and not b.is_particle for _, b in bodies]
+    if any(spinning):
+        spins = _at_random_speeds(lambda *args: masses_and_spins(*args)[1], system, n_u)
+        axes = [_axis(spin) if spins_in_frame else None for spins_in_frame, spin in zip(spinning, spins, strict=True)]
     reads = np.array([depends_on(program, [i]) for i in range(len(leaves))], bool).reshape(len(leaves), -1)
-    numbered = [not any(column) for column in reads.T]
-    found = _parts(motion, list(zip([i for i, _ in bodies], axes, numbered, strict=True)))
-    return found, tuple(int(i) for i in np.flatnonzero(reads.any(axis=1)))
+    named = {point: name for name, point in motion.points.items()}
+    unnamed = sum(body.name == UNNAMED for body in motion.bodies) > 1
+    parameters = []
+    for (i, body), axis, depends_on_leaves in zip(bodies, axes, reads.any(axis=0), strict=True):
+        origin, _ = origin_of(body)
+        indices = tuple(range(10))
+        if body.is_particle:
+            indices = (0,)
+        elif axis is not None and axis != SKEW:
+            indices = (0, 1 + axis, 4 + axis, 4 + (axis + 1) % 3)
+        name = f"{body.name}[{i}]" if unnamed and body.name == UNNAMED else body.name
+        about = "its mass centre" if origin is body.center else named.get(origin, origin.name)
+        parameters.append(BodyParameters(i, name, about, indices, axis, not depends_on_leaves))
+    return tuple(parameters), tuple(int(i) for i in np.flatnonzero(reads.any(axis=1)))
 
 
-def _at_trial_numbers(f: Callable[..., Any], system: System, n_u: int) -> Any:
+def _at_random_speeds(f: Callable[..., Any], system: System, n_u: int) -> Any:
     rng = np.random.default_rng(0)
     system, t, q = at_random_point((system, 0.3, None), rng)
     u = rng.uniform(0.5, 1.5, n_u).astype(q.dtype)
@@ -175,26 +183,7 @@ def _axis(spin: np.ndarray) -> int | None:
     return None if not turning.size else int(turning[0]) if turning.size == 1 else SKEW
 
 
-def _parts(motion: Motion, bodies: Sequence[tuple[int, int | None, bool]]) -> tuple[Part, ...]:
-    """From the place of each body with a mass, the axis about which it spins, whether its mass is a number."""
-    named = {point: name for name, point in motion.points.items()}
-    unnamed = sum(body.name == UNNAMED for body in motion.bodies) > 1
-    found = []
-    for i, axis, has_number in bodies:
-        body = motion.bodies[i]
-        name = f"{body.name}[{i}]" if unnamed and body.name == UNNAMED else body.name
-        origin, _ = origin_of(body)
-        about = "its mass centre" if origin is body.center else named.get(origin, origin.name)
-        kind = tuple(range(10))
-        if body.is_particle:
-            kind = (0,)
-        elif axis is not None and axis != SKEW:
-            kind = (0, 1 + axis, 4 + axis, 4 + (axis + 1) % 3)
-        found.append(Part(i, name, about, kind, axis, has_number))
-    return tuple(found)
-
-
-class Carried(NamedTuple):
+class RegressorKinematics(NamedTuple):
     """Of the points of b bodies, each in its body's frame."""
 
     V: Float[Array, "b 3 n"]
@@ -205,42 +194,46 @@ class Carried(NamedTuple):
     g: Float[Array, "b 3"]  # weight by mass [m/s^2]
 
 
-class _SaidOfPoints(EvaluatedDescription):
-    """As `EvaluatedDescription`, with the velocities of the bodies' points in the place of momenta."""
+class _EvaluatedOrigins(EvaluatedDescription):
+    """As `EvaluatedDescription`, with the velocities of the bodies' origins in the place of momenta."""
 
-    def __init__(self, reading: DescriptionEvaluator, parts: tuple[Part, ...], *at: Any):
-        super().__init__(reading, *at)
-        self.parts = parts
+    parts = ("rates", "configuration", "velocity_residuals", "velocities", "momenta", "frame_velocities")
+
+    def __init__(self, evaluator: DescriptionEvaluator, bodies: tuple[BodyParameters, ...], *at: Any):
+        super().__init__(evaluator, *at)
+        self._parameters = bodies
+
+    @functools.cached_property
+    def _origins(self) -> list[tuple[Body, Point]]:
+        bodies = [self.motion.bodies[body.place] for body in self._parameters]
+        return [(body, origin_of(body)[0]) for body in bodies]
 
     def velocities(self) -> tuple[list, list]:
         return self.momenta(), []
 
     def momenta(self) -> list[tuple[Row, Row]]:
-        bodies = [self.motion.bodies[part.place] for part in self.parts]
-        return [(origin_of(b)[0].velocity.components, b.angular_velocity.components_in(b.frame)) for b in bodies]
+        return [(P.velocity.components, b.angular_velocity.components_in(b.frame)) for b, P in self._origins]
 
-    def turning(self) -> list[tuple[Row, Row]]:
-        bodies = [self.motion.bodies[part.place] for part in self.parts]
-        frames = [(origin_of(b)[0].velocity.frame, b.frame) for b in bodies]
+    def frame_velocities(self) -> list[tuple[Row, Row]]:
+        frames = [(origin.velocity.frame, body.frame) for body, origin in self._origins]
         return [(a.angular_velocity.components, b.angular_velocity.components) for a, b in frames]
 
 
 @ScalarFunction
-def _said(described: Described, components: Any) -> dict[str, Any]:
+def _parts_of_origins(model: RegressorModel, components: Any) -> dict[str, Any]:
     inputs, t, q, u = components
-    said = _SaidOfPoints(DescriptionEvaluator(described.system, inputs), described.parts, t, q, u)
-    return {part: getattr(said, part)() for part in "rates configuration rolling velocities momenta turning".split()}
+    return _EvaluatedOrigins(DescriptionEvaluator(model.system, inputs), model.bodies, t, q, u).all_parts()
 
 
-class _Points(KaneEquations):
-    """An instant whose velocities and momenta are those of the bodies' points."""
+class _OriginKinematics(KaneEquations):
+    """Kane's equations at a state, whose velocities and momenta are those of the bodies' origins."""
 
-    def __init__(self, described: Described, t: Any, q: Any, u: Any, inputs: Any):
-        self.described = described
-        super().__init__(described.system, t, q, u, inputs)
+    def __init__(self, model: RegressorModel, t: Any, q: Any, u: Any, inputs: Any):
+        self.model = model
+        super().__init__(model.system, t, q, u, inputs)
 
     def read(self, part: str, t: Component, q: Row, u: Row) -> Any:
-        return _said.replay(part, self.described, (dict(self.inputs), t, tuple(q), tuple(u)), self._memory)
+        return _parts_of_origins.replay(part, self.model, (dict(self.inputs), t, tuple(q), tuple(u)), self._memory)
 
     def weights(self) -> list[tuple[Component, Row]]:
         """How each body's mass changes with the parameters that it reads, and how the forces at its centre do.
@@ -248,108 +241,101 @@ class _Points(KaneEquations):
         A mass that is a number of the description is changed by itself: `weight` reads it off the body.
         """
         leaves, structure = jax.tree.flatten(self.system)
-        moved, parts = self.described.leaves, self.described.parts
+        places, parameters = self.model.leaves, self.model.bodies
         u = tuple(jnp.asarray(x, self._zero().dtype) for x in self.u_all)
 
-        def read(*moving: Any) -> list[tuple[Component, Row]]:
-            own, more = moving[: len(moved)], moving[len(moved)]
-            given = list(leaves)
-            for i, x in zip(moved, own, strict=True):
-                given[i] = x
-            reading = DescriptionEvaluator(jax.tree.unflatten(structure, given), self.inputs)
-            motion = reading.motion(self.t, self.q, u)
-            bodies = [motion.bodies[part.place] for part in parts]
-            for body, part in zip(bodies, parts, strict=True):
-                body.mass = add(body.mass, more) if part.has_number else body.mass
-            loads = reading.loads_at(self.t, self.q, u, motion)
+        def masses_and_weights(*values: Any) -> list[tuple[Component, Row]]:
+            *own, added_mass = values
+            changed = list(leaves)
+            for i, x in zip(places, own, strict=True):
+                changed[i] = x
+            evaluator = DescriptionEvaluator(jax.tree.unflatten(structure, changed), self.inputs)
+            motion = evaluator.motion(self.t, self.q, u)
+            bodies = [motion.bodies[each.place] for each in parameters]
+            for body, each in zip(bodies, parameters, strict=True):
+                body.mass = add(body.mass, added_mass) if each.has_constant_mass else body.mass
+            loads = evaluator.loads_at(self.t, self.q, u, motion)
             return [(body.mass, _at_center(body, loads)) for body in bodies]
 
-        primals = [*[leaves[i] for i in moved], self._zero()]
+        primals = [*[leaves[i] for i in places], self._zero()]
         # Each by another amount, so that no sum or difference of them stays as it is.
         tangents = [jnp.full_like(x, 1.0 + 0.1 * i) for i, x in enumerate(primals)]
-        return jvp(read, primals, tangents)[1]
-
-
-def _by_mass(change: tuple[Component, Row]) -> tuple[Component, Row]:
-    m, F = jnp.asarray(change[0]), change[1]
-    return jnp.where(m == 0.0, 0.0, 1.0 / jnp.where(m == 0.0, 1.0, m)), F
+        return jvp(masses_and_weights, primals, tangents)[1]
 
 
 def _at_center(body: Body, loads: Sequence[Any]) -> Row:
-    total: Row = ZERO3
+    force: Row = ZERO3
     for load in loads:
         if isinstance(load, Force) and load.point is body.center:
-            total = add3(total, load.vector.components_in(body.frame))
-    return total
+            force = add3(force, load.vector.components_in(body.frame))
+    return force
 
 
 @ScalarFunction
-def carried(described: Described, t, q, u, inputs, u_dot) -> Carried:
-    """`Carried` of the bodies of a system, at accelerations `u_dot` (n,) of the independent speeds."""
-    now = _Points(described, t, q, u, inputs)
-    row = tuple(u_dot[i] for i in range(now.n))
-    partials = now.partials()
-    rates = now.momentum_rates((*row, *now.dependent_accelerations(row)))
-    omegas = [omega for _, omega in now.momenta(now.u_all)]
-    motion = now.motion(now.t, now.q, now.u_all)
-    V, W, a, alpha = [], [], [], []
-    for i, part in enumerate(described.parts):
-        body = motion.bodies[part.place]
-        origin, _ = origin_of(body)
-        own = origin.velocity.frame
+def regressor_kinematics(model: RegressorModel, t, q, u, inputs, u_dot) -> RegressorKinematics:
+    """Of the bodies of a model, at accelerations `u_dot` (n,) of the independent speeds."""
+    kane = _OriginKinematics(model, t, q, u, inputs)
+    row = tuple(u_dot[i] for i in range(kane.n))
+    partials = kane.partials()
+    rates = kane.momentum_rates((*row, *kane.dependent_accelerations(row)))
+    omegas = [omega for _, omega in kane.momenta(kane.u_all)]
+    motion = kane.motion(kane.t, kane.q, kane.u_all)
+    V, W, a, alpha, g = [], [], [], [], []
+    for i, (each, (dm, dF)) in enumerate(zip(model.bodies, kane.weights(), strict=True)):
+        body = motion.bodies[each.place]
+        own = origin_of(body)[0].velocity.frame
         into = lambda x, frame=own, body=body: frame.vector(*x).components_in(body.frame)  # noqa: E731
         V.append([into(bodies[i][0]) for bodies, _ in partials])
         W.append([bodies[i][1] for bodies, _ in partials])
         a.append(into(rates[i][0]))
         alpha.append(rates[i][1])
-    g = [tuple(mul(x, reciprocal) for x in F) for reciprocal, F in map(_by_mass, now.weights())]
-    n, b = now.n, len(described.parts)
-    array = lambda rows: stack(rows).astype(q.dtype).reshape(b, -1) if b else jnp.zeros((0, 3), q.dtype)  # noqa: E731
-    columns = lambda rows: jnp.swapaxes(  # noqa: E731
-        stack([x for row in rows for x in row]).astype(q.dtype).reshape(b, n, 3)
-        if b
-        else jnp.zeros((0, n, 3), q.dtype),
-        1,
-        2,
-    )
-    return Carried(columns(V), columns(W), array(a), array(alpha), array(omegas), array(g))
+        dm = jnp.asarray(dm)
+        reciprocal = jnp.where(dm == 0.0, 0.0, 1.0 / jnp.where(dm == 0.0, 1.0, dm))
+        g.append(tuple(mul(x, reciprocal) for x in dF))
+    n, b = kane.n, len(model.bodies)
+
+    def array(rows: Any, *shape: int) -> Array:
+        return stack(rows).astype(q.dtype).reshape(b, *shape, 3) if b else jnp.zeros((0, *shape, 3), q.dtype)
+
+    V, W = (jnp.swapaxes(array([x for row in rows for x in row], n), 1, 2) for rows in (V, W))  # (b,3,n)
+    return RegressorKinematics(V, W, array(a), array(alpha), array(omegas), array(g))
 
 
-def _ten(body: Body) -> Row:
-    """The ten values of a body, about the point that it was built from."""
-    r: Row = ZERO3
-    for step in origin_of(body)[1]:
-        r = add3(r, step.components_in(body.frame))
-    square = dot(r, r)
-    I = [
-        [add(body.inertia[i][j], mul(body.mass, sub(square if i == j else 0.0, mul(r[i], r[j])))) for j in range(3)]
-        for i in range(3)
-    ]
-    pairs = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-    return (body.mass, *(mul(body.mass, x) for x in r), *(I[i][j] for i, j in pairs))
+def regressor_columns(kinematics: RegressorKinematics, bodies: Sequence[BodyParameters]) -> Float[Array, "n p"]:
+    """The columns of all bodies' parameters, side by side.
 
+    Of the ten parameters of a body (m, m r, I) about its origin, with a less the weight by mass:
 
-def columns_of(now: Carried, parts: Sequence[Part]) -> Float[Array, "n p"]:
-    """The columns of all bodies' parameters, side by side."""
-    a, alpha, omega = now.a - now.g, now.alpha, now.omega
+        F = m a + alpha x m r + omega x (omega x m r),   T = m r x a + I alpha + omega x I omega
+    """
+    V, W, a, alpha, omega, g = kinematics
+    a = a - g
     turn = _cross(omega)
     of_moment = _cross(alpha) + turn @ turn
     zero = jnp.zeros_like(of_moment)
     F = jnp.concatenate([a[:, :, None], of_moment, zero, zero], axis=2)  # (b,3,10)
     T = jnp.concatenate([jnp.zeros_like(a)[:, :, None], -_cross(a), _times(alpha) + turn @ _times(omega)], axis=2)
-    Y = jnp.swapaxes(now.V, 1, 2) @ F + jnp.swapaxes(now.W, 1, 2) @ T  # (b,n,10)
-    rows = [Y[i] @ jnp.asarray(part.basis, Y.dtype) for i, part in enumerate(parts)]
-    return jnp.concatenate([jnp.zeros((now.V.shape[2], 0), Y.dtype), *rows], axis=1)
+    Y = jnp.swapaxes(V, 1, 2) @ F + jnp.swapaxes(W, 1, 2) @ T  # (b,n,10)
+    columns = [Y[i] @ jnp.asarray(body.basis, Y.dtype) for i, body in enumerate(bodies)]
+    return jnp.concatenate([jnp.zeros((V.shape[2], 0), Y.dtype), *columns], axis=1)
 
 
 @ScalarFunction
-def values_of(described: Described, t, q, u) -> Float[Array, " p"]:
+def parameter_values(model: RegressorModel, t, q, u) -> Float[Array, " p"]:
     """The parameters of the bodies, in the order of the columns; they are the same at all times, `u` (n + k,)."""
     rows = [tuple(x[i] for i in range(x.shape[0])) for x in (q, u)]
-    motion = DescriptionEvaluator(described.system).motion(t, *rows)
-    ten = [_ten(motion.bodies[part.place]) for part in described.parts]
-    values = [ten[i][k] for i, part in enumerate(described.parts) for k in part.kind]
+    motion = DescriptionEvaluator(model.system).motion(t, *rows)
+    values = [_ten(motion.bodies[each.place])[i] for each in model.bodies for i in each.indices]
     return as_vector(values, q) if values else jnp.zeros(0, q.dtype)
+
+
+def _ten(body: Body) -> Row:
+    """The ten parameters of a body, about the point that it was built from."""
+    m, r = body.mass, ZERO3
+    for step in origin_of(body)[1]:
+        r = add3(r, step.components_in(body.frame))
+    I = parallel_axis(body.inertia, mul(-1.0, m), r)
+    return (m, *(mul(m, x) for x in r), I[0][0], I[1][1], I[2][2], I[0][1], I[0][2], I[1][2])
 
 
 def _cross(x: Float[Array, "b 3"]) -> Float[Array, "b 3 3"]:
@@ -370,11 +356,8 @@ def _times(x: Float[Array, "b 3"]) -> Float[Array, "b 3 6"]:
 @ScalarFunction
 def unbalanced(system: System, t, q, u, inputs, u_dot) -> Float[Array, " n"]:
     """-(F_r + F*_r) (n,) at accelerations `u_dot`: zero in the motion."""
-    now = KaneEquations(system, t, q, u, inputs)
-    row = tuple(u_dot[i] for i in range(now.n))
-    partials = now.partials()
-    rates = now.momentum_rates((*row, *now.dependent_accelerations(row)))
-    needed = [
-        total(add(dot(V, p), dot(W, H)) for (V, W), (p, H) in zip(bodies, rates, strict=True)) for bodies, _ in partials
-    ]
-    return as_vector([sub(x, F) for x, F in zip(needed, now.active_forces(partials), strict=True)], q)
+    kane = KaneEquations(system, t, q, u, inputs)
+    row = tuple(u_dot[i] for i in range(kane.n))
+    partials = kane.partials()
+    inertia = kane.inertia_forces(partials, (*row, *kane.dependent_accelerations(row)))
+    return as_vector([mul(-1.0, add(x, F)) for x, F in zip(inertia, kane.active_forces(partials), strict=True)], q)

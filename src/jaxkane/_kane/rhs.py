@@ -20,30 +20,30 @@ from .._scalarjit.function import ScalarFunction
 from .._scalarjit.linear import as_vector, is_written_out
 from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Motion
-from .._system.system import NamedVector, State, System, packed, unpacked
+from .._system.system import NamedVector, State, System, has_outputs, packed, unpacked
 from .arguments import Inputs, Row, as_row, inputs_of
 from .evaluate import jvp
 from .kane import KaneEquations, motion_rates
 from .reactions import Reactions
 
 
-class Now(Inputs):
-    """One instant, as `state_rates` and `outputs` receive it: `now["command"]` is an input or a state by name.
+class MeasurementContext(Inputs):
+    """What `state_rates` and `outputs` receive as `now`: `now["command"]` is an input or a state by name.
 
     Attributes: `u_dot`, the time derivatives of all speeds, dependent ones too, by place and by name.
     """
 
-    def __init__(self, instant: KaneEquations, N: Frame, u_dot: NamedVector, answers: Iterator[Row] | None):
-        super().__init__(instant.inputs, inputs_of(instant.system))
+    def __init__(self, kane: KaneEquations, N: Frame, u_dot: NamedVector, rates: Iterator[Row] | None):
+        super().__init__(kane.inputs, inputs_of(kane.system))
         self.u_dot = u_dot
-        self._instant, self._N, self._answers = instant, N, answers
-        self._asked: list[Vector] = []
+        self._kane, self._N, self._rates = kane, N, rates
+        self._vectors: list[Vector] = []  # whose rates are needed
 
     def with_values(self, values: Mapping[str, Component]) -> Self:
-        """The same instant, for a part of a system that receives other inputs than the system does."""
-        other = copy.copy(self)
-        other.update(values)
-        return other
+        """The same context, for a part of a system that receives other inputs than the system does."""
+        context = copy.copy(self)
+        context.update(values)
+        return context
 
     def acceleration(self, point: Point) -> Vector:
         """Of a Point in the inertial frame [m/s^2]."""
@@ -60,11 +60,10 @@ class Now(Inputs):
     def force(self, name: str) -> Any:
         """What constraints carry at a named point [N] or frame [N m], a Vector, or along an auxiliary speed, a number:
         as `jaxkane.constraint_forces` gives it by that name."""
-        forces = self._forces
-        if name not in forces:
-            raise not_there(name, forces, "the named points, frames and auxiliary speeds")
-        found = forces[name]
-        return self._N.vector(*found) if isinstance(found, tuple) else found
+        if name not in self._forces:
+            raise not_there(name, self._forces, "the named points, frames and auxiliary speeds")
+        force = self._forces[name]
+        return self._N.vector(*force) if isinstance(force, tuple) else force
 
     @property
     def multipliers(self) -> Row:
@@ -73,86 +72,88 @@ class Now(Inputs):
 
     @functools.cached_property
     def _reactions(self) -> Reactions:
-        now = self._instant
-        return Reactions(now.system, now.t, now.q, now.u, dict(now.inputs), self.u_dot[: now.n])
+        kane = self._kane
+        return Reactions(kane.system, kane.t, kane.q, kane.u, dict(kane.inputs), self.u_dot[: kane.n])
 
     @functools.cached_property
     def _forces(self) -> dict[str, Any]:
         return dict([*self._reactions.forces_of_parts(), *self._reactions.forces_of_auxiliary_speeds()])
 
     def _rate(self, vector: Vector) -> Vector:
-        self._asked.append(vector)
-        if self._answers is None:
-            one = jnp.ones((), self._instant.dtype)
+        self._vectors.append(vector)
+        if self._rates is None:
+            one = jnp.ones((), self._kane.dtype)
             return Vector(vector.frame, (one, one, one))
-        return Vector(vector.frame, next(self._answers))  # type: ignore[arg-type]
+        return Vector(vector.frame, next(self._rates))  # type: ignore[arg-type]
 
 
-Read = Callable[[System, Component, Row, Row, Motion, Now], Any]
+Method = Callable[[System, Component, Row, Row, Motion, MeasurementContext], Any]
 
 
-def read_at(now: KaneEquations, u_dot: Row, read: Read) -> Any:
-    """What `read` finds in the description at an instant, whose independent speeds change with `u_dot` (n,)."""
-    u_dot_all = (*u_dot, *now.dependent_accelerations(u_dot))
-    names = (*now.system.speeds, *now.system.dependent_speeds)
+def evaluate_with_accelerations(kane: KaneEquations, u_dot: Row, method: Method) -> Any:
+    """`method` of the description at a state whose independent speeds change with `u_dot` (n,).
 
-    def reading(t: Component, q: Row, u: Row, answers: Iterator[Row] | None = None) -> tuple[Any, Now]:
-        motion = now.motion(t, q, u)
-        given = Now(now, motion.N, NamedVector(u_dot_all, names), answers)
-        return read(now.system, t, q, u, motion, given), given
+    It is evaluated once to learn which vectors' rates it needs, and once more with these, where there are any.
+    """
+    u_dot_all = (*u_dot, *kane.dependent_accelerations(u_dot))
+    names = (*kane.system.speeds, *kane.system.dependent_speeds)
 
-    # Points that are made while it is read divide by speeds, perhaps: by no exact zero.
-    q, u = (tuple(jnp.asarray(x, now.dtype) if is_exact(x) else x for x in row) for row in (now.q, now.u_all))
-    found, given = reading(now.t, q, u)
-    if not given._asked:
-        return found
+    def evaluate(t: Component, q: Row, u: Row, rates: Iterator[Row] | None = None) -> tuple[Any, list[Vector]]:
+        motion = kane.motion(t, q, u)
+        context = MeasurementContext(kane, motion.N, NamedVector(u_dot_all, names), rates)
+        return method(kane.system, t, q, u, motion, context), context._vectors
+
+    # Points that the method makes divide by speeds, perhaps: by no exact zero.
+    q, u = (tuple(jnp.asarray(x, kane.dtype) if is_exact(x) else x for x in row) for row in (kane.q, kane.u_all))
+    result, vectors = evaluate(kane.t, q, u)
+    if not vectors:
+        return result
     n_q = len(q)
 
-    def asked(t: Component, *z: Component) -> list[Row]:
-        return [vector.components for vector in reading(t, z[:n_q], z[n_q:])[1]._asked]
+    def components_of_vectors(t: Component, *z: Component) -> list[Row]:
+        return [vector.components for vector in evaluate(t, z[:n_q], z[n_q:])[1]]
 
-    values, rates = jvp(asked, (now.t, *q, *u), (1.0, *now.q_dot, *u_dot_all))
-    turning = [vector.frame.angular_velocity.components for vector in given._asked]
+    values, rates = jvp(components_of_vectors, (kane.t, *q, *u), (1.0, *kane.q_dot, *u_dot_all))
+    omegas = [vector.frame.angular_velocity.components for vector in vectors]
     # dv/dt in N = derivative of the components + omega x v
-    answers = [add3(rate, cross(w, v)) for rate, w, v in zip(rates, turning, values, strict=True)]
-    return reading(now.t, q, u, iter(answers))[0]
+    rates_in_N = [add3(rate, cross(w, v)) for rate, w, v in zip(rates, omegas, values, strict=True)]
+    return evaluate(kane.t, q, u, iter(rates_in_N))[0]
 
 
-def _outputs(system: System, t: Component, q: Row, u: Row, motion: Motion, now: Now) -> dict[str, Component]:
-    return flatten_outputs(system, system.outputs(t, q, u, motion, now))
-
-
-def flatten_outputs(system: System, given: Any) -> dict[str, Component]:
+def _outputs(system: System, t: Component, q: Row, u: Row, motion: Motion, now: MeasurementContext) -> dict[str, Any]:
     """Outputs by name, those of nested dicts joined by dots.
 
     **Raises:** `TypeError` for what is no number; `ValueError` for a name that stands for something else already.
     """
     label = f"{type(system).__name__}.outputs"
-    found = _flat(label, given)
-    taken = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.inputs, *system.states)
-    twice = [name for name in found if name in taken]
+    outputs = _flat(label, system.outputs(t, q, u, motion, now))
+    others = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.inputs, *system.states)
+    twice = [name for name in outputs if name in others]
     if twice:
         raise ValueError(
             f"{label}: {', '.join(twice)} is the name of a coordinate, a speed, an input or a state already, and "
-            f"trajectories are read by name. Call what a sensor says of it otherwise: {'measured_' + twice[0]!r}."
+            f"trajectories are read by name. Call what a sensor measures of it otherwise: {'measured_' + twice[0]!r}."
         )
-    return found
+    return outputs
 
 
-def _flat(label: str, given: Any) -> dict[str, Component]:
-    if not isinstance(given, Mapping):
-        hint = " Does it end without a `return`?" if given is None else ""
-        raise TypeError(f"{label} returns numbers by name, in a dict; got {given!r}.{hint}")
-    found: dict[str, Component] = {}
-    for name, value in given.items():
+def _flat(label: str, outputs: Any) -> dict[str, Component]:
+    if not isinstance(outputs, Mapping):
+        hint = " Does it end without a `return`?" if outputs is None else ""
+        raise TypeError(f"{label} returns numbers by name, in a dict; got {outputs!r}.{hint}")
+    flat: dict[str, Component] = {}
+    for name, value in outputs.items():
         if not isinstance(name, str) or not name:
             raise TypeError(f"{label}: the name of an output is a string, got {name!r}.")
-        inner = {f"{name}.{k}": x for k, x in _flat(label, value).items()} if isinstance(value, Mapping) else None
-        for key, x in ({name: value} if inner is None else inner).items():
-            if key in found:
+        if isinstance(value, Mapping):
+            items = {f"{name}.{key}": x for key, x in _flat(label, value).items()}
+        else:
+            items = {name: _number(label, name, value)}
+        for key, x in items.items():
+            if key in flat:
                 raise ValueError(f"{label}: the name {key!r} stands for two outputs.")
-            found[key] = x if inner is not None else _number(label, key, x)
-    return found
+            flat[key] = x
+    return flat
 
 
 def _number(label: str, name: str, value: Any) -> Component:
@@ -164,24 +165,19 @@ def _number(label: str, name: str, value: Any) -> Component:
         raise TypeError(f"{label}: {name!r} is one number: {error}") from None
 
 
-def has_outputs(system: System) -> bool:
-    """Whether a system says anything beside its coordinates, speeds, inputs and states."""
-    return type(system).outputs is not System.outputs
-
-
 def outputs_at(system: System, t: Array, q: Array, u: Array, inputs: Mapping[str, Array]) -> dict[str, Array]:
-    """Outputs by name, from arrays that are known to fit; `inputs` holds the states too."""
+    """Outputs by name, from arrays that were checked; `inputs` holds the states too."""
     if not has_outputs(system):
         return {}
     inputs = dict(inputs)
-    return _outputs_now(system, t, q, u, inputs, motion_rates(system, t, q, u, inputs)[1])
+    return _outputs_at(system, t, q, u, inputs, motion_rates(system, t, q, u, inputs)[1])
 
 
 @ScalarFunction
-def _outputs_now(system, t, q, u, inputs, u_dot):
-    now = KaneEquations(system, t, q, u, inputs)
-    found = read_at(now, as_row(u_dot, system.speeds, "u_dot"), _outputs)
-    return {name: as_vector([x], q)[0] for name, x in found.items()}
+def _outputs_at(system, t, q, u, inputs, u_dot):
+    kane = KaneEquations(system, t, q, u, inputs)
+    outputs = evaluate_with_accelerations(kane, as_row(u_dot, system.speeds, "u_dot"), _outputs)
+    return {name: as_vector([x], q)[0] for name, x in outputs.items()}
 
 
 def output_names(system: System) -> tuple[str, ...]:
@@ -192,7 +188,7 @@ def output_names(system: System) -> tuple[str, ...]:
     return tuple(jax.eval_shape(lambda t, q, u: outputs_at(system, t, q, u, {}), jnp.zeros(()), q, u))
 
 
-def _state_rates(system: System, t: Component, q: Row, u: Row, motion: Motion, now: Now) -> Row:
+def _state_rates(system: System, t: Component, q: Row, u: Row, motion: Motion, now: MeasurementContext) -> Row:
     names, label = system.states, f"{type(system).__name__}.state_rates"
     return named_row(system.state_rates(t, q, u, [now[name] for name in names], motion, now), names, label)
 
@@ -215,7 +211,7 @@ def named_row(rates: Any, names: Sequence[str], label: str) -> Row:
 
 def rates(system: System, t: Array, q: Array, u: Array, values: dict[str, Array]) -> State:
     """The right-hand side: the time derivatives of coordinates, independent speeds and states of the first order, from
-    arrays that are known to fit; `values` of inputs and states by name."""
+    arrays that were checked; `values` of inputs and states by name."""
     if not system.states:
         return State(*motion_rates(system, t, q, u, values))
     x = as_vector([values[name] for name in system.states], q)
@@ -230,7 +226,7 @@ def vector_field(system: System, t: Array, y: Array, inputs: Mapping[str, Any]) 
     state = unpacked(system, y)
     values = values_of(system, state.x, inputs)
     q_dot, u_dot = motion_rates(system, t, state.q, state.u, values)
-    x_dot = first_order_rates(system, t, state.q, state.u, values, u_dot) if system.states else None
+    x_dot = _first_order_rates(system, t, state.q, state.u, values, u_dot) if system.states else None
     return packed(State(q_dot, u_dot, x_dot))
 
 
@@ -247,14 +243,14 @@ def values_of(system: System, x: Array | None, inputs: Mapping[str, Any]) -> dic
 @ScalarFunction
 def _vector_field(system, t, y, inputs):
     state = unpacked(system, y)
-    now = KaneEquations(system, t, state.q, state.u, values_of(system, state.x, inputs))
-    u_dot = now.accelerations()
-    x_dot = read_at(now, u_dot, _state_rates) if system.states else ()
-    return as_vector((*now.q_dot, *u_dot, *x_dot), y)
+    kane = KaneEquations(system, t, state.q, state.u, values_of(system, state.x, inputs))
+    u_dot = kane.accelerations()
+    x_dot = evaluate_with_accelerations(kane, u_dot, _state_rates) if system.states else ()
+    return as_vector((*kane.q_dot, *u_dot, *x_dot), y)
 
 
 @ScalarFunction
-def first_order_rates(system, t, q, u, inputs, u_dot):
+def _first_order_rates(system, t, q, u, inputs, u_dot):
     """x_dot (n_x,) at the accelerations u_dot (n,)."""
-    now = KaneEquations(system, t, q, u, inputs)
-    return as_vector(read_at(now, as_row(u_dot, system.speeds, "u_dot"), _state_rates), q)
+    kane = KaneEquations(system, t, q, u, inputs)
+    return as_vector(evaluate_with_accelerations(kane, as_row(u_dot, system.speeds, "u_dot"), _state_rates), q)

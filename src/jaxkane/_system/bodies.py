@@ -69,7 +69,7 @@ class Body:
         self.name = name
         self.about = about
         if about is not None:
-            self.inertia = _central(self.inertia, self.mass, center.position_from(about).components_in(self.frame))
+            self.inertia = parallel_axis(self.inertia, self.mass, center.position_from(about).components_in(self.frame))
 
     def __repr__(self) -> str:
         return f"Body({self.name})"
@@ -101,7 +101,7 @@ def _inertia(value: Any, name: str) -> tuple[Triple, Triple, Triple]:
     )
 
 
-def _central(I: tuple[Triple, Triple, Triple], m: Component, r: Triple) -> tuple[Triple, Triple, Triple]:
+def parallel_axis(I: tuple[Triple, Triple, Triple], m: Component, r: Triple) -> tuple[Triple, Triple, Triple]:
     """The inertia about the mass centre, which is at `r` from the point about which it is I: I - m (r.r 1 - r r)."""
     squares = [mul(x, x) for x in r]
     rows = []

@@ -364,6 +364,11 @@ class System(eqx.Module, metaclass=SystemMeta):
         return {}
 
 
+def has_outputs(system: System) -> bool:
+    """Whether sensors measure anything; the names of what they measure are known once `outputs` is evaluated."""
+    return type(system).outputs is not System.outputs
+
+
 def names_of(system: System) -> tuple[tuple[str, ...], ...]:
     """Of coordinates, independent and dependent speeds, and states of the first order: what a motion is read by."""
     return tuple(map(tuple, (system.coordinates, system.speeds, system.dependent_speeds, system.states)))
@@ -374,8 +379,7 @@ def _check_names(system: System) -> None:
     name = type(system).__name__
     names = {kind: _checked_names(name, kind, getattr(system, kind)) for kind in NAMES}
     units = _checked_units(name, system.units)
-    has_outputs = type(system).outputs is not System.outputs  # whose names are known when they are read
-    if "units" in vars(type(system)) and not has_outputs:  # inherited units may name what this class lacks
+    if "units" in vars(type(system)) and not has_outputs(system):  # inherited units may name what this class lacks
         refuse_unknown(
             units,
             [each for named in names.values() for each in named],
@@ -410,9 +414,8 @@ def unit_of(name: str, declared: Mapping[str, str]) -> str:
 def units_of(system: System) -> dict[str, str]:
     """Units by name that a system declares; and of speeds that are the rates of such coordinates."""
     speeds = (*system.speeds, *system.dependent_speeds)
-    has_outputs = type(system).outputs is not System.outputs  # whose names are known when they are read
     names = (*system.coordinates, *speeds, *system.auxiliary_speeds, *system.inputs, *system.states)
-    units = {name: unit for name, unit in system.units.items() if name in names or has_outputs}
+    units = {name: unit for name, unit in system.units.items() if name in names or has_outputs(system)}
     if type(system).q_dot is System.q_dot:
         for coordinate, speed in zip(system.coordinates, speeds, strict=False):
             if coordinate in units:
