@@ -12,7 +12,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from .._kane.checks import check_bodies
-from .._kane.regressor import described
+from .._kane.regressor import regressor_model
 from .._scalarjit.cache_key import jit
 from .._system.system import System
 from ._base_parameters import BaseParameters, base_structure, equations_at, estimated, states_for
@@ -136,7 +136,7 @@ def _regressor_spec(system: System, parameters: Parameters) -> RegressorSpec:
             f"first_estimate: {', '.join(roles)} is no parameter in which the equations of motion are linear: "
             "leave it to the fit."
         )
-    every = RegressorSpec(described(system, None), (), (), ())
+    every = RegressorSpec(regressor_model(system, None), (), (), ())
     # At the start and beside it: the moment of inertia about a joint does not change with a centre that is there.
     at = [jnp.full_like(parameters.start, x) for x in (0.0, 0.37)]
     slopes = np.max([np.abs(_values_with_slopes(every, parameters, x)[1][0]) for x in at], axis=0)  # (columns, p)
@@ -144,7 +144,7 @@ def _regressor_spec(system: System, parameters: Parameters) -> RegressorSpec:
     moved: np.ndarray = slopes > 1e-9 * np.where(size > 0, size, 1.0)
     bodies: dict[str, tuple[str, ...]] = {}
     rows = iter(np.any(moved, axis=1).tolist())
-    for part in every.described.parts:
+    for part in every.model.bodies:
         names = [name.rpartition(".")[2] for name, is_moved in zip(part.names, rows) if is_moved]
         if names:
             bodies[part.name] = tuple(names)
@@ -156,7 +156,7 @@ def _regressor_spec(system: System, parameters: Parameters) -> RegressorSpec:
             places.append((leaf, place))
             names.append(entry.name if i == 0 else f"{entry.name}, tied {i}")
             units.append(entry.unit)
-    return RegressorSpec(described(system, bodies), tuple(places), tuple(names), tuple(units))
+    return RegressorSpec(regressor_model(system, bodies), tuple(places), tuple(names), tuple(units))
 
 
 def _check_linear(spec: RegressorSpec, parameters: Parameters) -> None:

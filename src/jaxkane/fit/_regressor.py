@@ -15,7 +15,17 @@ from .._kane.arguments import as_array, check_is_system, check_time, checked_val
 from .._kane.checks import check_system
 from .._kane.equations import InputValues
 from .._kane.evaluate import at_random_point, structure_of
-from .._kane.regressor import UNITS, Bodies, Carried, Described, carried, columns_of, described, unbalanced, values_of
+from .._kane.regressor import (
+    UNITS,
+    Bodies,
+    RegressorKinematics,
+    RegressorModel,
+    parameter_values,
+    regressor_columns,
+    regressor_kinematics,
+    regressor_model,
+    unbalanced,
+)
 from .._scalarjit.cache_key import Cache, jit
 from .._scalarjit.compat import Tracer, concretely
 from .._system.parameters import declared, leaf_name
@@ -56,31 +66,31 @@ def input_names(system: System) -> tuple[str, ...]:
 class RegressorSpec(eqx.Module):
     """Which parameters have columns: those of bodies of a system, and entries (leaf, place) of other parameters."""
 
-    described: Described
+    model: RegressorModel
     places: tuple[tuple[int, int], ...] = eqx.field(static=True)
     own_names: tuple[str, ...] = eqx.field(static=True)
     own_units: tuple[str, ...] = eqx.field(static=True)
 
     @property
     def system(self) -> System:
-        return self.described.system
+        return self.model.system
 
     @property
     def names(self) -> tuple[str, ...]:
-        return (*(name for part in self.described.parts for name in part.names), *self.own_names)
+        return (*(name for part in self.model.bodies for name in part.names), *self.own_names)
 
     @property
     def units(self) -> tuple[str, ...]:
-        return (*(UNITS[i] for part in self.described.parts for i in part.kind), *self.own_units)
+        return (*(UNITS[i] for part in self.model.bodies for i in part.indices), *self.own_units)
 
     def of(self, system: System) -> RegressorSpec:
         """The same of a system with other values."""
-        return eqx.tree_at(lambda spec: spec.described.system, self, system)
+        return eqx.tree_at(lambda spec: spec.model.system, self, system)
 
     def values(self, t: Array, q: Array) -> Array:
         """The parameters themselves, which are the same at all times and coordinates."""
         n = len(self.system.speeds) + len(self.system.dependent_speeds)
-        of_bodies = values_of(self.described, t, q, jnp.zeros(n, q.dtype))
+        of_bodies = parameter_values(self.model, t, q, jnp.zeros(n, q.dtype))
         return jnp.concatenate([of_bodies, self.own().astype(q.dtype)])
 
     def own(self) -> Array:
@@ -102,10 +112,10 @@ class RegressorSpec(eqx.Module):
 
     def with_kinematics(
         self, t: Array, q: Array, u: Array, inputs: Mapping[str, Array], u_dot: Array
-    ) -> tuple[Regressor, Carried]:
-        parts = self.described.parts
-        kinematics, own = carried(self.described, t, q, u, inputs, u_dot), self.own().astype(q.dtype)
-        Y, values = columns_of(kinematics, parts), self.values(t, q)
+    ) -> tuple[Regressor, RegressorKinematics]:
+        parts = self.model.bodies
+        kinematics, own = regressor_kinematics(self.model, t, q, u, inputs, u_dot), self.own().astype(q.dtype)
+        Y, values = regressor_columns(kinematics, parts), self.values(t, q)
         along = lambda own: unbalanced(self.with_values(own), t, q, u, inputs, u_dot)  # noqa: E731
         if self.places:
             Y = jnp.concatenate([Y, jax.jacfwd(along)(own)], axis=1)
@@ -131,7 +141,7 @@ def regressor_spec(system: System, bodies: Bodies, parameters: Names) -> Regress
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise ValueError(f"`parameters` names {', '.join(twice)} twice.")
-    spec = RegressorSpec(described(system, bodies), tuple(places), tuple(names), tuple(units))
+    spec = RegressorSpec(regressor_model(system, bodies), tuple(places), tuple(names), tuple(units))
     if not spec.names:
         raise ValueError(f"{type(system).__name__}: no body with a mass is named in `bodies`, and no `parameters`.")
     return spec
@@ -150,7 +160,7 @@ _CHECKED = Cache()  # structures, with the parameters that have columns
 
 def check_linear(spec: RegressorSpec, t: Any, q: Any) -> None:
     """Refuse what would make tau or Y depend on the parameters themselves; once for each structure and choice."""
-    key = (structure_of(spec.system), spec.described.parts, spec.places)
+    key = (structure_of(spec.system), spec.model.bodies, spec.places)
     if _CHECKED.known(key, False):
         return
     # What is differentiated alone has a value; what is traced has none.
@@ -168,8 +178,8 @@ class _Linearity:
         self.system, t, q = at_random_point((system, t, q), rng)
         self.name = type(system).__name__
         # Of the bodies that are named every parameter: what is known of them moves with the others.
-        every = described(system, [part.name for part in spec.described.parts])
-        self.spec = eqx.tree_at(lambda s: s.described, spec, every)
+        every = regressor_model(system, [part.name for part in spec.model.bodies])
+        self.spec = eqx.tree_at(lambda s: s.model, spec, every)
         self.columns = np.array([name in spec.names for name in self.spec.names], bool)
         self.of_bodies = np.arange(len(self.columns)) < len(self.columns) - len(spec.places)
         dtype = q.dtype
@@ -221,7 +231,7 @@ class _Linearity:
             system = jax.tree.unflatten(structure, [*leaves[:i], jnp.asarray(changed), *leaves[i + 1 :]])
             after, _ = self.evaluate(system)
             changes = {k for k, x in pieces.items() if self._differs(after[k], x, size * (k in ("tau", "right")))}
-            yield path, (i, place) in own, changes | ({"mass"} if i in self.spec.described.leaves else set())
+            yield path, (i, place) in own, changes | ({"mass"} if i in self.spec.model.leaves else set())
 
     def _differs(self, x: np.ndarray, y: np.ndarray, size: float) -> bool:
         """Whether a number, or a column of a matrix, has changed by more than rounding."""
@@ -264,8 +274,8 @@ class _Linearity:
     def _check_weights(self, g: np.ndarray) -> None:
         """A weight that is written as a number, of a mass that is one too, cannot be distinguished from other loads."""
         weightless = ~np.any(g != 0, axis=1)
-        lone = [part.name for part, none in zip(self.spec.described.parts, weightless, strict=True)
-                if none and part.has_number]  # fmt: skip
+        lone = [part.name for part, none in zip(self.spec.model.bodies, weightless, strict=True)
+                if none and part.has_constant_mass]  # fmt: skip
         if lone and not weightless.all():
             raise ValueError(
                 f"{self.name}: other bodies have a weight, and for {', '.join(lone)}, whose mass is a number in the "
