@@ -7,7 +7,8 @@ import pytest
 
 import jaxkane as jk
 from jaxkane.catalog import RigidBody, WhippleBicycle
-from jaxkane.fit import Free, Inertia, LeastSquares, PossibleBody, Problem, Trial, frame_inertia, minimize
+from jaxkane.fit import Free, Inertia, LeastSquares, Problem, Trial, frame_inertia, minimize
+from jaxkane.fit._bijections import PossibleBody
 from jaxkane.fit._parameters import parameters_of
 
 BICYCLE = WhippleBicycle.benchmark()

@@ -17,13 +17,13 @@ from jaxkane.fit import (
     Simulation,
     SpectralDensity,
     Trial,
-    bicycle_priors,
     bicycle_problem,
     fit_bicycle,
     frame_inertia,
     minimize,
     multi_start,
 )
+from jaxkane.fit._bicycle import bicycle_priors
 
 SIGMA = {"roll": 0.005, "steer": 0.005, "roll_rate": 0.03, "steer_rate": 0.05}
 

@@ -14,9 +14,7 @@ import jaxkane as jk
 from jaxkane.fit import (
     BFGS,
     GradientDescent,
-    Iterate,
     LeastSquares,
-    Optimizer,
     Problem,
     Trial,
     fit,
@@ -27,6 +25,7 @@ from jaxkane.fit import (
 )
 from jaxkane.fit._block_lsq import eliminate
 from jaxkane.fit._nuisance import moved, refined
+from jaxkane.fit._optimizers import Iterate, Optimizer
 from jaxkane.fit._problem import ProblemSpec
 
 

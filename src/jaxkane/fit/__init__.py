@@ -1,9 +1,11 @@
-"""Parameters from measured motion: trials, exact derivatives, optimizers, and how far to trust what is found."""
+"""Parameters from measured motion: trials, exact derivatives, optimizers, and how well the data determine them."""
 
 from ._base_parameters import BaseParameters as BaseParameters
 from ._base_parameters import base_parameters as base_parameters
-from ._bijections import Interval as Interval
-from ._bijections import PossibleBody as PossibleBody
+from ._bicycle import bicycle_problem as bicycle_problem
+from ._bicycle import bicycle_rides as bicycle_rides
+from ._bicycle import fit_bicycle as fit_bicycle
+from ._bicycle import frame_inertia as frame_inertia
 from ._candidates import Candidate as Candidate
 from ._compare import Comparison as Comparison
 from ._compare import compare as compare
@@ -24,19 +26,15 @@ from ._first_estimate import FirstEstimate as FirstEstimate
 from ._first_estimate import first_estimate as first_estimate
 from ._fit import fit as fit
 from ._fit import minimize as minimize
-from ._identifiability import Direction as Direction
 from ._identifiability import Identifiability as Identifiability
 from ._identifiability import identifiability as identifiability
 from ._kinematics import KinematicSamples as KinematicSamples
 from ._kinematics import kinematic_samples as kinematic_samples
-from ._model import Model as Model
 from ._model import Simulation as Simulation
 from ._model import Unknowns as Unknowns
 from ._optimizers import BFGS as BFGS
 from ._optimizers import GradientDescent as GradientDescent
-from ._optimizers import Iterate as Iterate
 from ._optimizers import LeastSquares as LeastSquares
-from ._optimizers import Optimizer as Optimizer
 from ._posterior import Laplace as Laplace
 from ._posterior import laplace as laplace
 from ._posterior import log_density as log_density
@@ -62,8 +60,3 @@ from ._trial import read_trials as read_trials
 from ._validate import CrossValidation as CrossValidation
 from ._validate import cross_validate as cross_validate
 from ._validate import validate as validate
-from .bicycle import bicycle_priors as bicycle_priors
-from .bicycle import bicycle_problem as bicycle_problem
-from .bicycle import bicycle_rides as bicycle_rides
-from .bicycle import fit_bicycle as fit_bicycle
-from .bicycle import frame_inertia as frame_inertia

@@ -14,9 +14,9 @@ from .._common.lookup import refuse_unknown
 from .._system.system import System
 from ._bijections import Interval
 from ._covariance import parameter_values
-from ._declarations import Delay, Free, Shared
+from ._declarations import CalibrationTerm, Delay, Free
 from ._model import Simulation, Unknowns
-from ._parameters import Part, as_items, parameters_of
+from ._parameters import ParameterSubset, as_items, parameters_of
 from ._problem import Names, Problem, ProblemSpec, deviations_by_name
 from ._result import Fit
 
@@ -109,7 +109,7 @@ def _candidate(fit: Fit, each: Any) -> Candidate:
 def _without_bounds_at_start(system: System, item: Any) -> tuple[Any, dict[str, Bounds]]:
     """The same to be searched for on both sides, where it starts on a bound; and that bound."""
     named = Free(item) if isinstance(item, str) or callable(item) else item
-    if not isinstance(named, (Free, Shared)):
+    if not isinstance(named, (Free, CalibrationTerm)):
         return item, {}
     free = parameters_of(system, named)
     ends = [(float(one.lower), float(one.upper)) for one in free.bijections if isinstance(one, Interval)]
@@ -249,7 +249,7 @@ class Extended:
         many free ones run the same compiled program.
         """
         (free_x, free_b), model = self.owned(active), self.problem.model
-        part = Part(model.parameters, jnp.asarray(free_x, dtype=jnp.int32), self.point.x)
+        part = ParameterSubset(model.parameters, jnp.asarray(free_x, dtype=jnp.int32), self.point.x)
         of_trial = np.array(model.nuisance.trial_deviation)
         still = np.delete(np.arange(of_trial.size), free_b)
         of_trial[still] = held[still]

@@ -1,4 +1,4 @@
-"""What a fit may be asked to estimate: free parameters, gains, offsets, delays, noise, inertias, with their priors."""
+"""What a fit can estimate: parameters, gains, offsets, delays, noise, inertias; each with bounds and a prior."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Where = Literal["input", "sensor", "start"]
 
 @dataclasses.dataclass(frozen=True)
 class Free:
-    """A parameter to be found, with what is known about it.
+    """A parameter to estimate, with what is known about it.
 
         Free("IBxx", bounds=(0.5, 20.0)), Free(lambda system: system.body.mass, prior=(12.0, 0.5))
 
@@ -55,21 +55,28 @@ class Free:
 
 
 @dataclasses.dataclass(frozen=True)
-class Shared:
-    """What is the same in all trials, and no parameter of the system. See `Gain`."""
+class Named:
+    """A number that is no parameter of the system and the same in all trials. The options are as in `Free`."""
 
     what: str
-    start: float = 0.0
+    start: float | None = None
     bounds: tuple[float | None, float | None] | None = None
     scale: float | None = None
     prior: Prior | None = None
     name: str | None = None
     unit: str = ""
+
+
+@dataclasses.dataclass(frozen=True)
+class CalibrationTerm(Named):
+    """Of an input, a sensor or the starts. See `Gain`."""
+
+    start: float = 0.0
     of: Where | None = None
 
 
 @dataclasses.dataclass(frozen=True)
-class Gain(Shared):
+class Gain(CalibrationTerm):
     """A factor common to all trials: of an input, of a sensor, or of what is known of the starts.
 
         Gain("steer_torque"), Gain("roll_rate", prior=(1.0, 0.02)), Gain("rear_wheel_rate", of="start")
@@ -87,7 +94,7 @@ class Gain(Shared):
 
 
 @dataclasses.dataclass(frozen=True)
-class Offset(Shared):
+class Offset(CalibrationTerm):
     """A constant common to all trials, that is added to an input, to what a sensor says, or to what is known of starts.
 
         Offset("roll", prior=(0.0, 0.02))                  # the zero of a sensor, the same in all rides
@@ -98,7 +105,7 @@ class Offset(Shared):
 
 
 @dataclasses.dataclass(frozen=True)
-class Delay(Shared):
+class Delay(CalibrationTerm):
     """A delay [s] common to all trials, with which an input acts or a sensor reports.
 
     - Of an input: the system receives samples(t - delay); before a trial's first sample that one stands. Windows keep
@@ -115,37 +122,23 @@ class Delay(Shared):
 
 
 @dataclasses.dataclass(frozen=True)
-class SpectralDensity:
+class SpectralDensity(Named):
     """The spectral density of the process noise of a speed, a state or an input: see `noise` in `fit`.
 
-    `of`: the name of an independent speed or a state, [unit^2/s], or of an input, [unit^2 s], that stands in `noise`.
+    `what`: the name of an independent speed or a state, [unit^2/s], or of an input, [unit^2 s], that stands in `noise`.
     `start`: by default what stands there. It stays positive; the rest as in `Free`.
     """
 
-    of: str
-    start: float | None = None
-    bounds: tuple[float | None, float | None] | None = None
-    scale: float | None = None
-    prior: Prior | None = None
-    name: str | None = None
-    unit: str = ""
-
 
 @dataclasses.dataclass(frozen=True)
-class NoiseScale:
-    """The factor by which `Trial.sigma` of a channel is to be multiplied, common to all trials, in a fit with `noise`.
+class NoiseScale(Named):
+    """The factor of `Trial.sigma` of a channel, the same in all trials, in a fit with `noise`.
 
-    `channel`: its name. Where `sigma` was given as 1, the factor is the standard deviation in the channel's unit. It
+    `what`: the channel. Where `sigma` was given as 1, the factor is the standard deviation in the channel's unit. It
     stays positive; the rest as in `Free`.
     """
 
-    channel: str
     start: float = 1.0
-    bounds: tuple[float | None, float | None] | None = None
-    scale: float | None = None
-    prior: Prior | None = None
-    name: str | None = None
-    unit: str = ""
 
 
 @dataclasses.dataclass(frozen=True)

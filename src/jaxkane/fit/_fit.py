@@ -5,15 +5,13 @@ from __future__ import annotations
 import dataclasses
 import os
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from .._common.files import differences
 from .._system.system import System
-from ._io import described, read_state, tree_of, write_state
+from ._io import Checkpoint
 from ._model import Unknowns
 from ._nuisance import solve_nuisance, usable
 from ._optimizers import Iterate, LeastSquares, Optimizer
@@ -225,35 +223,3 @@ def uninterrupted(fit: Any) -> Any:
     if fit.status == "interrupted":
         raise KeyboardInterrupt
     return fit
-
-
-class Checkpoint:
-    """One file, `path`, for one problem and method; with `path` None nothing is kept.
-
-    `method`: its name, and whatever else of it the next step depends on, by name.
-    """
-
-    def __init__(self, path: str | os.PathLike[str] | None, problem: Problem, **method: Any):
-        self.path = None if path is None else Path(path).expanduser()
-        self.key = {} if path is None else {**method, **described(problem)}
-
-    def write(self, **state: Any) -> None:
-        """Keep the state, whole or not at all: a crash while writing leaves the one before."""
-        if self.path is not None:
-            write_state(self.path, self.key, state)
-
-    def read(self, **like: Any) -> dict[str, Any] | None:
-        """The state that was kept, or None; `like` has trees of the structure of what was written.
-
-        **Raises:** `ValueError` where the file belongs to another problem, data or method, or cannot be read.
-        """
-        if self.path is None or not self.path.exists():
-            return None
-        there, arrays = read_state(self.path)
-        wrong = differences(there, self.key)
-        if wrong:
-            raise ValueError(
-                f"{self.path} is the state of another fit. It differs in {wrong}. Name another file, or delete this "
-                "one."
-            )
-        return {name: tree_of(self.path, arrays, name, tree) for name, tree in like.items()}

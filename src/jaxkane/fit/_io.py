@@ -1,9 +1,10 @@
-"""Numbers of a fit in a file, with a description of the problem that they belong to. Knows files; knows no method."""
+"""Files of a fit: arrays with a description of the problem that they belong to, and checkpoints."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from .._common.files import atomic_write
+from .._common.files import atomic_write, differences
 from .._scalarjit.digest import digest
 from .._system.parameters import leaf_name
 from ._kalman import filtered
@@ -54,10 +55,41 @@ def tree_of(path: Path, arrays: Mapping[str, np.ndarray], name: str, like: Any) 
     """
     like, rest = eqx.partition(like, eqx.is_array_like)
     leaves, structure = jax.tree.flatten(like)
-    found = [arrays.get(f"{name}/{i}") for i in range(len(leaves))]
-    if any(x is None for x in found) or f"{name}/{len(leaves)}" in arrays:
+    new = [arrays.get(f"{name}/{i}") for i in range(len(leaves))]
+    if any(x is None for x in new) or f"{name}/{len(leaves)}" in arrays:
         raise ValueError(f"{path} lacks a part of the state of this fit ({name}): delete it.")
-    return eqx.combine(jax.tree.unflatten(structure, [jax.numpy.asarray(x) for x in found]), rest)
+    return eqx.combine(jax.tree.unflatten(structure, [jax.numpy.asarray(x) for x in new]), rest)
+
+
+class Checkpoint:
+    """A file with the state of a search, for one problem and method; with `path` None nothing is kept.
+
+    `method`: by name, what else the next step depends on.
+    """
+
+    def __init__(self, path: str | os.PathLike[str] | None, problem: Problem, **method: Any):
+        self.path = None if path is None else Path(path).expanduser()
+        self.key = {} if path is None else {**method, **described(problem)}
+
+    def write(self, **state: Any) -> None:
+        if self.path is not None:
+            write_state(self.path, self.key, state)
+
+    def read(self, **like: Any) -> dict[str, Any] | None:
+        """The state in the file, or None; `like` has trees of the same structure.
+
+        **Raises:** `ValueError` where the file belongs to another problem, data or method, or cannot be read.
+        """
+        if self.path is None or not self.path.exists():
+            return None
+        there, arrays = read_state(self.path)
+        wrong = differences(there, self.key)
+        if wrong:
+            raise ValueError(
+                f"{self.path} is the state of another fit. It differs in {wrong}. Name another file, or delete this "
+                "one."
+            )
+        return {name: tree_of(self.path, arrays, name, tree) for name, tree in like.items()}
 
 
 def described(problem: Problem) -> dict[str, Any]:
@@ -87,7 +119,7 @@ def described(problem: Problem) -> dict[str, Any]:
         "atol": settings.atol,
         "max_steps": settings.max_steps,
         "solver": type(settings.solver).__name__,
-        "fixed parameter": {name: _described_value(x) for name, x in fixed.items()},
+        "fixed parameter": {name: digest(x) if np.ndim(x) else float(x) for name, x in fixed.items()},
         "initial guesses, priors": digest(jax.tree.leaves(dataclasses.replace(numbers, system=guessed))),
         "data": digest(jax.tree.leaves(problem.windows)),
         "program": digest(jax.make_jaxpr(residuals)(numbers, window, point.z[0], point.b[0], point.x)),
@@ -100,8 +132,3 @@ def _fixed_and_guessed(problem: Problem) -> tuple[dict[str, Any], list[Any]]:
     leaves = jax.tree_util.tree_leaves_with_path(problem.system)
     arrays = [(i, leaf_name(path), x) for i, (path, x) in enumerate(leaves) if eqx.is_array(x)]
     return {name: x for i, name, x in arrays if i not in moved}, [x for i, _, x in arrays if i in moved]
-
-
-def _described_value(x: Any) -> Any:
-    """A number as it is, an array by its digest."""
-    return digest(x) if np.ndim(x) else float(x)

@@ -235,22 +235,16 @@ class Model(eqx.Module):
 
     def signals(self, window: Windows, b: Array, calibration: Calibration) -> dict[str, Any]:
         """The inputs of one window by name."""
-        system, signals = self.system, {}
+        signals: dict[str, Any] = {}
         # One array of times for all that have no delay: kinks that are known to be at the same times cost no more than
         # those of one input.
         prompt = window.acting(0.0)
-        for i, name in enumerate(system.inputs):
-            bias = self.nuisance.of_trial(b, "bias of input", name, 0.0) + calibration.get(
-                ("offset of input", name), 0.0
-            )
+        for i, name in enumerate(self.system.inputs):
+            gain, bias = self._gain_and_bias("input", name, b, calibration)
             if name in self.sampled_inputs:
-                gain = calibration.get(("gain of input", name), 1.0) * self.nuisance.of_trial(
-                    b, "gain of input", name, 1.0
-                )
-                delayed = ("delay of input", name) in calibration or ("delay of input", name) in self.nuisance.trial
-                delay = calibration.get(("delay of input", name), 0.0) + self.nuisance.of_trial(
-                    b, "delay of input", name, 0.0
-                )
+                kind = ("delay of input", name)
+                delayed = kind in calibration or kind in self.nuisance.trial
+                delay = self.nuisance.of_trial(b, *kind, 0.0) + calibration.get(kind, 0.0)
                 times, samples = window.acting(delay) if delayed else prompt
                 values = gain * samples[i] + bias
                 if name in self.zero_order_hold and delayed and self.settings.step is not None:
@@ -268,14 +262,19 @@ class Model(eqx.Module):
             y = ride[c]
             if ("delay of sensor", c) in calibration:
                 y = delayed_signal(ride.t, y, calibration["delay of sensor", c])
-            gain = self.nuisance.of_trial(b, "gain of sensor", c, 1.0) * calibration.get(("gain of sensor", c), 1.0)
-            bias = self.nuisance.of_trial(b, "bias of sensor", c, 0.0) + calibration.get(("offset of sensor", c), 0.0)
+            gain, bias = self._gain_and_bias("sensor", c, b, calibration)
             rows.append(gain * y + bias)
         return jnp.stack(rows)
 
-    def residuals(self, window: Windows, start: Array, z: Array, b: Array, x: Array) -> tuple[Array, Any]:
-        """Residuals of one window, priors included (m,), in which the next window starts where it is first thought to;
-        and what was seen."""
+    def _gain_and_bias(self, of: str, name: str, b: Array, calibration: Calibration) -> tuple[Array, Array]:
+        """Of an input or a sensor: the trial's own and that of all trials together."""
+        gain = self.nuisance.of_trial(b, f"gain of {of}", name, 1.0) * calibration.get((f"gain of {of}", name), 1.0)
+        bias = self.nuisance.of_trial(b, f"bias of {of}", name, 0.0) + calibration.get((f"offset of {of}", name), 0.0)
+        return gain, bias
+
+    def residuals(self, window: Windows, start: Array, z: Array, b: Array, x: Array) -> tuple[Array, Prediction]:
+        """Residuals of one window, priors included (m,), in which the next window starts at its initial guess; and the
+        prediction."""
         ride = self.simulate(window, start, b, x)
         calibration = self.parameters.apply(self.system, x)[1]
         simulated, n = self.simulated(ride, b, calibration), self.nuisance

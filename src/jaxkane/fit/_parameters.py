@@ -18,7 +18,7 @@ from .._kane.rhs import output_names
 from .._system.parameters import ANY, ParameterInfo, declared, leaf_name, learned_part, names_of_leaf
 from .._system.system import System, unit_of, units_of
 from ._bijections import Interval, PossibleBody
-from ._declarations import Delay, Free, Gain, Inertia, NoiseScale, Offset, Prior, Shared, SpectralDensity, Where
+from ._declarations import CalibrationTerm, Free, Inertia, Named, NoiseScale, Offset, Prior, SpectralDensity, Where
 
 
 def one_leaf(system: System, name: str, shape: tuple[int, ...] = ()) -> int:
@@ -134,17 +134,17 @@ class Parameters(eqx.Module):
     def apply(self, system: System, x: Float[Array, " p"]) -> tuple[System, dict[tuple[str, str], Array]]:
         """The system with these parameters; gains, offsets, delays and the noise's by ("gain of input", name)."""
         leaves, structure = jax.tree.flatten(system)
-        roles = {}
+        calibration = {}
         values = self.values(x)
         for i, entry in enumerate(self.entries):
             value = values[i]
             if entry.role is not None:
-                roles[entry.role] = value
+                calibration[entry.role] = value
             for number, place, factor in entry.targets:
                 leaf = leaves[number]
                 flat = jnp.ravel(leaf).at[place].set((factor * value).astype(leaf.dtype))
                 leaves[number] = flat.reshape(leaf.shape)
-        return jax.tree.unflatten(structure, leaves), roles
+        return jax.tree.unflatten(structure, leaves), calibration
 
     def prior_residuals(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
         """(value - mean) / deviation; zero without a prior."""
@@ -178,10 +178,10 @@ def checked_prior(name: str, prior: Any) -> Prior:
     return mean, deviation
 
 
-class Part(eqx.Module):
-    """In the place of `Parameters` in a `Model`: those at `places` (k,) of the `whole`; the others stay at `rest` (p,).
+class ParameterSubset(eqx.Module):
+    """The `Parameters` at `places` (k,) of the `whole`, for a `Model`; all others keep the values of `rest` (p,).
 
-    Which they are is a number and no part of a compiled program: all choices of as many run the same one.
+    The places are data: every choice of k parameters runs the same compiled program.
     """
 
     whole: Parameters
@@ -228,7 +228,7 @@ class Part(eqx.Module):
     def prior_residuals(self, x: Float[Array, " k"]) -> Float[Array, " k"]:
         return self.whole.prior_residuals(self._all(x))[self.places]
 
-    def with_priors(self, priors: Mapping[str, Prior]) -> Part:
+    def with_priors(self, priors: Mapping[str, Prior]) -> ParameterSubset:
         return dataclasses.replace(self, whole=self.whole.with_priors(priors))
 
     def _all(self, x: Array) -> Array:
@@ -245,7 +245,7 @@ POSITIVE = ParameterInfo(True, ())
 
 def as_items(free: Any) -> list[Any]:
     """What a fit takes as `free`, one by one."""
-    if isinstance(free, (str, Free, Inertia, SpectralDensity, NoiseScale, Gain, Offset, Delay)) or callable(free):
+    if isinstance(free, (str, Free, Inertia, Named)) or callable(free):
         return [free]
     if not isinstance(free, Iterable):
         raise TypeError(
@@ -273,7 +273,7 @@ def parameters_of(
             raise TypeError(f"`name` of what is free is text, got {item.name!r}.")
     parts: list[tuple[list[Entry], Any, list[float], list[float], list[Prior | None]]] = []
     for item in free:
-        if isinstance(item, Shared):
+        if isinstance(item, CalibrationTerm):
             parts.append(_of_all_trials(system, item, noise))
         elif isinstance(item, (SpectralDensity, NoiseScale)):
             parts.append(_of_noise(system, item, noise, channels))
@@ -303,7 +303,7 @@ def parameters_of(
     )
 
 
-def _of_all_trials(system: System, item: Shared, noise: Mapping[str, float] | None):
+def _of_all_trials(system: System, item: CalibrationTerm, noise: Mapping[str, float] | None):
     kind, where = type(item).__name__.lower(), where_of(system, item)
     if noise is not None and (kind, where) == ("delay", "sensor"):
         raise ValueError(
@@ -320,7 +320,7 @@ def _of_noise(
     system: System, item: SpectralDensity | NoiseScale, noise: Mapping[str, float] | None, channels: Sequence[str]
 ):
     kind = "spectral density" if isinstance(item, SpectralDensity) else "noise scale"
-    what, of = (item.of, noise or {}) if isinstance(item, SpectralDensity) else (item.channel, channels)
+    what, of = item.what, (noise or {}) if isinstance(item, SpectralDensity) else channels
     if noise is None:
         raise ValueError(
             f"{type(item).__name__}({what!r}) is estimated by its likelihood, and this is a fit of least squares: give "
@@ -345,7 +345,7 @@ def _of_noise(
     return _scalar(entry, item, start, POSITIVE)
 
 
-def where_of(system: System, item: Shared) -> Where:
+def where_of(system: System, item: CalibrationTerm) -> Where:
     """Whether it is of an input, of a sensor or of the starts.
 
     **Raises:** `ValueError` where there is nothing of that name.
@@ -403,7 +403,7 @@ def _followers(system: System, name: str, factor: float) -> list[tuple[int, int,
 
 def _scalar(
     entry: Entry,
-    item: Free | Shared | SpectralDensity | NoiseScale,
+    item: Free | Named,
     start: Any,
     info: ParameterInfo,
     tied: Sequence[tuple[ParameterInfo, float]] = (),
