@@ -227,7 +227,7 @@ def test_what_data_cannot_tell_is_said(rubbing):
 def test_one_trial_alone(rubbing):
     alone = fitted(rubbing.problem.trials[:1])
     found = forward_selection(alone, ["dry", "spring"])
-    assert "nothing is left out" in found.headings[0]
+    assert "nothing is left out" in found.tables[0][0]
     assert np.isnan(found.rounds[0][0].held_out_cost)
     assert found.selected == ("dry",)
     with pytest.raises(ValueError, match="one trial alone cannot be left out"):
@@ -276,7 +276,7 @@ def test_fits_beside_each_other(rubbing, found):
     text = str(table)
     # Where a search starts says nothing: of what nothing is said, anything is believed.
     assert compare({"viscous": rubbing}).bound_violations["viscous"] == ()
-    for words in ("with friction", "dry", f"{found.fit.cost:.6g}", "swing 5", "neighbours' correlation", "Held back"):
+    for words in ("with friction", "dry", f"{found.fit.cost:.6g}", "swing 5", "neighbours' correlation", "Held out"):
         assert words in text
     assert f"{found.fit.cost:.6g}" in table._repr_html_()
     assert "status" in text
@@ -301,7 +301,7 @@ def test_fits_beside_each_other(rubbing, found):
 
 def test_a_page_of_the_report(found, tmp_path):
     page = save_report(found.fit, tmp_path / "fit.html", forward_selection=found).read_text(encoding="utf-8")
-    assert "What may be missing" in page
+    assert "Model extensions" in page
     assert "no more than chance" in page
     assert "Selected: dry" in found._repr_html_()
 

@@ -73,7 +73,7 @@ def test_a_trial_that_the_others_cannot_simulate_costs_infinity(falling):
     np.testing.assert_allclose(costs[:3], costs_by_trial(falling.problem, falling.point), rtol=1e-6)
     left_out = CrossValidation(("a", "b"), *(np.array([1.0, 1.0]) for _ in range(3)), np.array([1.0, np.inf]),
                                np.array([2.0, 2.0]), {})  # fmt: skip
-    assert left_out.verdict == "b cannot be simulated with the parameters of the others."
+    assert left_out.conclusion == "b cannot be simulated with the parameters of the others."
 
 
 def test_the_score_is_relative_to_the_data_and_not_to_the_first_guess():

@@ -213,7 +213,7 @@ def conditioned(y, q=Q, deviation=DEVIATION, **values):
 
 
 def applied(problem, point):
-    return Fit(problem, point, problem.linearize(point), np.zeros(1), (0.0,), "applied", "none")
+    return Fit(problem, point, problem.linearize(point), np.zeros(1), (0.0,), "validated", "none")
 
 
 def test_the_smoother_knows_all_measurements(case):

@@ -17,9 +17,8 @@ noise = np.random.default_rng(0).normal(0.0, 1e-4, t.size)
 
 
 def told(*trials, coordinates=("x",)):
-    return suspicious_records(
-        types.SimpleNamespace(trials=trials, system=types.SimpleNamespace(coordinates=coordinates))
-    )
+    system = types.SimpleNamespace(coordinates=coordinates)
+    return list(suspicious_records(types.SimpleNamespace(trials=trials, system=system)))
 
 
 def trial(measured, inputs=None, t=t, name="run"):

@@ -22,9 +22,9 @@ from jaxkane.fit import (
     regressor,
 )
 from jaxkane.fit._base_parameters import random_states
+from jaxkane.fit._diagnostics import describe_bodies
 from jaxkane.fit._kinematics import max_spacing
 from jaxkane.fit._parameters import parameters_of
-from jaxkane.fit._tables import bodies_in_words
 from jaxkane.joints import Actuator, Link, Loop, Site, hinge, mechanism
 
 FRICTION = ("k1", "k2")
@@ -611,7 +611,7 @@ def test_a_simulated_motion_tells_of_the_system_that_made_it():
 def test_what_was_freed_as_an_inertia_is_told_as_a_whole():
     bicycle = jk.catalog.WhippleBicycle.benchmark()
     parameters = parameters_of(bicycle, (jk.fit.frame_inertia("H"), "mB", jk.fit.frame_inertia("F", fixed=())))
-    fork, wheel = bodies_in_words(parameters, parameters.start * 0.0)
+    fork, wheel = describe_bodies(parameters, parameters.start * 0.0)
     xx, zz, xz = (float(getattr(bicycle, name)) for name in ("IHxx", "IHzz", "IHxz"))
     small, large = np.linalg.eigvalsh([[xx, xz], [xz, zz]])
     assert f"principal moments {small:.5g}, 0.06, {large:.5g} kg m^2, along (" in fork

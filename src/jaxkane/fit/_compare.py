@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import html
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -15,7 +14,7 @@ from ._bijections import Interval
 from ._parameters import Parameters
 from ._problem import refuse_other
 from ._result import Fit
-from ._tables import html_table, plain
+from ._tables import Rows, html_tables, text_tables
 from ._trial import Trial
 from ._validate import validate
 
@@ -27,31 +26,31 @@ DEVIATIONS = 3.0
 
 @dataclasses.dataclass(frozen=True)
 class Plausible:
-    """By name of a parameter, between what it is believed."""
+    """By name of a parameter, the range in which it is believed."""
 
     ranges: Mapping[str, Range]
 
     def bound_violations(self, values: Mapping[str, float]) -> list[str]:
-        """What is not believed of these values, in words."""
-        found = []
+        """Which of these values lie outside, in words."""
+        violations = []
         for name, value in values.items():
             low, high = self.ranges.get(name, (-math.inf, math.inf))
             if not low <= value <= high:
                 side = f"below {low:.4g}" if value < low else f"above {high:.4g}"
-                found.append(f"{name} = {value:.4g} is {side}" if math.isfinite(value) else f"{name} is {value}")
-        return found
+                violations.append(f"{name} = {value:.4g} is {side}" if math.isfinite(value) else f"{name} is {value}")
+        return violations
 
 
-def plausible_of(parameters: Parameters, said: Mapping[str, Any]) -> Plausible:
-    """For every parameter what was said of it, (lower, upper) or a share of its start; else three deviations of its
-    prior; else its bounds, of which it must stay away. Where a search starts says nothing."""
+def plausible_of(parameters: Parameters, given: Mapping[str, Any]) -> Plausible:
+    """For every parameter the given range, (lower, upper) or a share of its start; else three deviations of its prior;
+    else its bounds, of which it must stay away. Where a search starts says nothing."""
     ranges, first = {}, 0
     for bijection, size in zip(parameters.bijections, parameters.sizes, strict=True):
         for i in range(first, first + size):
             name, start = parameters.names[i], float(parameters.start[i])
             mean, deviation = float(parameters.prior_mean[i]), float(parameters.prior_deviation[i])
-            if name in said:
-                ranges[name] = checked_range(name, said[name], start)
+            if name in given:
+                ranges[name] = checked_range(name, given[name], start)
             elif math.isfinite(deviation):
                 ranges[name] = mean - DEVIATIONS * deviation, mean + DEVIATIONS * deviation
             elif isinstance(bijection, Interval) and all(bijection.bounded) and bijection.uniform:
@@ -82,14 +81,11 @@ def checked_range(name: str, given: Any, start: float) -> Range:
     return low, high
 
 
-Table = tuple[str, list[list[str]]]
-
-
 @dataclasses.dataclass(frozen=True, repr=False)
 class Comparison:
     """What `compare` gives; print it for the tables.
 
-    - `fits`: by name. `held_out`: by name, the parameters of each on trials that were held back; empty without any.
+    - `fits`: by name. `held_out`: by name, the parameters of each on held-out trials; empty without any.
     - `bound_violations`: by name, what is not plausible of each fit's parameters, in words.
     """
 
@@ -98,22 +94,17 @@ class Comparison:
     bound_violations: Mapping[str, tuple[str, ...]]
 
     @property
-    def tables(self) -> list[Table]:
+    def tables(self) -> list[tuple[str, Rows]]:
         """A heading and rows, of which the first is the head, for each."""
-        found = [("Parameters, with the errors of their intervals", self._parameters()), ("All", self._sums())]
-        if any(self.bound_violations.values()):
-            rows = [
-                [name, violation]
-                for name, bound_violations in self.bound_violations.items()
-                for violation in bound_violations
-            ]
-            found.append(("Bound violations", [["fit", "violation"], *rows]))
-        found.append(("Sum of squares and variance accounted for, by channel", self._channels(self.fits)))
-        found.append(("Sum of squares, by trial", self._trials(self.fits)))
-        if self.held_out:
-            found.append(("Held back: by channel", self._channels(self.held_out)))
-            found.append(("Held back: by trial", self._trials(self.held_out)))
-        return found
+        tables = [("Parameters, with the errors of their intervals", self._parameters()), ("All", self._sums())]
+        violations = [[name, violation] for name, of_fit in self.bound_violations.items() for violation in of_fit]
+        if violations:
+            tables.append(("Bound violations", [["fit", "violation"], *violations]))
+        for where, fits in (("", self.fits), ("Held out: ", self.held_out)):
+            if fits:
+                tables.append((f"{where}Sum of squares and variance accounted for, by channel", self._channels(fits)))
+                tables.append((f"{where}Sum of squares, by trial", self._trials(fits)))
+        return tables
 
     def _parameters(self) -> list[list[str]]:
         names = list(dict.fromkeys(name for fit in self.fits.values() for name in fit.names))
@@ -132,7 +123,7 @@ class Comparison:
         for cost in dict.fromkeys(fit.problem.cost_name for fit in fits):
             rows.append([cost, *(f"{fit.cost:.6g}" if fit.problem.cost_name == cost else "" for fit in fits)])
         if self.held_out:
-            rows.append(["held back", *(_held_cost(self.held_out[name]) for name in columns)])
+            rows.append(["held out", *(_held_out_cost(self.held_out[name]) for name in columns)])
         rows.append(["residuals", *(str(fit.problem.size[0]) for fit in fits)])
         rows.append(["unknowns", *(str(fit.problem.size[1]) for fit in fits)])
         rows.append(["variance of a residual", *(f"{fit.variance:.3g}" for fit in fits)])
@@ -160,15 +151,15 @@ class Comparison:
         return [["trial", *fits], *([trial, *(of[name].get(trial, "") for name in fits)] for trial in trials)]
 
     def __str__(self) -> str:
-        return "\n\n".join(f"{heading}\n{plain(rows)}" for heading, rows in self.tables)
+        return text_tables(self.tables)
 
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        return "".join(f"<p>{html.escape(heading)}</p>{html_table(rows)}" for heading, rows in self.tables)
+        return html_tables(self.tables)
 
 
-def _held_cost(fit: Fit) -> str:
+def _held_out_cost(fit: Fit) -> str:
     n = len(fit.trial_names)
     return f"{fit.cost:.6g}" + (f" ({n} of {n + len(fit.failed)} trials)" if fit.failed else "")
 

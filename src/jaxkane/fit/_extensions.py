@@ -35,7 +35,7 @@ from ._statistics import (
     use_clusters,
     wald_test,
 )
-from ._tables import html_table, plain
+from ._tables import Rows, html_tables, text_tables
 from ._validate import folds_of
 
 Folds = Sequence[Sequence[int]] | None
@@ -180,14 +180,15 @@ class ForwardSelection:
         return self.rounds[0][0] if self.selected else None
 
     @property
-    def headings(self) -> tuple[str, ...]:
-        """Of every round, in words."""
-        found = []
-        for i, (cost, out) in enumerate(zip(self.costs, self.held_out_costs, strict=True)):
+    def tables(self) -> list[tuple[str, Rows]]:
+        """A heading and rows, of which the first is the head, of every round."""
+        tables: list[tuple[str, Rows]] = []
+        for i, (cost, out, rows) in enumerate(zip(self.costs, self.held_out_costs, self.rounds, strict=True)):
             beside = f" with {', '.join(self.selected[:i])}" if i else ""
             left = "one trial, nothing is left out" if math.isnan(out) else f"{out:.5g} of trials left out in turn"
-            found.append(f"Sum of squares{beside} {cost:.6g}; {left}.")
-        return tuple(found)
+            heading = f"Sum of squares{beside} {cost:.6g}; {left}."
+            tables.append((heading, [HEAD, *(row.cells for row in rows)]))
+        return tables
 
     @property
     def conclusion(self) -> str:
@@ -201,24 +202,12 @@ class ForwardSelection:
         return f"Selected: {', '.join(taken)}. Sum of squares {self.before.cost:.6g} -> {self.fit.cost:.6g}{left}."
 
     def __str__(self) -> str:
-        parts = [
-            f"{heading}\n{plain(_lines(rows), (0, len(HEAD) - 1))}"
-            for heading, rows in zip(self.headings, self.rounds, strict=True)
-        ]
-        return "\n\n".join([*parts, self.conclusion])
+        return f"{text_tables(self.tables, (0, len(HEAD) - 1))}\n\n{self.conclusion}"
 
     __repr__ = __str__
 
     def _repr_html_(self) -> str:
-        parts = [
-            f"<p>{html.escape(heading)}</p>{html_table(_lines(rows))}"
-            for heading, rows in zip(self.headings, self.rounds, strict=True)
-        ]
-        return "".join([*parts, f"<p>{html.escape(self.conclusion)}</p>"])
-
-
-def _lines(rows: Sequence[Extension]) -> list[tuple[str, ...]]:
-    return [HEAD, *(row.cells for row in rows)]
+        return f"{html_tables(self.tables)}<p>{html.escape(self.conclusion)}</p>"
 
 
 NEUTRAL = 1e-6

@@ -16,10 +16,10 @@ from .._kane.regressor import regressor_model
 from .._scalarjit.cache_key import jit
 from .._system.system import System
 from ._base_parameters import BaseParameters, base_structure, equations_at, estimated, states_for
+from ._diagnostics import describe_bodies
 from ._kinematics import Motions, kinematic_samples, max_spacing
 from ._parameters import Parameters, parameters_of
 from ._regressor import RegressorSpec, check_linear
-from ._tables import bodies_in_words
 from ._trial import Trial
 
 _PULL = 1e-2  # of a free number towards its start, in standard deviations: decides what the data do not determine
@@ -124,7 +124,7 @@ def first_estimate(
         distance,
         spacing,
         infeasibility,
-        tuple(bodies_in_words(parameters, x)),
+        tuple(describe_bodies(parameters, x)),
     )
 
 

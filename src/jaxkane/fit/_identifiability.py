@@ -16,6 +16,7 @@ from ._linearize import Linearization
 from ._model import Unknowns
 from ._nuisance import solve_nuisance
 from ._problem import Problem, refuse_other
+from ._tables import Rows, text_table
 
 
 @dataclasses.dataclass(frozen=True)
@@ -108,15 +109,14 @@ class Identifiability:
         return infinite_along(to_units @ covariance @ to_units.T, self.vectors[~known])
 
     @property
-    def table(self) -> str:
-        """Singular values, deviations and directions."""
-        lines = ["singular value   deviation   direction (scaled parameters)"]
-        for s, deviation, row in zip(self.singular_values, self.deviations, self.vectors, strict=True):
-            lines.append(f"{s:14.4g}   {deviation:9.2g}   {combination(self.names, row)}")
-        return "\n".join(lines)
+    def rows(self) -> Rows:
+        """Singular values, deviations and directions; the first row is the head."""
+        values = zip(self.vectors, self.singular_values, self.deviations, strict=True)
+        rows = [[combination(self.names, row), f"{s:.4g}", f"{deviation:.2g}"] for row, s, deviation in values]
+        return [("direction (scaled parameters)", "singular value", "deviation"), *rows]
 
     def __str__(self) -> str:
-        return "\n".join([self.table, *filter(None, [self.rank_message]), *self.messages])
+        return "\n".join([text_table(self.rows), *filter(None, [self.rank_message]), *self.messages])
 
 
 def identifiability(problem: Problem, *, flat: float = 0.5, at: Unknowns | None = None) -> Identifiability:

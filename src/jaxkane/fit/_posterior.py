@@ -105,7 +105,7 @@ def laplace(fit: Fit) -> Laplace:
         )
     eliminated = eliminate(fit.linearization.blocks, 0.0)
     to_gain = fit.linearization.squares - float(eliminated.step(1e-9)[1])
-    if fit.status == "applied" or not to_gain < 0.1:
+    if fit.status == "validated" or not to_gain < 0.1:
         raise ValueError(
             f"This is no minimum ({fit.status}): a step would lower the sum of squares by {to_gain:.3g}. Go on with "
             "`minimize(fit.problem, LeastSquares(), start=fit.point)`."

@@ -1,4 +1,4 @@
-"""What a fit gives: estimates, how sure they are, and what the data do not determine; saved and loaded."""
+"""The result of a fit: estimates, their errors, residuals, and what the data do not determine; saved and loaded."""
 
 from __future__ import annotations
 
@@ -10,24 +10,26 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 from .._common.files import differences
+from .._common.lookup import refuse_unknown
 from .._integrate.trajectory import Trajectory
 from .._system.system import System
-from . import _covariance as covariance
-from . import _diagnostics as notes
-from . import _statistics as residuals
+from . import _diagnostics as diagnostics
+from . import _statistics as statistics
 from ._block_lsq import Blocks
+from ._covariance import cluster_robust_covariance, clusters_of, intervals
 from ._identifiability import Identifiability, identifiability_at
 from ._io import described, read_state, tree_of, write_state
-from ._linearize import Linearization
+from ._linearize import Linearization, starts_of
 from ._model import Prediction, Unknowns
-from ._parameters import Parameters
+from ._parameters import Parameters, leaf_names
 from ._problem import STEP_TOLERANCE, Problem, refuse_other
-from ._statistics import ByTrial, ResidualTest, residual_test
-from ._tables import STATUS, nuisance_by_trial, summary, table, title
+from ._statistics import ByTrial, ResidualTest
+from ._tables import Rows, text_table
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -114,11 +116,14 @@ class Fit:
 
     @property
     def start(self) -> dict[str, float]:
-        return dict(zip(self.names, np.asarray(self.parameters.start).tolist(), strict=True))
+        return self._by_name(self.parameters.start)
 
     @property
     def estimates(self) -> dict[str, float]:
-        return dict(zip(self.names, np.asarray(self.parameters.values(self.point.x)).tolist(), strict=True))
+        return self._by_name(self.parameters.values(self.point.x))
+
+    def _by_name(self, values: Any) -> dict[str, float]:
+        return dict(zip(self.names, np.asarray(values).tolist(), strict=True))
 
     @functools.cached_property
     def identifiability(self) -> Identifiability:
@@ -126,11 +131,16 @@ class Fit:
 
     @property
     def message(self) -> str:
-        words = STATUS[self.status]
+        ending = diagnostics.STATUS[self.status]
         if self.status == "converged" and not self.identifiability.ok:
-            words = "the cost has converged, but not every parameter is determined"
-        more = (*self.identifiability.messages, *notes.no_freedom(self), *notes.coarse_steps(self))
-        return "; ".join([words, *(note.rstrip(".") for note in more)])
+            ending = "the cost has converged, but not every parameter is determined"
+        no_freedom = diagnostics.no_degrees_of_freedom(self.problem, self.variance)
+        notes = (*self.identifiability.messages, *no_freedom, *self._coarse_steps)
+        return "; ".join([ending, *(note.rstrip(".") for note in notes)])
+
+    @property
+    def _coarse_steps(self) -> tuple[str, ...]:
+        return (diagnostics.coarse_steps(self.problem, self.step_error),) if self.too_coarse else ()
 
     @property
     def ok(self) -> bool:
@@ -161,28 +171,28 @@ class Fit:
         return self._of_estimates(self.identifiability.covariance)
 
     def _of_estimates(self, covariance: np.ndarray) -> np.ndarray:
-        return np.full_like(covariance, np.nan) if self.status == "applied" else covariance
+        return np.full_like(covariance, np.nan) if self.status == "validated" else covariance
 
     @property
     def standard_errors(self) -> dict[str, float]:
-        return dict(zip(self.names, np.sqrt(self.covariance.diagonal()).tolist(), strict=True))
+        return self._by_name(np.sqrt(self.covariance.diagonal()))
 
     @functools.cached_property
     def clustered_covariance(self) -> np.ndarray:
         """(p, p), in the parameters' units, robust to residuals that are correlated within a trial, or a window: see
         `clusters`."""
-        seen = self.identifiability
-        along = covariance.cluster_robust_covariance(self.problem, self.point, self.linearization, seen.directions)
-        return self._of_estimates(seen.in_units(along))
+        directions = self.identifiability.directions
+        along = cluster_robust_covariance(self.problem, self.point, self.linearization, directions)
+        return self._of_estimates(self.identifiability.in_units(along))
 
     @property
     def clustered_errors(self) -> dict[str, float]:
-        return dict(zip(self.names, np.sqrt(self.clustered_covariance.diagonal()).tolist(), strict=True))
+        return self._by_name(np.sqrt(self.clustered_covariance.diagonal()))
 
     @property
     def uses_clustered_errors(self) -> bool:
         """Whether `errors` are the cluster-robust ones: residuals are no noise, and trials or windows are enough."""
-        return bool(self.clusters[1] and abs(self.autocorrelation) > residuals.CORRELATED)
+        return bool(self.clusters[1] and abs(self.autocorrelation) > statistics.CORRELATED)
 
     @property
     def errors(self) -> dict[str, float]:
@@ -193,7 +203,7 @@ class Fit:
     def clusters(self) -> tuple[str, int]:
         """Within what the cluster-robust errors take residuals to be correlated, "trial" or "window", and how many
         there are; ("", 0) where there are too few."""
-        return covariance.clusters_of(self.problem)
+        return clusters_of(self.problem)
 
     @property
     def degrees_of_freedom(self) -> float:
@@ -203,7 +213,7 @@ class Fit:
 
     def quantile(self, level: float = 0.95) -> float:
         """Of Student's distribution, two-sided, with as many degrees of freedom as `degrees_of_freedom`."""
-        return residuals.t_quantile(level, self.degrees_of_freedom)
+        return statistics.t_quantile(level, self.degrees_of_freedom)
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Confidence intervals by name, inside a parameter's bounds: symmetric in the free numbers.
@@ -213,7 +223,7 @@ class Fit:
         **Raises:** `ValueError` for a level that is not between 0 and 1.
         """
         half = self.quantile(level) * np.array(list(self.errors.values()))
-        return dict(zip(self.names, covariance.intervals(self.parameters, self.point.x, half), strict=True))
+        return dict(zip(self.names, intervals(self.parameters, self.point.x, half), strict=True))
 
     @property
     def correlation(self) -> np.ndarray:
@@ -223,12 +233,12 @@ class Fit:
 
     @functools.cached_property
     def fitted(self) -> ByTrial:
-        return residuals.by_trial(self.problem, np.asarray(self.linearization.simulated))
+        return statistics.by_trial(self.problem, np.asarray(self.linearization.simulated))
 
     @functools.cached_property
     def residuals(self) -> ByTrial:
         deviation = self.linearization.prediction.deviation
-        known = None if deviation is None else residuals.by_trial(self.problem, np.asarray(deviation))
+        known = None if deviation is None else statistics.by_trial(self.problem, np.asarray(deviation))
         scaled = {}
         for (name, channels), trial in zip(self.fitted.items(), self.problem.trials, strict=True):
             sigma = trial.sigma if known is None else known[name]
@@ -239,7 +249,7 @@ class Fit:
     def tests(self) -> dict[str, dict[str, ResidualTest]]:
         return {
             name: {
-                channel: residual_test(trial.measured[channel], self.fitted[name][channel], r)
+                channel: statistics.residual_test(trial.measured[channel], self.fitted[name][channel], r)
                 for channel, r in self.residuals[name].items()
             }
             for name, trial in zip(self.trial_names, self.problem.trials, strict=True)
@@ -247,33 +257,70 @@ class Fit:
 
     @property
     def variance_accounted_for(self) -> dict[str, float]:
-        trials = list(zip(self.fitted.values(), self.problem.trials, strict=True))
-        return {
-            channel: residuals.variance_accounted_for(
-                *zip(*((t.measured[channel], y[channel]) for y, t in trials if channel in y), strict=True)
-            )
-            for channel in self.problem.channels
-        }
+        """By channel, over all trials; below zero is worse than a constant."""
+        shares, trials = {}, list(zip(self.fitted.values(), self.problem.trials, strict=True))
+        for channel in self.problem.channels:
+            measured = [trial.measured[channel] for _, trial in trials if channel in trial.measured]
+            fitted = [channels[channel] for channels, _ in trials if channel in channels]
+            shares[channel] = statistics.variance_accounted_for(measured, fitted)
+        return shares
 
     @functools.cached_property
     def autocorrelation(self) -> float:
         """Of neighbouring residuals, over all channels, each weighted by its size."""
         every = (r for channels in self.residuals.values() for r in channels.values())
-        return float(residuals.autocorrelations(every, 1)[0])
+        return float(statistics.autocorrelations(every, 1)[0])
 
     @property
     def trial_names(self) -> tuple[str, ...]:
         """Names of the trials, numbered where they repeat."""
-        return residuals.trial_names(self.problem)
+        return statistics.trial_names(self.problem)
 
     @property
     def nuisance(self) -> dict[str, dict[str, Any]]:
-        return nuisance_by_trial(self.problem, self.point, self.linearization.prediction)
+        """By trial, values of the biases and gains, and of the starts of its windows (W,), by name."""
+        problem, n = self.problem, self.problem.model.nuisance
+        starts = np.asarray(starts_of(problem.model, problem.windows, self.point)[0])[:, problem.model.unknown_places]
+        owner = np.array([k for k, _, _ in problem.slices])
+        filtered = self.linearization.prediction.unknowns  # with process noise a window is a trial
+        b = self.point.b if filtered is None else filtered
+        in_filter = np.isfinite(np.asarray(n.start_deviation)) & (problem.model.noise is not None)
+        values = {}
+        for k, name in enumerate(self.trial_names):
+            values[name] = {
+                f"{kind.split()[0]} of {what}": float(b[k, j]) + (1.0 if kind.startswith("gain") else 0.0)
+                for j, (kind, what) in enumerate(n.trial)
+            }
+            values[name] |= {f"start of {s}": starts[owner == k, j] for j, s in enumerate(n.start) if not in_filter[j]}
+        return values
 
     @functools.cached_property
     def notes(self) -> tuple[str, ...]:
         """What a reader should know, in words."""
-        return notes.notes_of(self)
+        problem, parameters, seen = self.problem, self.parameters, self.identifiability
+        innovation = self.mean_normalized_innovation_squared
+        return (
+            *diagnostics.not_converged(self.status),
+            *(f"{name} is left out: {why}." for name, why in self.failed.items()),
+            *filter(None, [seen.rank_message]),
+            *seen.messages,
+            *diagnostics.correlated_parameters(parameters, self.correlation),
+            *diagnostics.outlier_trials(self.residuals),
+            *diagnostics.autocorrelated_residuals(self.autocorrelation),
+            *(diagnostics.wrong_noise(self.residuals, innovation) if problem.model.noise is not None else ()),
+            *diagnostics.wrong_sigma(problem, self.variance, seen.degrees_of_freedom),
+            *diagnostics.no_degrees_of_freedom(problem, self.variance),
+            *self._coarse_steps,
+            *diagnostics.infeasible_bodies(problem, self.point),
+            *diagnostics.bodies_at_the_boundary(parameters, self.point.x),
+            *diagnostics.far_from_start(parameters, self.start, self.estimates, self.standard_errors),
+            *diagnostics.known_by_prior(parameters, seen.given_sigma_errors),
+            *diagnostics.constant_records(problem),
+            *diagnostics.suspicious_records(problem),
+            *diagnostics.duplicate_trials(problem),
+            *diagnostics.wrong_units(problem, self.fitted),
+            *diagnostics.poorly_fitted_channels(self.tests, self.variance),
+        )
 
     def save(self, path: str | os.PathLike[str]) -> Path:
         """Write the numbers of this fit to one file, whole or not at all; `jaxkane.fit.load(path, problem)` reads it.
@@ -291,19 +338,68 @@ class Fit:
         write_state(path, key, {"point": self.point, "step": step, "history": np.array(self.history), **numbers})
         return path
 
-    def table(self, truth: Mapping[str, float] | System | None = None) -> str:
-        """Name, start, estimate and standard error of every parameter; and the truth, where it is known."""
-        return table(self, truth)
-
-    def __str__(self) -> str:
-        return summary(self)
-
     @property
     def title(self) -> str:
         """How much was fitted, in a line."""
-        return title(self)
+        problem, (n_r, n_unknown) = self.problem, self.problem.size
+        return (
+            f"{type(problem.system).__name__}: {len(problem.trials)} trials, {len(problem.slices)} windows, {n_r} "
+            f"residuals, {len(self.names)} parameters, {n_unknown - len(self.names)} nuisance values"
+        )
+
+    def table(self, truth: Mapping[str, float] | System | None = None) -> str:
+        """Name, start, estimate and standard error of every parameter; and the truth, where it is known."""
+        return text_table(parameter_rows(self, truth))
+
+    def __str__(self) -> str:
+        end = f"{self.problem.cost_name} {self.history[0]:.6g} -> {self.cost:.6g} by {self.method}"
+        bodies = diagnostics.describe_bodies(self.parameters, self.point.x)
+        return "\n".join([self.title, self.table(), *bodies, f"{end}: {diagnostics.STATUS[self.status]}", *self.notes])
 
     __repr__ = __str__
+
+
+def parameter_rows(fit: Fit, truth: Mapping[str, float] | System | None = None, detailed: bool = False) -> Rows:
+    """Of every parameter name, unit, start, estimate and standard error; the cluster-robust error and the interval;
+    the truth, where it is known, and how far the estimate is from it. Of a learned function one row for all numbers."""
+    known, learned, errors = _true_values(fit, truth), fit.parameters.learned, fit.standard_errors
+    clustered, ends = (fit.clustered_errors, fit.intervals()) if detailed else ({}, {})
+    head = ["parameter", "unit", "start", "estimate", "std. error"]
+    head += [f"by {fit.clusters[0] or 'trial'}", "95 % interval"] * detailed + ["truth", "error"] * bool(known)
+    rows: list[list[str]] = [head]
+    for name, unit, part in zip(fit.names, fit.parameters.units, learned, strict=True):
+        if part:
+            continue
+        value = fit.estimates[name]
+        row = [name, unit, f"{fit.start[name]:.5g}", f"{value:.5g}", f"{errors[name]:.2g}"]
+        row += [f"{clustered[name]:.2g}", "{:.4g} to {:.4g}".format(*ends[name])] if detailed else []
+        if name in known:
+            right = known[name]
+            row += [f"{right:.5g}", f"{value / right - 1:.2%}" if right else f"{value:.2g}"]
+        rows.append(row)
+    for part in dict.fromkeys(filter(None, learned)):
+        own = [name for name, of in zip(fit.names, learned, strict=True) if of == part]
+        start, end = (np.sqrt(np.mean([at[name] ** 2 for name in own])) for at in (fit.start, fit.estimates))
+        rows.append([f"{part}, rms of {len(own)} learned numbers", "", f"{start:.5g}", f"{end:.5g}"])
+    return [[*row, *[""] * (len(head) - len(row))] for row in rows]
+
+
+def _true_values(fit: Fit, truth: Mapping[str, float] | System | None) -> dict[str, float]:
+    """Of free parameters, from a system or by name.
+
+    **Raises:** `ValueError` for a name that is neither free nor a parameter; `TypeError` for another kind of system.
+    """
+    if truth is None:
+        return {}
+    system = fit.problem.system
+    if isinstance(truth, Mapping):
+        refuse_unknown(truth, (*fit.names, *leaf_names(system)), "`truth` names")
+        return {name: float(truth[name]) for name in fit.names if name in truth}
+    if type(truth) is not type(system):
+        raise TypeError(f"`truth` is a {type(system).__name__}, or values by name; got {type(truth).__name__}.")
+    leaves = jax.tree.leaves(truth)
+    targets = {e.name: e.targets[0] for e in fit.parameters.entries if e.targets}
+    return {name: float(jnp.ravel(leaves[leaf])[place]) for name, (leaf, place, _) in targets.items()}
 
 
 SAME_COST = 1e-6
@@ -328,38 +424,34 @@ def load(path: str | os.PathLike[str], problem: Problem) -> Fit:
     """
     refuse_other(problem, Problem, "load", "load(path, Problem.of(system, trials, free))")
     path = Path(path).expanduser()
-    there, arrays = read_state(path)
-    of_fit: dict[str, Any] = there.pop("fit", {})
+    saved, arrays = read_state(path)
+    of_fit: dict[str, Any] = saved.pop("fit", {})
     if not of_fit:
         raise ValueError(f"{path} is the checkpoint of a fit, not a fit that was saved: give it as `checkpoint=`.")
     step = tree_of(path, arrays, "step", problem.windows.step)
     if problem.chooses_steps and step.shape == problem.windows.step.shape:
         problem = problem.with_steps(step)
-    here = described(problem)
-    wrong = differences(*({key: d[key] for key in d if key not in ("program", "versions")} for d in (there, here)))
+    key = described(problem)
+    wrong = differences(*({k: d[k] for k in d if k not in ("program", "versions")} for d in (saved, key)))
     if wrong:
         raise ValueError(f"{path} is the fit of another problem. It differs in {wrong}. Pose the problem as it was.")
-    like: dict[str, Any] = {"point": problem.start, "R": 0.0, "step_errors": 0.0, "history": 0.0}
-    there_too = jnp.zeros(()) if problem.model.noise is not None else None
-    like["seen"] = Prediction(jnp.zeros(()), jnp.zeros(()), there_too, there_too, there_too)
-    found = {name: tree_of(path, arrays, name, tree) for name, tree in like.items()}
-    point, n_z, n_b = found["point"], found["point"].z.shape[1], found["point"].b.shape[1]
-    blocks = Blocks(found["R"], problem.by_trial, n_z, n_z if problem.model.nuisance.has_defects else 0, n_b)
-    at = Linearization(blocks, found["seen"])
-    if there["program"] != here["program"]:
-        _refuse_changed(path, problem, point, at, there["versions"])
-    errors, history = np.asarray(found["step_errors"]), tuple(float(c) for c in found["history"])
+    of_filter = jnp.zeros(()) if problem.model.noise is not None else None
+    prediction = Prediction(jnp.zeros(()), jnp.zeros(()), of_filter, of_filter, of_filter)
+    like = {"point": problem.start, "R": 0.0, "step_errors": 0.0, "history": 0.0, "seen": prediction}
+    state: dict[str, Any] = {name: tree_of(path, arrays, name, tree) for name, tree in like.items()}
+    point, n_z, n_b = state["point"], state["point"].z.shape[1], state["point"].b.shape[1]
+    blocks = Blocks(state["R"], problem.by_trial, n_z, n_z if problem.model.nuisance.has_defects else 0, n_b)
+    at = Linearization(blocks, state["seen"])
+    if saved["program"] != key["program"]:
+        now = problem.cost(point)
+        if not abs(now - at.cost) <= SAME_COST * at.squares:
+            raise ValueError(
+                f"{path}: the code has changed since this fit was saved (by {saved['versions']}), and "
+                f"{problem.cost_name} with it: {at.cost:.6g} then, {now:.6g} now. Fit anew, from `start=` if you like, "
+                "or go back to that code."
+            )
+    errors, history = np.asarray(state["step_errors"]), tuple(float(c) for c in state["history"])
     return Fit(problem, point, at, errors, history, of_fit["status"], of_fit["method"], of_fit["failed"])
-
-
-def _refuse_changed(path: Path, problem: Problem, point: Unknowns, at: Linearization, versions: str) -> None:
-    """`ValueError` where what the code computes today is not what was computed for the fit."""
-    now = problem.cost(point)
-    if not abs(now - at.cost) <= SAME_COST * at.squares:
-        raise ValueError(
-            f"{path}: the code has changed since this fit was saved (by {versions}), and {problem.cost_name} with it: "
-            f"{at.cost:.6g} then, {now:.6g} now. Fit anew, from `start=` if you like, or go back to that code."
-        )
 
 
 def trajectories(fit: Fit) -> list[tuple[str, Trajectory]]:

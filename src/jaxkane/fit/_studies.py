@@ -9,16 +9,18 @@ from collections.abc import Callable
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from scipy.stats import qmc
 from tqdm import tqdm
 
 from .._common.lookup import hint, real_number
-from ._diagnostics import bad_channels
+from ._diagnostics import poorly_fitted_channels
 from ._fit import minimize, uninterrupted
 from ._model import Unknowns
 from ._nuisance import solve_nuisance
 from ._optimizers import LeastSquares, Optimizer
 from ._problem import Problem, refuse_other
 from ._result import Fit
+from ._tables import text_table
 from ._windows import Windows
 
 
@@ -56,15 +58,13 @@ class MultiStart:
 
     def __str__(self) -> str:
         names = self.best.names
-        lines = [f"{'sum of squares':>15}  {'steps':>5}  {'ended':<12}" + "".join(f"{n[:14]:>15}" for n in names)]
+        rows = [("sum of squares", "steps", "ended", *names)]
         for f in self.fits:
-            lines.append(
-                f"{f.cost:>15.6g}  {len(f.history) - 1:>5}  {f.status:<12}"
-                + "".join(f"{f.estimates[n]:>15.5g}" for n in names)
-            )
-        lines.append(f"{'spread':>36}" + "".join(f"{s:>15.2g}" for s in self.spread.values()))
+            estimates = (f"{f.estimates[name]:.5g}" for name in names)
+            rows.append((f"{f.cost:.6g}", str(len(f.history) - 1), f.status, *estimates))
+        rows.append(("", "", "spread", *(f"{s:.2g}" for s in self.spread.values())))
         total = len(self.fits) + len(self.failures)
-        lines.append(f"{self.agreeing} of {total} initial guesses end at the best.")
+        lines = [text_table(rows, (2,)), f"{self.agreeing} of {total} initial guesses end at the best."]
         if self.agreeing == 1 and total > 1:
             lines.append("Nothing confirms that this is the lowest minimum: try more, or shorter windows.")
         if self.untried:
@@ -94,10 +94,10 @@ def multi_start(
 
     **Arguments:**
 
-    - `n`: how many fits. `spread`: of the initial guesses, uniform within this many scales of every parameter on either
-        side (for a positive one a factor between exp(-spread) and exp(spread)).
+    - `n`: how many fits. `spread`: of the initial guesses, a Latin hypercube within this many scales of every parameter
+        on either side (for a positive one a factor between exp(-spread) and exp(spread)).
     - `candidates`: draw so many guesses, and fit the `n` with the lowest cost; by default `n`.
-    - `seed`: of the random numbers. `optimizer`: by default `LeastSquares()`. `steps`, `callback`: of every fit, as in
+    - `seed`: of the Latin hypercube. `optimizer`: by default `LeastSquares()`. `steps`, `callback`: of every fit, as in
         `minimize`. `progress`: a progress bar.
 
     **Returns:** a `MultiStart`; after an interruption (Ctrl-C) of what was tried until then.
@@ -110,39 +110,38 @@ def multi_start(
     if not 0 <= real_number(spread, "`spread`") < math.inf:
         raise ValueError(f"`spread` is how far guesses lie from the first, in scales, not negative; got {spread}.")
     optimizer = LeastSquares() if optimizer is None else optimizer
-    rng = np.random.default_rng(seed)
-    p = len(problem.parameters.names)
-    drawn = rng.uniform(-spread, spread, (max(n, candidates or n), p))
+    unit = qmc.LatinHypercube(len(problem.parameters.names), seed=seed).random(max(n, candidates or n))
+    drawn = spread * (2 * unit - 1)
     points = [eqx.tree_at(lambda q: q.x, problem.start, jnp.asarray(x, problem.windows.t.dtype)) for x in drawn]
     if len(points) > n:
         costs = np.nan_to_num([problem.cost(point) for point in points], nan=np.inf)
         points = [points[i] for i in np.argsort(costs)[:n]]
-    found, failures, untried = [], [], 0
+    fits, failures, untried = [], [], 0
     for i, point in enumerate(tqdm(points, disable=not progress, desc="initial guesses")):
         values = np.asarray(problem.parameters.values(point.x)).tolist()
         guess = dict(zip(problem.parameters.names, values, strict=True))
         try:
-            found.append((minimize(problem, optimizer, steps=steps, start=point, callback=callback), guess))
+            fits.append((minimize(problem, optimizer, steps=steps, start=point, callback=callback), guess))
         except ValueError as error:
             failures.append(f"From {', '.join(f'{k} = {v:.4g}' for k, v in guess.items())}: {error}")
             continue
         except KeyboardInterrupt:  # before its first step
-            if not found:
+            if not fits:
                 raise
             untried = len(points) - i
             break
-        if found[-1][0].status == "interrupted":
+        if fits[-1][0].status == "interrupted":
             untried = len(points) - i - 1
             break
-    if not found:
+    if not fits:
         raise ValueError(f"None of {n} initial guesses can be simulated. The last: {failures[-1]}")
-    found.sort(key=lambda pair: pair[0].cost)
-    return MultiStart(tuple(f for f, _ in found), tuple(g for _, g in found), tuple(failures), untried)
+    fits.sort(key=lambda pair: pair[0].cost)
+    return MultiStart(tuple(f for f, _ in fits), tuple(g for _, g in fits), tuple(failures), untried)
 
 
 @dataclasses.dataclass(frozen=True)
 class Profile:
-    """The sum of squares with one parameter held at values (n,), all others found anew.
+    """The sum of squares with one parameter fixed at values (n,), all others estimated anew.
 
     `interval`: where `costs` exceed their minimum by no more than chance does at `level`, with the quantile and the
     errors of `Fit.intervals`; infinite on a side where they do not come so far. A parabola has the interval of
@@ -178,43 +177,42 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
         span = 0.75 * (high - low) / error
     i = fit.names.index(name)
     prior = float(fit.parameters.prior_mean[i]), float(fit.parameters.prior_deviation[i])
-    values, found = best + span * error * np.linspace(-1, 1, n | 1), {}
+    values, fits = best + span * error * np.linspace(-1, 1, n | 1), {}
     for side in (values[values >= best], values[values < best][::-1]):
         point = fit.point
         for value in side:
             pinned = fit.problem.with_priors({name: (float(value), 1e-4 * error)})
             try:
                 start = pinned.at({name: float(value)}, point)
-                there = uninterrupted(minimize(pinned, LeastSquares(rtol=1e-5), start=start))
+                result = uninterrupted(minimize(pinned, LeastSquares(rtol=1e-5), start=start))
             except ValueError:  # outside its bounds, or nothing that can be simulated
                 break
-            if there.status != "converged":
+            if result.status != "converged":
                 break
-            pin = (there.estimates[name] - value) / (1e-4 * error)
-            cost = there.cost - pin**2 + ((there.estimates[name] - prior[0]) / prior[1]) ** 2
-            found[float(value)], point = (cost, there.estimates), there.point
-    if not found:
-        raise ValueError(f"{name}: no fit converges with it held at {best:.6g} or near: {fit.message}.")
-    values = np.array(sorted(found))
-    costs = np.array([found[v][0] for v in values])
+            pin = (result.estimates[name] - value) / (1e-4 * error)
+            cost = result.cost - pin**2 + ((result.estimates[name] - prior[0]) / prior[1]) ** 2
+            fits[float(value)], point = (cost, result.estimates), result.point
+    if not fits:
+        raise ValueError(f"{name}: no fit converges with it fixed at {best:.6g} or near: {fit.message}.")
+    values = np.array(sorted(fits))
+    costs = np.array([fits[v][0] for v in values])
     # The cost rises by one at the error that `sigma` as it was given would leave.
     limit = costs.min() + (fit.quantile(level) * fit.errors[name] / fit.identifiability.given_sigma_errors[i]) ** 2
-    return Profile(name, values, costs, level, _crossings(values, costs, limit), tuple(found[v][1] for v in values))
+    return Profile(name, values, costs, level, _crossings(values, costs, limit), tuple(fits[v][1] for v in values))
 
 
 def _crossings(values: np.ndarray, costs: np.ndarray, limit: float) -> tuple[float, float]:
-    """Where the costs rise above the limit on both sides of their minimum."""
-    least, ends = int(np.argmin(costs)), []
+    """Where the costs rise above the limit on both sides of their minimum; infinite where they do not."""
+    best, ends = int(np.argmin(costs)), []
     # The root of what a cost exceeds its minimum by is linear where the cost is a parabola.
-    height, wanted = np.sqrt(costs - costs[least]), np.sqrt(limit - costs[least])
-    for beyond, infinite in ((range(least, -1, -1), -np.inf), (range(least, len(values)), np.inf)):
-        order = list(beyond)
-        above = next((k for k in order if height[k] > wanted), None)
+    height, limit_height = np.sqrt(costs - costs[best]), np.sqrt(limit - costs[best])
+    for side, infinite in ((range(best, -1, -1), -np.inf), (range(best, len(values)), np.inf)):
+        above = next((k for k in side if height[k] > limit_height), None)
         if above is None:
             ends.append(infinite)
             continue
-        inside = order[order.index(above) - 1]
-        share = (wanted - height[inside]) / (height[above] - height[inside])
+        inside = above - side.step
+        share = (limit_height - height[inside]) / (height[above] - height[inside])
         ends.append(float(values[inside] + share * (values[above] - values[inside])))
     return ends[0], ends[1]
 
@@ -225,7 +223,7 @@ def check_signs(fit: Fit) -> tuple[str, ...]:
     Where a channel fits badly (`Fit.notes` says so), each sign is turned round in turn and a few steps of a fit are
     made; where none does, nothing is tried.
     """
-    if not bad_channels(fit):
+    if not any(poorly_fitted_channels(fit.tests, fit.variance)):
         return ()
     notes, problem = [], fit.problem
     for i, name in enumerate(problem.system.inputs):

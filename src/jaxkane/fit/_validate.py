@@ -16,16 +16,17 @@ from ._optimizers import LeastSquares
 from ._problem import Problem, refuse_other
 from ._result import Fit
 from ._statistics import trial_names
+from ._tables import Rows, text_table
 from ._trial import Trial
 
 
 def validate(fit: Fit, trials: Sequence[Trial] | Trial) -> Fit:
-    """The parameters of a fit on other trials, of which only starts and biases are found (held-out data).
+    """The parameters of a fit on other trials, of which only starts and biases are estimated (held-out data).
 
         jk.fit.validate(result, others).variance_accounted_for
 
-    **Returns:** a `Fit` of these trials, with the status "applied": its `cost`, `variance_accounted_for`, `tests` and
-    report are those of these trials; its parameters were not fitted to them, and have no errors here (NaN). Trials that
+    **Returns:** a `Fit` of these trials, with the status "validated": its `cost`, `variance_accounted_for`, `tests` and
+    report are those of these trials; its parameters were not fitted to them, and have no errors (NaN). Trials that
     cannot be simulated with these parameters are left out: `failed` says by name why, and so do the `notes`.
 
     **Raises:** `ValueError` as `fit` does, for trials that do not suit the system, and where none can be simulated.
@@ -41,24 +42,24 @@ def validate(fit: Fit, trials: Sequence[Trial] | Trial) -> Fit:
             point, at = solve_nuisance(problem, first, steps=20, rtol=1e-6)
             break
         except Unsimulated as error:
-            failed |= {names[k]: words for k, words in error.reasons.items()}
-            kept = [k for k in range(len(names)) if k not in error.reasons]
-            if not kept:
-                words = next(iter(failed.items()))
+            failed |= {names[k]: why for k, why in error.reasons.items()}
+            left = [k for k in range(len(names)) if k not in error.reasons]
+            if not left:
+                name, why = next(iter(failed.items()))
                 raise ValueError(
-                    f"None of these trials can be simulated with these parameters: {words[0]}, {words[1]}."
+                    f"None of these trials can be simulated with these parameters: {name}, {why}."
                 ) from None
-            problem, names = fit.problem.with_trials([problem.trials[k] for k in kept]), [names[k] for k in kept]
+            problem, names = fit.problem.with_trials([problem.trials[k] for k in left]), [names[k] for k in left]
     try:
         before = solve_nuisance(problem, problem.start)[1].cost
     except Unsimulated:  # with the initial guesses, which is no fault of the fit
         before = float("nan")
-    return dataclasses.replace(Fit.of(problem, point, at, (before, at.cost), "applied", fit.method), failed=failed)
+    return dataclasses.replace(Fit.of(problem, point, at, (before, at.cost), "validated", fit.method), failed=failed)
 
 
 @dataclasses.dataclass(frozen=True)
 class CrossValidation:
-    """Trials left out in turn: sums of squares of each, its own starts and biases found with the parameters held; of
+    """Trials left out in turn: sums of squares of each, its own starts and biases estimated with fixed parameters; of
     fits with process noise, minus twice the log likelihoods.
 
     - `trials`: their names; `n`: numbers of residuals; `at_start`, `fitted`, `held_out` (T,): with the parameters of
@@ -78,35 +79,38 @@ class CrossValidation:
 
     @property
     def score(self) -> float:
-        """1 - held out / spread, over all trials: the share of the measurements' variance that parameters found from
-        other trials account for (the predictive R^2; one is perfect, below zero is worse than a constant). The initial
+        """1 - held out / spread, over all trials: the share of the measurements' variance that parameters from other
+        trials account for (the predictive R^2; one is perfect, below zero is worse than a constant). The initial
         guess has no part in it. NaN of likelihoods, which have no zero."""
         if self.cost_name != "sum of squares":
             return float("nan")
         return float(1 - self.held_out.sum() / self.spread.sum())
 
     @property
-    def verdict(self) -> str:
+    def conclusion(self) -> str:
         """How well trials are predicted that a fit has not seen, in words."""
         lost = [name for name, cost in zip(self.trials, self.held_out, strict=True) if not np.isfinite(cost)]
         if lost:
             return f"{', '.join(lost)} cannot be simulated with the parameters of the others."
         if self.cost_name != "sum of squares":
-            less = self.at_start.sum() - self.held_out.sum()
-            return f"held out, the {self.cost_name} of all is {less:.4g} below that of the start."
+            drop = self.at_start.sum() - self.held_out.sum()
+            return f"held out, the {self.cost_name} of all is {drop:.4g} below that of the start."
         return f"held-out score: {100 * self.score:.1f} % of the measurements' variance is accounted for."
 
+    @property
+    def rows(self) -> Rows:
+        """Of every trial, and of all together; the first row is the head."""
+        columns = (self.spread, self.at_start, self.fitted, self.held_out)
+        rows = [*zip(self.trials, self.n, *columns, strict=True), ("all", *(c.sum() for c in (self.n, *columns)))]
+        cells = [[name, str(n), *(f"{cost:.5g}" for cost in costs)] for name, n, *costs in rows]
+        return [("trial left out", "residuals", "spread", "start", "fitted", "held out"), *cells]
+
     def __str__(self) -> str:
-        lines = [f"{'trial':<28}{'residuals':>10}{'spread':>12}{'start':>12}{'fitted':>12}{'held out':>12}"]
-        columns = (self.n, self.spread, self.at_start, self.fitted, self.held_out)
-        rows = [*zip(self.trials, *columns, strict=True), ("all", *(column.sum() for column in columns))]
-        lines += [f"{name:<28}{n:>10}" + "".join(f"{x:>12.5g}" for x in costs) for name, n, *costs in rows]
-        lines.append(self.verdict)
-        return "\n".join(lines)
+        return f"{text_table(self.rows)}\n{self.conclusion}"
 
 
 def cross_validate(fit: Fit, folds: int | Sequence[Sequence[int]] | None = None) -> CrossValidation:
-    """Cross-validation: fit some of the trials, and predict the others with the parameters that were found.
+    """Cross-validation: fit some of the trials, and predict the others with these parameters.
 
     **Arguments:** `folds`: how many, or the numbers of the trials that are left out together; by default each trial
     alone, and five folds from eleven trials on.
@@ -120,13 +124,12 @@ def cross_validate(fit: Fit, folds: int | Sequence[Sequence[int]] | None = None)
     if folds is None:
         folds = T if T <= 10 else 5
     groups = folds_of(folds, T)
-    held, estimates = np.full(T, np.nan), {name: [] for name in fit.names}
+    held_out, estimates = np.full(T, np.nan), []
     for group in groups:
-        others = fit.problem.only(set(range(T)) - set(group))
-        found = uninterrupted(minimize(others, LeastSquares(), start=fit.point))
-        held[group] = costs_by_trial(fit.problem, found.point)[group]
-        for name, value in found.estimates.items():
-            estimates[name].append(value)
+        training = fit.problem.only(set(range(T)) - set(group))
+        trained = uninterrupted(minimize(training, LeastSquares(), start=fit.point))
+        held_out[group] = costs_by_trial(fit.problem, trained.point)[group]
+        estimates.append(trained.estimates)
     owner = np.asarray(fit.problem.windows.trial)
     counts = np.asarray(jnp.sum(fit.problem.windows.weight > 0, axis=(1, 2)))
     return CrossValidation(
@@ -134,9 +137,9 @@ def cross_validate(fit: Fit, folds: int | Sequence[Sequence[int]] | None = None)
         n=np.array([counts[owner == k].sum() for k in range(T)]),
         at_start=costs_by_trial(fit.problem, fit.problem.start),
         fitted=costs_by_trial(fit.problem, fit.point),
-        held_out=held,
+        held_out=held_out,
         spread=spread_by_trial(fit.problem),
-        estimates={name: np.array(values) for name, values in estimates.items()},
+        estimates={name: np.array([of_fold[name] for of_fold in estimates]) for name in fit.names},
         cost_name=fit.problem.cost_name,
     )
 
@@ -153,7 +156,7 @@ def folds_of(folds: int | Sequence[Sequence[int]], T: int) -> list[list[int]]:
 
 
 def costs_by_trial(problem: Problem, point: Unknowns) -> np.ndarray:
-    """Sums of squares (T,) with these parameters, starts and biases found for them.
+    """Sums of squares (T,) with these parameters, starts and biases estimated for them.
 
     With the priors of a trial's starts and biases, and without those of the parameters, which belong to no trial.
     Infinite of trials that cannot be simulated.
@@ -163,10 +166,10 @@ def costs_by_trial(problem: Problem, point: Unknowns) -> np.ndarray:
     try:
         _, at = solve_nuisance(problem, point, rtol=1e-5)
     except Unsimulated as error:
-        costs, kept = np.full(len(problem.trials), np.inf), np.delete(np.arange(len(problem.trials)), [*error.reasons])
-        if kept.size:
-            others = problem.with_trials([problem.trials[k] for k in kept])
-            costs[kept] = costs_by_trial(others, dataclasses.replace(others.start, x=point.x))
+        costs, left = np.full(len(problem.trials), np.inf), np.delete(np.arange(len(problem.trials)), [*error.reasons])
+        if left.size:
+            others = problem.with_trials([problem.trials[k] for k in left])
+            costs[left] = costs_by_trial(others, dataclasses.replace(others.start, x=point.x))
         return costs
     value = at.prediction.cost
     costs = np.sum(np.asarray(at.blocks.R)[:, :, -1] ** 2, axis=1) if value is None else np.asarray(value)
