@@ -16,7 +16,7 @@ import jaxkane as jk
 from jaxkane import Scalar, parameter
 from jaxkane.bicycles import sharp_motorcycle
 from jaxkane.stability import critical_speeds, eigenvalues, linearize, straight_ahead
-from jaxkane.stability._eigenvalues import _tracked, pairs, track
+from jaxkane.stability._modes import _track_and_name, conjugate_pairs, track
 
 BIKE = jk.catalog.WhippleBicycle.benchmark()
 PUBLISHED = json.loads((Path(__file__).parents[1] / "data" / "meijaard2007.json").read_text())
@@ -275,7 +275,7 @@ def test_a_pair_is_not_torn_while_it_is_one(seed, n):
     p = np.linspace(0.0, 0.01, n)
     values, vectors = np.linalg.eig(A + p[:, None, None] * dA)
     order, _ = track(p, values, vectors)
-    together = pairs(np.take_along_axis(values, order, axis=1))
+    together = conjugate_pairs(np.take_along_axis(values, order, axis=1))
     kept = (together.sum(axis=(1, 2))[1:] == 2) & (together.sum(axis=(1, 2))[:-1] == 2)
     np.testing.assert_array_equal(together[1:][kept], together[:-1][kept])
 
@@ -306,7 +306,7 @@ def in_order(v):
     A = canonical(v)
     values, vectors = np.linalg.eig(A)
     left = np.linalg.inv(vectors).conj().swapaxes(1, 2)
-    order, clear = _tracked((v, values, left, vectors), LATERAL, {})
+    order, clear = _track_and_name((v, values, left, vectors), LATERAL, {})
     return np.take_along_axis(values, order, axis=1), clear
 
 
@@ -351,7 +351,7 @@ def test_names_of_a_motorcycle_at_one_speed_and_in_coarse_steps():
     for v in (20.0, 30.0, 40.0):
         found = eigenvalues(motorcycle, jnp.array([v]))
         values, names = np.asarray(found.eigenvalues[0]), np.array(found.modes)
-        for i, j in np.argwhere(pairs(values)):
+        for i, j in np.argwhere(conjugate_pairs(values)):
             assert names[i] == names[j] or {*names[[i, j]]} <= {f"mode {k}" for k in range(1, 9)}
     for first in (1.0, 3.0, 5.0):
         found = critical_speeds(motorcycle, jnp.arange(first, 50.1, 5.0))

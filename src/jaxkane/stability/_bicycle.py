@@ -1,8 +1,6 @@
-"""What the literature does with the bicycle: riding straight ahead, the canonical matrices, the modes' names."""
+"""Riding straight ahead, and the canonical matrices of a bicycle."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,9 +15,6 @@ from .._scalarjit.nan import nan_where
 from .._system.system import State
 from ..catalog import WhippleBicycle
 from ._steady import SteadyMotion, jacobian, steady_turn
-
-LATERAL = WhippleBicycle.lateral
-"""The states of Meijaard et al. (2007); riding straight, the speed does not notice them to first order."""
 
 
 def straight_ahead(bicycle: WhippleBicycle, speed: Component) -> State | SteadyMotion:
@@ -77,8 +72,8 @@ def canonical(bicycle: WhippleBicycle) -> Canonical:
     **Raises:** `ValueError` for a bicycle with more speeds or with states, whose equations are more than these two, and
     for one whose equations have other terms, as gains that are scheduled over speed; under a trace these are NaN.
     """
-    name, more = type(bicycle).__name__, (*bicycle.speeds[len(WhippleBicycle.speeds) :], *bicycle.states)
-    if more or bicycle.speeds != WhippleBicycle.speeds:
+    name = type(bicycle).__name__
+    if bicycle.states or bicycle.speeds != WhippleBicycle.speeds:
         raise ValueError(
             f"canonical: {name} moves by {', '.join((*bicycle.speeds, *bicycle.states))}, and has no equations in roll "
             "and steer alone; jaxkane.stability.linearize gives all of them."
@@ -100,30 +95,13 @@ def canonical(bicycle: WhippleBicycle) -> Canonical:
     K, C = jax.lax.map(stiffness_and_damping, jnp.array([-1.0, 0.0, 1.0, 2.0], still.q.dtype))
     C1, K2 = (C[2] - C[0]) / 2, (K[2] + K[0]) / 2 - K[1]
     off = jnp.stack([K[3] - K[1] - 4 * K2, C[3] - C[1] - 2 * C1, C[2] - C[1] - C1, K[2] - K[0]])  # zero of these terms
-    others = ~(jnp.max(jnp.abs(off)) < jnp.finfo(K.dtype).eps ** 0.5 * jnp.max(jnp.abs(jnp.stack([K[3], C[3]]))))
-    if is_concrete(others) and others:
+    has_other_terms = ~(
+        jnp.max(jnp.abs(off)) < jnp.finfo(K.dtype).eps ** 0.5 * jnp.max(jnp.abs(jnp.stack([K[3], C[3]])))
+    )
+    if is_concrete(has_other_terms) and has_other_terms:
         raise ValueError(
             f"canonical: the equations of {name} hold other terms of the speed than C0 + v C1 and K0 + v^2 K2; "
             "jaxkane.stability.linearize gives them at one speed."
         )
-    found = (M[np.ix_(lateral, lateral)], C1, K[1] / bicycle.g, K2, C[1])
-    return Canonical(*(nan_where(others, each, bicycle) for each in found))
-
-
-MODES = ("weave", "weave", "capsize", "castering")
-"""Names of the modes of `LATERAL`, in the order of `mode_order`."""
-
-
-def mode_order(values: Any) -> np.ndarray:
-    """Columns of tracked eigenvalues (m, 4) along the speed in the order of `MODES`.
-
-    The pair that oscillates is the weave, and of the others castering decays faster. At the lowest speeds nothing
-    oscillates: where nothing ever does, the two largest are those that would become the weave. Riding backwards is
-    riding forwards with time reversed: all decay is growth, that of castering the fastest.
-    """
-    oscillating = np.abs(values.imag) > 1e-9
-    pairs = oscillating.sum(axis=1)
-    i = int(np.argmax(pairs == 2)) if (pairs == 2).any() else 0
-    row = values[i]
-    backwards = row.real.sum() > 1e-9 * np.abs(row).max()
-    return np.lexsort((-row.imag, row.real if backwards else -row.real, ~oscillating[i]))
+    matrices = (M[np.ix_(lateral, lateral)], C1, K[1] / bicycle.g, K2, C[1])
+    return Canonical(*(nan_where(has_other_terms, each, bicycle) for each in matrices))

@@ -18,7 +18,7 @@ from .._scalarjit.cache_key import jit
 from .._scalarjit.nan import nan_where
 from .._system.system import System
 from ._eig import Eig, eig
-from ._eigenvalues import MotionAt, eigenvalues, family_of, followed, matrix, names_of_modes
+from ._eigenvalues import MotionAt, eigenvalues, motion_family, names_of_modes, state_matrix, track_modes
 
 _MOST = 8
 _GRID = np.linspace(0.0, 20.0, 201)  # [m/s]
@@ -34,7 +34,7 @@ class CriticalSpeeds(eqx.Module):
 
     Attributes: `values` (m,); `frequency` (m,) [rad/s], zero where the mode does not oscillate; `direction` (m,): 1
     where the mode becomes unstable, -1 where it becomes stable; `mode` (m,): its place in `modes`, the names.
-    `found["weave"]` is the first value of that mode; without one it is `none`, which is NaN with its derivatives.
+    `speeds["weave"]` is the first value of that mode; without one it is `none`, which is NaN with its derivatives.
     """
 
     values: Float[Array, " m"]
@@ -101,21 +101,20 @@ def critical_speeds(
     """
     if isinstance(most, bool) or not isinstance(most, int) or most < 1:
         raise ValueError(f"critical_speeds: `most` is how many are kept, at least one; got {most!r}.")
-    values, at, states, groups = family_of(system, _default_grid(system, values, motion), motion, states)
+    values, at, states, groups = motion_family(system, _GRID if values is motion is None else values, motion, states)
     values = jnp.sort(values)  # directions are those of a rising parameter
     if len(values) < 2:
         names = eigenvalues(system, values, motion, states=states, modes=modes).modes
         empty, none = jnp.zeros(0, values.dtype), jnp.full((), jnp.nan, values.dtype)
         return CriticalSpeeds(empty, empty, empty.astype(int), empty.astype(int), none, names)
-    found, kept = _crossings(system, values, at, states, groups, most)
-    known = jax.lax.stop_gradient(found)
-    origin = (system, values, found.values)  # which follow from what `motion` closes over, too
-    names, unnamed = names_of_modes(kept, groups, known.clear, modes)
+    crossings, state_names = _crossings(system, values, at, states, groups, most)
+    known = jax.lax.stop_gradient(crossings)
+    origin = (system, values, crossings.values)  # which follow from what `motion` closes over, too
+    names, unnamed = names_of_modes(state_names, groups, known.clear, modes)
     # What is decided by numbers that are known is left to NumPy: every operation would be a program of its own.
-    as_array: Any = np.asarray if is_concrete(found, origin) else jnp.asarray
-    critical, frequency, direction, column = map(
-        as_array, (found.values, found.frequency, known.direction, known.column)
-    )
+    as_array: Any = np.asarray if is_concrete(crossings, origin) else jnp.asarray
+    columns = (crossings.values, crossings.frequency, known.direction, known.column)
+    critical, frequency, direction, column = map(as_array, columns)
     if is_concrete(known):
         if known.is_missing:
             raise ValueError(
@@ -134,31 +133,27 @@ def critical_speeds(
                 "too flatly to be found. jaxkane.stability.eigenvalues shows where.",
                 stacklevel=2,
             )
-        rows = np.flatnonzero(known.there)
+        rows = np.flatnonzero(known.counts)
         order: Any = rows[np.argsort(np.asarray(known.values)[rows])]
     else:
-        there = known.there & ~jnp.asarray(unnamed)[column] & ~known.is_missing
-        critical, frequency = nan_where(~there, (critical, frequency), origin)
+        counts = known.counts & ~jnp.asarray(unnamed)[column] & ~known.is_missing
+        critical, frequency = nan_where(~counts, (critical, frequency), origin)
         order = jnp.argsort(jax.lax.stop_gradient(critical))
     none = np.full((), np.nan, values.dtype)
-    if not is_concrete(found, origin):
+    if not is_concrete(crossings, origin):
         none = nan_where(jnp.array(True), jnp.zeros((), values.dtype), origin)
-    found = [jnp.asarray(x[order]) for x in (critical, frequency, direction, column)]
-    return CriticalSpeeds(found[0], found[1], found[2], found[3], jnp.asarray(none), names)
-
-
-def _default_grid(system: System, values: Any, motion: MotionAt) -> Any:
-    return _GRID if values is None and motion is None else values
+    ordered = (jnp.asarray(x[order]) for x in (critical, frequency, direction, column))
+    return CriticalSpeeds(*ordered, jnp.asarray(none), names)
 
 
 class _Crossings(NamedTuple):
-    """Of `count` crossings the first k, of which `there` are some; `missing`: a value without a steady motion."""
+    """Of `count` crossings the first k, of which some `counts`; `missing`: a value without a steady motion."""
 
     values: Float[Array, " k"]
     frequency: Float[Array, " k"]
     direction: Int[Array, " k"]
     column: Int[Array, " k"]
-    there: Any
+    counts: Any
     count: Any
     is_missing: Any
     missing: Any
@@ -177,7 +172,7 @@ class _Brackets(NamedTuple):
     is_missing: Any
     missing: Any
 
-    def with_more(self, lower, upper, near, rises, is_one) -> _Brackets:
+    def extended(self, lower, upper, near, rises, is_one) -> _Brackets:
         """Those of `near` (n,) that are one are added as far as there is room; all are counted."""
         at = jnp.where(is_one, self.count + jnp.cumsum(is_one) - 1, len(self.lower))
         old = (self.lower, self.upper, self.near, self.rises)
@@ -189,39 +184,39 @@ class _Brackets(NamedTuple):
 @jit
 def _crossings(system, values, motion, states, groups, most: int):
     fixed = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, (system, values))
-    kept: list[tuple[str, ...]] = []
+    state_names: list[tuple[str, ...]] = []
 
     def at(p):
-        A, names = matrix(fixed[0], p, motion, states)
-        kept.append(names)
+        A, names = state_matrix(fixed[0], p, motion, states)
+        state_names.append(names)
         return jax.lax.stop_gradient(A)
 
     p = fixed[1]
     A = jax.vmap(at)(p)
     spectra = eig(A)
-    brackets = _bracketed(at, p, A, spectra.values, most)
+    brackets = _bracket(at, p, A, spectra.values, most)
     is_one = jnp.arange(most) < brackets.count
     # Empty places repeat the first, so that nothing there can spoil a derivative.
     brackets = jax.tree.map(lambda x: jnp.where(is_one, x, x[0]) if x.ndim else x, brackets)
-    roots = _bisected(at, brackets)
-    roots, frequency, there_too, place = jax.lax.map(
+    roots = _bisect(at, brackets)
+    roots, frequency, spectra_at_roots, place = jax.lax.map(
         lambda root: _differentiable(system, motion, states, *root), (roots, brackets.near)
     )
     rows = jnp.concatenate([p, jax.lax.stop_gradient(roots)])
     order = jnp.argsort(rows)
-    all_of = jax.tree.map(lambda x, y: jnp.concatenate([x, y])[order], spectra, jax.lax.stop_gradient(there_too))
-    columns, clear = followed(rows[order], all_of, kept[0], groups)
+    all_of = jax.tree.map(lambda x, y: jnp.concatenate([x, y])[order], spectra, jax.lax.stop_gradient(spectra_at_roots))
+    columns, clear = track_modes(rows[order], all_of, state_names[0], groups)
     columns = columns[jnp.argsort(order)][len(p) :]
     column = jnp.argmax(columns == place[:, None].astype(columns.dtype), axis=1)
     # What is zero at the first or the last value has not passed it.
     ends, step = p[jnp.array([0, -1])], jnp.abs(p[jnp.array([1, -2])] - p[jnp.array([0, -1])])
     inside = jnp.all(jnp.abs(rows[len(p) :, None] - ends[None, :]) > 1e-9 * step[None, :], axis=1)
-    there = is_one & inside
+    counts = is_one & inside
     direction = jnp.where(brackets.rises, 1, -1)
     counted = brackets.count, brackets.is_missing, brackets.missing
-    passed = jnp.sum(jnp.where(there, direction * jnp.where(frequency > 0, 2, 1), 0))
+    passed = jnp.sum(jnp.where(counts, direction * jnp.where(frequency > 0, 2, 1), 0))
     unexplained = _unexplained(spectra.values[0], spectra.values[-1], passed)
-    return _Crossings(roots, frequency, direction, column, there, *counted, clear, unexplained), kept[0]
+    return _Crossings(roots, frequency, direction, column, counts, *counted, clear, unexplained), state_names[0]
 
 
 def _unexplained(first, last, passed):
@@ -232,25 +227,18 @@ def _unexplained(first, last, passed):
         return jnp.sum(size > _MOST_NEUTRAL), jnp.sum(size > _NOISE)  # between them, it may be rounding errors
 
     (few, many), (few_last, many_last) = growing(first), growing(last)
-    least, most = few_last - many, many_last - few
-    return jnp.clip(0, least - passed, most - passed)
+    low, high = few_last - many, many_last - few
+    return jnp.clip(0, low - passed, high - passed)
 
 
-def _bracketed(at, p, A, x, most: int) -> _Brackets:
+def _bracket(at, p, A, x, most: int) -> _Brackets:
     """Where eigenvalues of A = at(p) pass the imaginary axis between the values p (m,), where A is (m, n, n) and has
     the eigenvalues x (m, n)."""
     depth = _HALVINGS + 2
-    gone = ~jnp.all(jnp.isfinite(A), axis=(1, 2))
-    nothing = jnp.zeros(most, p.dtype)
-    brackets = _Brackets(
-        nothing,
-        nothing,
-        nothing.astype(x.dtype),
-        jnp.zeros(most, bool),
-        jnp.zeros((), int),
-        jnp.any(gone),
-        p[jnp.argmax(gone)],
-    )
+    missing = ~jnp.all(jnp.isfinite(A), axis=(1, 2))
+    zeros = jnp.zeros(most, p.dtype)
+    empty = (zeros, zeros, zeros.astype(x.dtype), jnp.zeros(most, bool), jnp.zeros((), int))
+    brackets = _Brackets(*empty, jnp.any(missing), p[jnp.argmax(missing)])
 
     def within(brackets, step):
         """The halves of a step that are still to be looked at lie on a stack."""
@@ -261,17 +249,17 @@ def _bracketed(at, p, A, x, most: int) -> _Brackets:
             lower, upper = jax.tree.map(lambda x: x[height - 1], stack)
             p = 0.5 * (lower[0] + upper[0])
             A = at(p)
-            found = eig(A)
-            middle = p, A, found.values
+            spectrum = eig(A)
+            middle = p, A, spectrum.values
             exists = jnp.all(jnp.isfinite(lower[1] + A + upper[1]))
-            clear, *passing = _passing(found, lower, middle, upper)
+            clear, *passing = _crossing_modes(spectrum, lower, middle, upper)
             last = (jnp.abs(upper[0] - lower[0]) <= 0.5**_HALVINGS * jnp.abs(step[1][0] - step[0][0])) | (
                 trial >= _TRIALS
             )
             near, rises, is_one = (
-                jnp.where(clear, x, y) for x, y in zip(passing, _changes(lower[2], upper[2]), strict=True)
+                jnp.where(clear, x, y) for x, y in zip(passing, _crossings_by_order(lower[2], upper[2]), strict=True)
             )
-            brackets = brackets.with_more(lower[0], upper[0], near, rises, is_one & (clear | last) & exists)
+            brackets = brackets.extended(lower[0], upper[0], near, rises, is_one & (clear | last) & exists)
             missing = jnp.where(brackets.is_missing | exists, brackets.missing, p)
             brackets = brackets._replace(is_missing=brackets.is_missing | ~exists, missing=missing)
             for i, half in enumerate(((middle, upper), (lower, middle))):
@@ -281,20 +269,18 @@ def _bracketed(at, p, A, x, most: int) -> _Brackets:
         carry = (brackets, stack, jnp.ones((), int), jnp.zeros((), int))
         return jax.lax.while_loop(lambda carry: carry[2] > 0, look, carry)[0], None
 
-    ends = p, A, x
-    return jax.lax.scan(within, brackets, (jax.tree.map(lambda x: x[:-1], ends), jax.tree.map(lambda x: x[1:], ends)))[
-        0
-    ]
+    lower, upper = (p[:-1], A[:-1], x[:-1]), (p[1:], A[1:], x[1:])
+    return jax.lax.scan(within, brackets, (lower, upper))[0]
 
 
-def _passing(found: Eig, lower, middle, upper):
+def _crossing_modes(spectrum: Eig, lower, middle, upper):
     """Whether it is clear what passes the imaginary axis about A; and the eigenvalues (n,), which of them pass it
     towards the right, and which pass it at all (of a conjugate pair the upper one)."""
     (_, A_lower, before), (_, A, x), (_, A_upper, after) = lower, middle, upper
-    s = jnp.abs(jnp.sum(found.left.conj() * found.vectors, axis=0))
+    s = jnp.abs(jnp.sum(spectrum.left.conj() * spectrum.vectors, axis=0))
     # Both vectors of one length: discs then do not depend on how LAPACK scales them.
     by = (1 / jnp.sqrt(s)).astype(x.dtype)
-    Y, X = found.left.conj().T * by[:, None], found.vectors * by[None, :]
+    Y, X = spectrum.left.conj().T * by[:, None], spectrum.vectors * by[None, :]
     changes = (A_lower - A, A_upper - A, A_lower - 2 * A + A_upper)  # the last where A is not linear in p
     M = jnp.max(jnp.stack([jnp.abs(Y @ dA.astype(X.dtype) @ X) for dA in changes]), axis=0)
     radius = jnp.sum(M, axis=1)
@@ -315,7 +301,7 @@ def _passing(found: Eig, lower, middle, upper):
     return clear, x, rises, within_reach & (negative[0] != negative[2]) & (x.imag >= 0)
 
 
-def _changes(before, after):
+def _crossings_by_order(before, after):
     """The same where it is not clear: by the order of the real parts, which change continuously."""
     before, after = (x[jnp.lexsort((-x.imag, -x.real))] for x in (before, after))
     rounding = 1e3 * jnp.finfo(before.dtype).eps * jnp.max(jnp.abs(before))
@@ -324,13 +310,13 @@ def _changes(before, after):
     return (before + after) / 2, rises, changed & ((before.imag >= 0) | (after.imag >= 0))
 
 
-def _bisected(at, brackets: _Brackets):
+def _bisect(at, brackets: _Brackets):
     """The critical values (k,), to rounding."""
 
     def half(ends, _):
         lower, upper = ends
         middle = 0.5 * (lower + upper)
-        x = jax.lax.map(lambda row: _next_to(eig(at(row[0])), row[1])[0], (middle, brackets.near))
+        x = jax.lax.map(lambda row: _nearest(eig(at(row[0])), row[1])[0], (middle, brackets.near))
         is_below = (x.real < 0) == brackets.rises
         return (jnp.where(is_below, middle, lower), jnp.where(is_below, upper, middle)), None
 
@@ -339,20 +325,20 @@ def _bisected(at, brackets: _Brackets):
     return 0.5 * (lower + upper)
 
 
-def _next_to(found: Eig, near):
-    place = jnp.argmin(jnp.abs(jax.lax.stop_gradient(found.values) - near))
-    return found.values[place], place
+def _nearest(spectrum: Eig, near):
+    place = jnp.argmin(jnp.abs(jax.lax.stop_gradient(spectrum.values) - near))
+    return spectrum.values[place], place
 
 
 def _differentiable(system, motion, states, root, near):
     """A critical value with its derivatives, its frequency, the eigenvalues there and the place of the critical one."""
 
-    def spectrum(p):
-        found = eig(matrix(system, p, motion, states)[0])
-        return *_next_to(found, near), found
+    def spectrum_at(p):
+        spectrum = eig(state_matrix(system, p, motion, states)[0])
+        return *_nearest(spectrum, near), spectrum
 
     root = jax.lax.custom_root(
-        lambda p: spectrum(p)[0].real, root, lambda _, root: root, lambda f, y: y / f(jnp.ones_like(y))
+        lambda p: spectrum_at(p)[0].real, root, lambda _, root: root, lambda f, y: y / f(jnp.ones_like(y))
     )
-    x, place, found = spectrum(root)
-    return root, jnp.abs(x.imag), found, place
+    x, place, spectrum = spectrum_at(root)
+    return root, jnp.abs(x.imag), spectrum, place

@@ -92,12 +92,12 @@ def _step(H, exceptional):
     n, H = len(H), [list(row) for row in H]
     linked = [H[k + 1][k] != 0 for k in range(n - 1)]
     # inside[k]: rows k and k + 1 belong to the block; last[k]: they are its last two.
-    found = below = jnp.asarray(False)
-    inside, last = [found] * (n - 1), [found] * (n - 1)
+    has_last = below = jnp.asarray(False)
+    inside, last = [has_last] * (n - 1), [has_last] * (n - 1)
     for k in reversed(range(n - 1)):
         if k > 0:
-            last[k] = linked[k] & linked[k - 1] & ~found
-        found = found | last[k]
+            last[k] = linked[k] & linked[k - 1] & ~has_last
+        has_last = has_last | last[k]
         inside[k] = below = linked[k] & (below | last[k])
     first = [inside[0], *(inside[k] & ~inside[k - 1] for k in range(1, n - 1))]
     # The shifts are the eigenvalues of the last two rows [[a, b], [c, d]], of which bc is the product b c.

@@ -1,10 +1,10 @@
-"""Eigenvalues along a parameter, each followed through crossings, and names of modes."""
+"""Eigenvalues of linear models along a parameter of their steady motions."""
 
 from __future__ import annotations
 
 import inspect
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -12,7 +12,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
-from scipy.optimize import linear_sum_assignment
 
 from .._common.lookup import as_names, not_there
 from .._kane.arguments import check_is_system, is_concrete, is_numeric
@@ -21,82 +20,11 @@ from .._scalarjit.nan import nan_where
 from .._system.parameters import parameter_info
 from .._system.system import State, System, unit_of, units_of
 from ..catalog import WhippleBicycle
-from ._bicycle import LATERAL, MODES, mode_order, straight_ahead
+from ._bicycle import straight_ahead
 from ._eig import MOST_CONDITION, Eig, eig
 from ._linearize import linearize
+from ._modes import LATERAL, Groups, mode_names, track_modes
 from ._steady import SteadyMotion
-
-Groups = Mapping[str, Sequence[str]]
-OTHER = "mode {}"
-_CLEAR = 0.5
-
-
-def mode_names(states: Sequence[str], groups: Groups) -> tuple[str, ...] | None:
-    """Names of the modes of a bicycle that rides straight: those of the bicycle, then one for each state of a group.
-
-    None where the states are not those of `LATERAL` and of the groups, so that nothing is named.
-    """
-    grouped = [k for members in groups.values() for k in members]
-    if sorted((*LATERAL, *grouped)) != sorted(states):
-        return None
-    return (*MODES, *(name for name, members in groups.items() for _ in members))
-
-
-def participation(left: Any, right: Any) -> np.ndarray:
-    """How much each state takes part in each mode, (..., states, modes)."""
-    each = np.abs(np.conj(left) * right)
-    return each / np.maximum(each.sum(axis=-2, keepdims=True), 1e-300)
-
-
-def pairs(values: Any) -> np.ndarray:
-    """Whether (..., n, n) the i-th and the j-th of eigenvalues (..., n) are a conjugate pair, its upper one first."""
-    return (values.imag[..., :, None] > 0) & (values[..., :, None] == values[..., None, :].conj())
-
-
-def named_order(
-    values: np.ndarray, shares: np.ndarray, confused: np.ndarray, states: Sequence[str], groups: Groups
-) -> tuple[np.ndarray, np.ndarray]:
-    """Columns (n,) of tracked eigenvalues (m, n) in the order of `mode_names`, and whether (n,) each name is clear.
-
-    `shares` (m, states, modes): participations; `confused` (n, n): columns that may have changed places. Modes are
-    dealt out to groups where they belong to them most clearly: at the value at which the smallest share of a group in a
-    mode of its own is largest. Two groups that vibrate with the steer, "wobble" and "front end", are distinguished by
-    their frequencies: the slower one is the wobble. A name is clear where at least half of each of its modes belongs
-    to it, no pair has two names, and no mode of another name may have changed places with one of its own.
-    """
-    members = [[states.index(k) for k in group] for group in (LATERAL, *groups.values())]
-    owner = np.repeat(np.arange(len(members)), [len(group) for group in members])  # of each slot
-    of_groups = np.stack([shares[:, group].sum(axis=1) for group in members], axis=1)  # (m, groups, modes)
-    dealt = [linear_sum_assignment(-row[owner])[1] for row in of_groups]
-    own_share = np.stack([row[owner, slots] for row, slots in zip(of_groups, dealt, strict=True)])  # (m, n)
-    best = int(np.argmax(own_share.min(axis=1)))
-    order, sure = dealt[best], own_share[best] >= _CLEAR
-    own = order[: len(LATERAL)]
-    order[: len(LATERAL)] = own[mode_order(values[:, own])]
-    order = _slower_first(order, values[best], groups)
-    names = np.array(mode_names(states, groups))
-    others = names[:, None] != names
-    torn = pairs(values[:, order]) & others
-    if torn[best].any():
-        return order, np.zeros(len(order), bool)
-    doubtful = ~sure | np.any((confused[np.ix_(order, order)] | torn.any(axis=0) | torn.any(axis=0).T) & others, axis=1)
-    return order, ~np.isin(names, names[doubtful])
-
-
-def _slower_first(order: np.ndarray, values: np.ndarray, groups: Groups) -> np.ndarray:
-    """The same, the slower of the wobble and what else vibrates at the front end being the wobble."""
-    names = mode_names([*LATERAL, *(k for group in groups.values() for k in group)], groups) or ()
-    places = [[i for i, name in enumerate(names) if name == each] for each in ("wobble", "front end")]
-    if len(places[0]) != len(places[1]):
-        return order
-    speed = [np.abs(values[order[place]]).min(initial=np.inf) for place in places]
-    if speed[1] < speed[0]:
-        order = order.copy()
-        order[places[0] + places[1]] = order[places[1] + places[0]]
-    return order
-
-
-_MARGIN = 1.5  # by how much more the modes would have to change if two of them changed places
 
 MotionAt = Callable[[Any, Any], Any] | State | SteadyMotion | None
 
@@ -110,7 +38,7 @@ class Eigenvalues(eqx.Module):
         axis but one, of unit length.
     - `condition` (m, n): of each eigenvalue, see `jaxkane.stability.linearize(...).eig`. Derivatives are NaN where it
         is above 1e6: two modes coalesce there, and have none.
-    - `modes`: names of the columns; `found["weave"]` gives those of a name. `states`: names of the vectors' entries.
+    - `modes`: names of the columns; `modes["weave"]` gives those of a name. `states`: names of the vectors' entries.
     - `parameter`: what the values are of, with its unit where that is known: the label of a plot's axis.
     """
 
@@ -180,13 +108,14 @@ def eigenvalues(
     **Raises:** `ValueError` as `linearize`, and where there is no default motion, or none of `values` has a steady one.
     Of a motion that is given, values without a steady one are NaN.
     """
-    values, at, states, groups = family_of(system, values, motion, states)
-    found, kept, clear = _along(system, values, at, states, groups)
-    if motion is None and is_concrete(found.values) and not np.isfinite(np.asarray(found.values)).any():
-        matrix(system, values[0], at, states)  # which says why
-    names, lost = names_of_modes(kept, groups, clear, modes)
-    roots = found.values if is_concrete(lost) else nan_where(lost, found.values.T, (system, values)).T
-    return Eigenvalues(values, roots, found.vectors, found.condition, names, kept, _parameter(system, at))
+    values, at, states, groups = motion_family(system, values, motion, states)
+    spectra, state_names, clear = _eigenvalues_along(system, values, at, states, groups)
+    if motion is None and is_concrete(spectra.values) and not np.isfinite(np.asarray(spectra.values)).any():
+        state_matrix(system, values[0], at, states)  # which says why
+    names, unnamed = names_of_modes(state_names, groups, clear, modes)
+    roots = spectra.values if is_concrete(unnamed) else nan_where(unnamed, spectra.values.T, (system, values)).T
+    label = _parameter(system, at)
+    return Eigenvalues(values, roots, spectra.vectors, spectra.condition, names, state_names, label)
 
 
 def names_of_modes(
@@ -194,11 +123,11 @@ def names_of_modes(
 ) -> tuple[tuple[str, ...], Any]:
     """Names of the columns, and those of them (n,) that must be NaN: under a trace, where its name is not clear."""
     names = as_names(modes) if modes is not None else None if groups is None else mode_names(states, groups)
-    others = [OTHER.format(i + 1) for i in range(len(states))]
+    numbered = [f"mode {i + 1}" for i in range(len(states))]
     if names is not None and len(names) != len(states):
         raise ValueError(f"eigenvalues: {len(states)} modes, but {len(names)} names: {', '.join(names)}.")
     if modes is not None or names is None:
-        return names or tuple(others), np.zeros(len(states), bool)
+        return names or tuple(numbered), np.zeros(len(states), bool)
     if not is_concrete(clear):
         return names, ~clear
     doubtful = dict.fromkeys(name for name, c in zip(names, clear, strict=True) if not c)
@@ -209,11 +138,11 @@ def names_of_modes(
             UserWarning,
             stacklevel=3,
         )
-    named = (k if c else other for k, c, other in zip(names, clear, others, strict=True))
-    return tuple(named), np.zeros(len(states), bool)
+    recognized = (k if c else number for k, c, number in zip(names, clear, numbered, strict=True))
+    return tuple(recognized), np.zeros(len(states), bool)
 
 
-def family_of(system: System, values: Any, motion: MotionAt, states: Sequence[str] | None):
+def motion_family(system: System, values: Any, motion: MotionAt, states: Sequence[str] | None):
     """Values, (system, value) -> motion, states, and the groups of states whose modes have names; None: none has."""
     is_straight = False
     check_is_system(system)
@@ -230,8 +159,7 @@ def family_of(system: System, values: Any, motion: MotionAt, states: Sequence[st
     if not callable(motion):
         if values is not None:
             raise ValueError("One motion has no values of a parameter: leave `values` out, or give a function.")
-        fixed, values = motion, jnp.zeros(1)
-        motion = _Fixed(fixed)
+        motion, values = _OneMotion(motion), jnp.zeros(1)
     if values is None:
         raise ValueError("Give the values of the parameter, e.g. speeds jnp.linspace(0.0, 10.0, 201).")
     if not is_numeric(values):
@@ -247,7 +175,7 @@ def _parameter(system: System, motion: Any) -> str:
     """What varies along a family, as a label: the name of the second argument of `motion`, and its unit."""
     if motion is straight_ahead:
         return "forward speed [m/s]"
-    names = [] if isinstance(motion, _Fixed) else list(inspect.signature(motion).parameters)
+    names = [] if isinstance(motion, _OneMotion) else list(inspect.signature(motion).parameters)
     if len(names) < 2:
         return "parameter"
     unit = unit_of(names[1], {k: info.unit for k, info in parameter_info(system).items()} | units_of(system))
@@ -261,14 +189,14 @@ class _Groups(dict):
         return hash(tuple(self.items()))
 
 
-class _Fixed(eqx.Module):
+class _OneMotion(eqx.Module):
     motion: Any
 
     def __call__(self, system, value):
         return self.motion
 
 
-def matrix(system: System, value: Any, motion: Any, states: tuple[str, ...] | None):
+def state_matrix(system: System, value: Any, motion: Any, states: tuple[str, ...] | None):
     """A (n, n) at one value of the parameter, and the names of its states."""
     at = motion(system, value)
     if isinstance(at, tuple):
@@ -278,92 +206,21 @@ def matrix(system: System, value: Any, motion: Any, states: tuple[str, ...] | No
 
 
 @jit
-def _along(system, values, motion, states, groups):
+def _eigenvalues_along(system, values, motion, states, groups):
     names: list[tuple[str, ...]] = []
 
     def one(value):
-        A, kept = matrix(system, value, motion, states)
-        names.append(kept)
+        A, state_names = state_matrix(system, value, motion, states)
+        names.append(state_names)
         return A
 
-    found = eig(jax.vmap(one)(values))
-    order, clear = followed(values, found, names[0], groups)
+    spectra = eig(jax.vmap(one)(values))
+    order, clear = track_modes(values, spectra, names[0], groups)
     rows = jnp.arange(len(values))[:, None]
-    picked = Eig(
-        found.values[rows, order],
-        found.vectors[rows, :, order].swapaxes(1, 2),
-        found.left[rows, :, order].swapaxes(1, 2),
-        found.condition[rows, order],
+    tracked = Eig(
+        spectra.values[rows, order],
+        spectra.vectors[rows, :, order].swapaxes(1, 2),
+        spectra.left[rows, :, order].swapaxes(1, 2),
+        spectra.condition[rows, order],
     )
-    return picked, names[0], clear
-
-
-def followed(values: Any, found: Eig, states: tuple[str, ...], groups: Groups | None):
-    """Columns (m, n) that follow each mode along `values` (m,), and whether (n,) the names that they have are clear."""
-    shapes = (found.values.shape, jnp.int32), (found.values.shape[-1:], jnp.bool_)
-    return jax.pure_callback(
-        lambda *numbers: _tracked(numbers, states, groups),
-        tuple(jax.ShapeDtypeStruct(*shape) for shape in shapes),
-        *jax.lax.stop_gradient((values, found.values, found.left, found.vectors)),
-        vmap_method="sequential",
-    )
-
-
-def _tracked(numbers: Any, states: tuple[str, ...], groups: Groups | None):
-    """Columns (m, n) that follow each mode, those with names in their order, and whether (n,) these are clear."""
-    at, values, left, right = map(np.asarray, numbers)
-    order, confused = track(at, values, right)
-    clear = np.ones(order.shape[1], bool)
-    rows = np.isfinite(values).all(axis=1)
-    if groups is not None and rows.any() and mode_names(states, groups) is not None:
-        followed = np.take_along_axis(values, order, axis=1)[rows]
-        shares = np.take_along_axis(participation(left, right), order[:, None, :], axis=2)[rows]
-        columns, clear = named_order(followed, shares, confused, states, groups)
-        order = order[:, columns]
-    return order.astype(np.int32), clear
-
-
-def track(at: Any, values: Any, vectors: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The order (m, n) in which each row's eigenvalues (m, n) and vectors (m, n, n) continue those of the row above, at
-    `at` (m,); and whether (n, n) the i-th and the j-th column could as well have changed places somewhere."""
-    at, values, vectors = map(np.asarray, (at, values, vectors))
-    m, n = values.shape
-    order = np.tile(np.arange(n), (m, 1))
-    if m:
-        order[0] = np.lexsort((-values[0].imag, -values[0].real))
-    confused = np.zeros((n, n), bool)
-    known: list[int] = []  # rows without NaN so far
-    for k in range(m):
-        if not np.all(np.isfinite(values[k])):
-            continue
-        if known:
-            i = known[-1]
-            last, X = values[i, order[i]], vectors[i][:, order[i]]
-            ahead = last
-            if len(known) > 1:  # along the line through the last two, where these are not much closer
-                j = known[-2]
-                far, step = at[k] - at[i], at[i] - at[j]
-                ahead = last + far / step * (last - values[j, order[j]]) if abs(far) <= 4 * abs(step) > 0 else last
-            size = 1e-12 + np.abs(values[k]).max()
-            near = np.abs(values[k][None, :] - ahead[:, None]) / size
-            alike = np.abs(X.conj().T @ vectors[k])
-            change = near + 0.1 * (1.0 - alike)
-            columns = linear_sum_assignment(change)[1]
-            change = change[:, columns]
-            kept = np.diag(change)
-            confused |= change + change.T < _MARGIN * (kept[:, None] + kept)
-            order[k] = _pairs_in_order(last, values[k], columns)
-        known.append(k)
-    return order, confused
-
-
-def _pairs_in_order(last: Any, values: Any, order: Any) -> np.ndarray:
-    """The same, where a pair becomes real, or real ones a pair: its upper one and the larger one are of one column."""
-    either = pairs(last) | pairs(values[order])
-    for i, j in zip(*np.nonzero(either), strict=True):
-        new = values[order[[i, j]]]
-        alike = [pairs(both).any() or not both.imag.any() for both in (last[[i, j]], new)]
-        above = [(x[0].imag, x[0].real) >= (x[1].imag, x[1].real) for x in (last[[i, j]], new)]
-        if all(alike) and above[0] != above[1]:
-            order[[i, j]] = order[[j, i]]
-    return order
+    return tracked, names[0], clear

@@ -1,4 +1,4 @@
-"""Linear models about steady motions, on the constraint manifold; other independent speeds."""
+"""Linear models about steady motions, on the constraint manifold; and systems with other independent speeds."""
 
 from __future__ import annotations
 
@@ -28,91 +28,15 @@ from .._scalarjit.nan import nan_where
 from .._system.parameters import parameters_in
 from .._system.system import NamedVector, State, System
 from ._eig import Eig, eig, eigvals
-from ._steady import SteadyMotion, check_dependent, check_state, cyclic_coordinates, inputs_by_name, is_wrong, jacobian
-
-
-class _Respeeded(System):
-    """A system read with its speeds in another order, other ones being independent."""
-
-    inner: System
-    independent: tuple[str, ...] = eqx.field(static=True)
-    dependent: tuple[str, ...] = eqx.field(static=True)
-
-    def _in_order(self, u: Any) -> NamedVector:
-        names = (*self.inner.speeds, *self.inner.dependent_speeds, *self.inner.auxiliary_speeds)
-        return NamedVector([u[name] for name in names], names)
-
-    def _of_inner(self, now: Any) -> Any:
-        """The same instant, with the accelerations in the order of the inner system's speeds."""
-        names = (*self.inner.speeds, *self.inner.dependent_speeds)
-        other = copy.copy(now)
-        other.u_dot = NamedVector([now.u_dot[name] for name in names], names)
-        return other
-
-    def q_dot(self, t, q, u):
-        return self.inner.q_dot(t, q, self._in_order(u))
-
-    def motion(self, t, q, u):
-        return self.inner.motion(t, q, self._in_order(u))
-
-    def loads(self, t, q, u, motion, inputs):
-        return self.inner.loads(t, q, self._in_order(u), motion, inputs)
-
-    def state_rates(self, t, q, u, x, motion, now):
-        return self.inner.state_rates(t, q, self._in_order(u), x, motion, self._of_inner(now))
-
-    def configuration_constraints(self, t, q):
-        return self.inner.configuration_constraints(t, q)
-
-    def implied_constraints(self, t, q):
-        return self.inner.implied_constraints(t, q)
-
-    def events(self, t, q, u):
-        return self.inner.events(t, q, self._in_order(u))
-
-
-for _name in ("coordinates", "auxiliary_speeds", "dependent_coordinates", "inputs", "states", "units", "check_inertia"):
-    setattr(_Respeeded, _name, property(lambda self, name=_name: getattr(self.inner, name)))
-setattr(_Respeeded, "speeds", property(lambda self: self.independent))  # noqa: B010
-setattr(_Respeeded, "dependent_speeds", property(lambda self: self.dependent))  # noqa: B010
-
-
-class _WithOutputs(_Respeeded):
-    def outputs(self, t, q, u, motion, now):
-        return self.inner.outputs(t, q, self._in_order(u), motion, self._of_inner(now))
-
-
-def with_speeds(system: System, speeds: Sequence[str]) -> System:
-    """The same system with other independent speeds, for motions in which its own do not determine the others.
-
-    A bicycle that pivots about its rear wheel's contact has a yaw rate although neither its rear wheel nor its roll
-    or steer turns: `with_speeds(bicycle, ("roll_rate", "yaw_rate", "steer_rate"))`.
-    `jaxkane.best_dependent_speeds` says which choice is well conditioned.
-
-    **Arguments:** `speeds`: names of as many speeds as there are independent ones, of the independent and the
-    dependent ones.
-
-    **Returns:** a system whose parameters are those of `.inner`, and all else is the system's.
-
-    **Raises:** `ValueError` for other names, or another number of them.
-    """
-    everything = (*system.speeds, *system.dependent_speeds)
-    speeds = as_names(speeds)
-    if len(set(speeds)) != len(system.speeds) or not set(speeds) <= set(everything) or len(speeds) != len(set(speeds)):
-        raise ValueError(
-            f"{type(system).__name__}: name {len(system.speeds)} different ones of {', '.join(everything)}; got "
-            f"{', '.join(speeds)}."
-        )
-    inner: Any = type(system)
-    base: Any = _WithOutputs if has_outputs(system) else _Respeeded
-    return _kind_of(inner, base)(system, speeds, tuple(name for name in everything if name not in speeds))
-
-
-@functools.lru_cache(maxsize=1000)
-def _kind_of(inner: Any, base: Any) -> Any:
-    """The class of such systems, under the name of the inner one for messages."""
-    return type(base)(inner.__name__, (base,), {"__doc__": inner.__doc__})
-
+from ._steady import (
+    SteadyMotion,
+    check_dependent,
+    check_steady,
+    cyclic_coordinates,
+    inputs_by_name,
+    is_not_steady,
+    jacobian,
+)
 
 Outputs = Sequence[str] | Mapping[str, Callable[..., Any]] | None
 
@@ -147,8 +71,8 @@ class LinearModel(eqx.Module):
         return eigvals(self.A)
 
     def __repr__(self) -> str:
-        rows = [("states", self.states), ("inputs", self.inputs), ("outputs", self.outputs)]
-        return "LinearModel(" + "; ".join(f"{what}: {', '.join(names) or 'none'}" for what, names in rows) + ")"
+        rows = [f"{kind}: {', '.join(getattr(self, kind)) or 'none'}" for kind in ("states", "inputs", "outputs")]
+        return f"LinearModel({'; '.join(rows)})"
 
 
 def linearize(
@@ -209,31 +133,32 @@ def linearize(
     dependent = system.dependent_coordinates if dependent is None else as_names(dependent)
     check_dependent(system, dependent, n_h)
     if is_concrete(*origin):
-        check_state(*origin, steady)
-    kept = _states(system, states, dependent)
-    rows = tuple(kept) if outputs is None else as_names(outputs)
+        check_steady(*origin, steady)
+    states = _state_names(system, states, dependent)
+    rows = states if outputs is None else as_names(outputs)
     functions = dict(outputs) if isinstance(outputs, Mapping) else {}
     own = output_names(system) if outputs is not None else ()
     known = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.states, *own)
     refuse_unknown(rows, (*known, *functions), f"{name}: outputs are functions, or by name; it has no output", "it has")
-    wrong = jnp.array(False) if is_concrete(*origin) else is_wrong(*origin, steady) | ~_is_allowed(system)
+    wrong = jnp.array(False)
+    if not is_concrete(*origin):
+        wrong = is_not_steady(*origin, steady) | ~_parameters_are_allowed(system)
     # Numbers in the place of NaN, which would spoil the gradients of callers who do not use it (0 * NaN).
     at = tuple(jnp.where(jnp.all(jnp.isfinite(y)), y, 0.1) for y in (t, q, u, x, w))
-    model, follows = _derivatives((system, *at), _Choice(dependent, kept, rows), functions)
+    model, follows = _derivatives((system, *at), _ModelNames(dependent, states, rows), functions)
     if is_concrete(*origin, model) and not (follows and all(np.isfinite(M).all() for M in model)):
-        raise ValueError(_why_not(origin, dependent, bool(follows)))
+        raise ValueError(_no_linear_model(origin, dependent, bool(follows)))
     A, B, C, D = nan_where(wrong | ~follows, model, origin)
-    return LinearModel(A, B, C, D, kept, tuple(system.inputs), rows)
+    return LinearModel(A, B, C, D, states, tuple(system.inputs), rows)
 
 
-def _is_allowed(system: System) -> Array:
+def _parameters_are_allowed(system: System) -> Array:
     """Whether each parameter is what it was declared to be, which an error tells where the numbers are known."""
     limited = [(value, info) for _, value, info in parameters_in(system) if info.is_limited]
     return jnp.all(jnp.stack([jnp.array(True), *(jnp.all(info.allows(value)) for value, info in limited)]))
 
 
-def _why_not(origin: Any, dependent: tuple[str, ...], follows: bool) -> str:
-    """Why there is no linear model, where its matrices are not finite or the dependent coordinates do not follow."""
+def _no_linear_model(origin: Any, dependent: tuple[str, ...], follows: bool) -> str:
     system, t, q, u, x, w = origin
     name = type(system).__name__
     if not follows:
@@ -247,7 +172,7 @@ def _why_not(origin: Any, dependent: tuple[str, ...], follows: bool) -> str:
     )
 
 
-def _states(system: System, states: Sequence[str] | None, dependent: tuple[str, ...]) -> tuple[str, ...]:
+def _state_names(system: System, states: Sequence[str] | None, dependent: tuple[str, ...]) -> tuple[str, ...]:
     free = tuple(c for c in system.coordinates if c not in dependent)
     if states is None:
         cyclic = cyclic_coordinates(system)
@@ -266,32 +191,30 @@ def _states(system: System, states: Sequence[str] | None, dependent: tuple[str, 
     return states
 
 
-class _Choice(eqx.Module):
-    """What a model is to hold, by names."""
-
+class _ModelNames(eqx.Module):
     dependent: tuple[str, ...] = eqx.field(static=True)
     states: tuple[str, ...] = eqx.field(static=True)
     outputs: tuple[str, ...] = eqx.field(static=True)
 
 
 @jit
-def _derivatives(at, choice: _Choice, functions: dict[str, Callable[..., Any]]):
+def _derivatives(at, model_names: _ModelNames, functions: dict[str, Callable[..., Any]]):
     q, w = at[2], at[5]
-    T = _tangents(*at[:3], choice)
-    x = jnp.zeros(len(choice.states), q.dtype)
+    T = _tangents(*at[:3], model_names)
+    x = jnp.zeros(len(model_names.states), q.dtype)
     # Two loops, so that who wants A alone does not pay for B.
-    A, C = jacobian(lambda x: _at_deviation(x, w, at, T, choice, functions), x)
-    B, D = jacobian(lambda w: _at_deviation(x, w, at, T, choice, functions), w)
+    A, C = jacobian(lambda x: _at_deviation(x, w, at, T, model_names, functions), x)
+    B, D = jacobian(lambda w: _at_deviation(x, w, at, T, model_names, functions), w)
     # Multiplied by more than that, a rounding error is as large as what it belongs to.
     follows = jnp.max(jnp.abs(jax.lax.stop_gradient(T)), initial=0.0) < 1 / SINGULAR_ROUNDING
     return (A, B, C, D), follows
 
 
-def _at_deviation(x, w, at, T, choice: _Choice, functions: dict[str, Callable[..., Any]]):
+def _at_deviation(x, w, at, T, model_names: _ModelNames, functions: dict[str, Callable[..., Any]]):
     """Rates of the states (n,) and the outputs (p,), where the states deviate by x (n,), at inputs w (m,)."""
     system, t, q, u, x1, _ = at
     names, speeds = system.coordinates, (*system.speeds, *system.dependent_speeds)
-    moved = dict(zip(choice.states, x, strict=True))
+    moved = dict(zip(model_names.states, x, strict=True))
     q = q + sum((moved[k] * T[:, i] for i, k in enumerate(names) if k in moved), jnp.zeros_like(q))
     u = jnp.stack([u[i] + moved[k] if k in moved else u[i] for i, k in enumerate(system.speeds)])
     x1 = [x1[i] + moved[k] if k in moved else x1[i] for i, k in enumerate(system.states)]
@@ -301,12 +224,12 @@ def _at_deviation(x, w, at, T, choice: _Choice, functions: dict[str, Callable[..
     all_names = (*names, *system.speeds, *system.states)
     x_dot = dict(zip(all_names, (*rate.q, *rate.u, *of_states), strict=True))
     known = dict(zip(all_names, (*q, *u, *x1), strict=True))
-    if not {*functions, *known, *system.dependent_speeds} >= {*choice.outputs}:
+    if not {*functions, *known, *system.dependent_speeds} >= {*model_names.outputs}:
         known |= outputs_at(system, t, q, u, values)
-    if functions or not known.keys() >= {*choice.outputs}:
+    if functions or not known.keys() >= {*model_names.outputs}:
         known |= zip(system.dependent_speeds, dependent_speeds(system, t, q, u), strict=True)
     y = []
-    for k in choice.outputs:
+    for k in model_names.outputs:
         if k in functions:
             value = functions[k](t, NamedVector(q, names), NamedVector([known[s] for s in speeds], speeds))
             if not is_one_number(value):
@@ -314,14 +237,14 @@ def _at_deviation(x, w, at, T, choice: _Choice, functions: dict[str, Callable[..
             y.append(jnp.asarray(value, q.dtype))
         else:
             y.append(known[k])
-    return tuple(jnp.stack(z) if z else jnp.zeros(0, q.dtype) for z in ([x_dot[k] for k in choice.states], y))
+    return tuple(jnp.stack(z) if z else jnp.zeros(0, q.dtype) for z in ([x_dot[k] for k in model_names.states], y))
 
 
 @ScalarFunction
-def _tangents(system: System, t, q, choice: _Choice):
+def _tangents(system: System, t, q, model_names: _ModelNames):
     """T (n_q, n_q), column i: how all coordinates move when the i-th does; zero for dependent ones."""
     names = system.coordinates
-    d = [names.index(k) for k in choice.dependent]
+    d = [names.index(k) for k in model_names.dependent]
     T = [[float(i == j and i not in d) for j in range(len(names))] for i in range(len(names))]
     if d:
         _, along = jax.linearize(lambda q: as_vector(tuple(system.configuration_constraints(t, [*q])), q), q)
@@ -332,3 +255,86 @@ def _tangents(system: System, t, q, choice: _Choice):
             for i, x in zip(d, move, strict=True):
                 T[i][j] = x
     return stack(T).astype(q.dtype)
+
+
+class _WithSpeeds(System):
+    """A system with other independent speeds."""
+
+    inner: System
+    independent: tuple[str, ...] = eqx.field(static=True)
+    dependent: tuple[str, ...] = eqx.field(static=True)
+
+    def _in_order(self, u: Any) -> NamedVector:
+        names = (*self.inner.speeds, *self.inner.dependent_speeds, *self.inner.auxiliary_speeds)
+        return NamedVector([u[name] for name in names], names)
+
+    def _of_inner(self, now: Any) -> Any:
+        """`now` with the accelerations in the order of the inner system's speeds."""
+        names = (*self.inner.speeds, *self.inner.dependent_speeds)
+        now, u_dot = copy.copy(now), now.u_dot
+        now.u_dot = NamedVector([u_dot[name] for name in names], names)
+        return now
+
+    def q_dot(self, t, q, u):
+        return self.inner.q_dot(t, q, self._in_order(u))
+
+    def motion(self, t, q, u):
+        return self.inner.motion(t, q, self._in_order(u))
+
+    def loads(self, t, q, u, motion, inputs):
+        return self.inner.loads(t, q, self._in_order(u), motion, inputs)
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return self.inner.state_rates(t, q, self._in_order(u), x, motion, self._of_inner(now))
+
+    def configuration_constraints(self, t, q):
+        return self.inner.configuration_constraints(t, q)
+
+    def implied_constraints(self, t, q):
+        return self.inner.implied_constraints(t, q)
+
+    def events(self, t, q, u):
+        return self.inner.events(t, q, self._in_order(u))
+
+
+for _name in ("coordinates", "auxiliary_speeds", "dependent_coordinates", "inputs", "states", "units", "check_inertia"):
+    setattr(_WithSpeeds, _name, property(lambda self, name=_name: getattr(self.inner, name)))
+setattr(_WithSpeeds, "speeds", property(lambda self: self.independent))  # noqa: B010
+setattr(_WithSpeeds, "dependent_speeds", property(lambda self: self.dependent))  # noqa: B010
+
+
+class _WithSpeedsAndOutputs(_WithSpeeds):
+    def outputs(self, t, q, u, motion, now):
+        return self.inner.outputs(t, q, self._in_order(u), motion, self._of_inner(now))
+
+
+def with_speeds(system: System, speeds: Sequence[str]) -> System:
+    """The same system with other independent speeds, for motions in which its own do not determine the others.
+
+    A bicycle that pivots about its rear wheel's contact has a yaw rate although neither its rear wheel nor its roll
+    or steer turns: `with_speeds(bicycle, ("roll_rate", "yaw_rate", "steer_rate"))`.
+    `jaxkane.best_dependent_speeds` says which choice is well conditioned.
+
+    **Arguments:** `speeds`: names of as many speeds as there are independent ones, of the independent and the
+    dependent ones.
+
+    **Returns:** a system whose parameters are those of `.inner`, and all else is the system's.
+
+    **Raises:** `ValueError` for other names, or another number of them.
+    """
+    everything = (*system.speeds, *system.dependent_speeds)
+    speeds = as_names(speeds)
+    if len(set(speeds)) != len(system.speeds) or not set(speeds) <= set(everything) or len(speeds) != len(set(speeds)):
+        raise ValueError(
+            f"{type(system).__name__}: name {len(system.speeds)} different ones of {', '.join(everything)}; got "
+            f"{', '.join(speeds)}."
+        )
+    inner: Any = type(system)
+    base: Any = _WithSpeedsAndOutputs if has_outputs(system) else _WithSpeeds
+    return _class_with(inner, base)(system, speeds, tuple(name for name in everything if name not in speeds))
+
+
+@functools.lru_cache(maxsize=1000)
+def _class_with(inner: Any, base: Any) -> Any:
+    """A subclass under the name of the inner class, for messages."""
+    return type(base)(inner.__name__, (base,), {"__doc__": inner.__doc__})

@@ -1,4 +1,4 @@
-"""Equilibria and steady motions: cyclic coordinates, roots, and whether a motion is steady."""
+"""Equilibria and steady motions: their equations and how these are solved, cyclic coordinates, checks of a motion."""
 
 from __future__ import annotations
 
@@ -18,73 +18,13 @@ from .._kane.checks import check_system
 from .._kane.constraints import configuration_residual
 from .._kane.equations import dependent_speeds, diagnosis
 from .._kane.rhs import rates, values_of
-from .._kane.rhs import rates as rates_of
 from .._scalarjit.cache_key import Cache, jit, version_of
 from .._scalarjit.compat import concretely
 from .._scalarjit.components import Component
 from .._scalarjit.nan import nan_where
 from .._system.system import State, System, names_of
 
-
-def jacobian(f: Callable[[Array], Any], x: Array) -> Any:
-    """df/dx (m, n) at x (n,), one column after the other."""
-    columns = jax.lax.map(lambda dx: jax.jvp(f, (x,), (dx,))[1], jnp.eye(x.shape[0], dtype=x.dtype))
-    return jax.tree.map(lambda y: jnp.moveaxis(y, 0, -1), columns)
-
-
-@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def root(residual: Callable[[Array, Any], Array], guess: Array, args: Any) -> Array:
-    """z (n,) with residual(z, args) = 0 (m >= n equations), by Levenberg and Marquardt's method from `guess`.
-
-    Differentiable in `args`, any number of times, both modes:  dz = -F_z^+ F_args dargs. A solution is not promised:
-    look at the residual and at the rank of its derivative.
-    """
-    return _levenberg_marquardt(lambda z: residual(z, args), guess)
-
-
-@root.defjvp
-def _root_jvp(residual, primals, tangents):
-    guess, args = primals
-    z = root(residual, guess, args)
-    _, dF = jax.jvp(lambda args: residual(z, args), (args,), (tangents[1],))
-    J = jacobian(lambda z: residual(z, args), z)
-    J = jnp.where(jnp.all(jnp.isfinite(J)), J, 0.0)  # what was not found has no slope, and says so elsewhere
-    return z, -jnp.linalg.pinv(J) @ dF
-
-
-def _levenberg_marquardt(F: Callable[[Array], Array], z: Array, max_steps: int = 80) -> Array:
-    # Steps are kept while the residual falls; the damping vanishes near a solution, where this is Gauss and Newton's.
-    eps = float(jnp.finfo(z.dtype).eps)
-
-    def cost(r):
-        return jnp.where(jnp.all(jnp.isfinite(r)), jnp.sum(r**2), jnp.inf)
-
-    def step(carry):
-        z, r, damping, small, k = carry
-        J = jacobian(F, z)
-        safe = jnp.all(jnp.isfinite(J))
-        J = jnp.where(safe, J, 0.0)
-        size = jnp.linalg.norm(J, axis=0)
-        size = jnp.where(size > 0, size, 1.0)  # of columns, so that units do not matter
-        U, s, Vt = jnp.linalg.svd(J / size[None, :], full_matrices=False)
-        filtered = jnp.where(s > 1e3 * eps * s[0], s / (s**2 + damping), 0.0)
-        dz = -(Vt.T @ (filtered * (U.T @ r))) / size
-        trial = F(z + dz)
-        better = cost(trial) < cost(r)
-        tiny = jnp.all(jnp.abs(dz) <= 4 * eps * (1 + jnp.abs(z)))
-        z, r = jnp.where(better, z + dz, z), jnp.where(better, trial, r)
-        small = jnp.where(tiny | ~safe | (~better & (damping < 1e-13)) | (damping > 1e8), 1, 0)
-        damping = jnp.where(better, damping * jnp.where(damping < 1e-6, 0.0, 0.03), 10 * jnp.maximum(damping, 1e-14))
-        return z, r, damping, small, k + 1
-
-    def going(carry):
-        return (carry[3] == 0) & (carry[4] < max_steps)
-
-    r = F(z)
-    start = (z, r, jnp.asarray(1e-2, z.dtype), jnp.zeros((), int), jnp.zeros((), int))
-    return jax.lax.while_loop(going, step, start)[0]
-
-
+_MAX_STEPS = 80  # of the Levenberg-Marquardt method
 _CYCLIC = Cache()  # names, by structure
 _TRIALS = 3  # at which the rates are finite
 _MOST_TRIALS = 12
@@ -92,161 +32,7 @@ _SHIFTS = (0.3, -7.0, 150.0)  # of a coordinate [rad, m]: what begins far away c
 _INPUTS = (1.0, 30.0, 1000.0)  # sizes of trial inputs
 
 
-def cyclic_coordinates(system: System) -> tuple[str, ...]:
-    """Names of the cyclic (ignorable) coordinates: those that may be shifted without a change of any other rate.
-
-    Neither the accelerations, nor the configuration constraints, nor the rates of the other coordinates depend on
-    them: a bicycle's wheel angles, yaw and place. They may grow in a steady motion, in which the others stand still.
-
-    Found by shifting each coordinate at trial states, times, inputs and parameters, once for each class and shape of
-    the parameters: a dependence that vanishes for special parameters (a spring of zero stiffness), or as long as an
-    input is zero (a force that follows a steer angle), counts as one.
-
-    **Raises:** `ValueError` where no trial has finite accelerations.
-    """
-    check_is_system(system)
-    leaves, treedef = jax.tree.flatten(system)
-    shapes = tuple((jnp.shape(x), str(jnp.result_type(x))) for x in leaves)
-    key = (type(system), str(treedef), shapes, version_of(system))
-    with concretely():
-        return _CYCLIC.get(key, lambda: _search(system, leaves, treedef))
-
-
-def _search(system: System, leaves: list, treedef) -> tuple[str, ...]:
-    names, n_q = system.coordinates, len(system.coordinates)
-    rng = np.random.default_rng(0)
-    dtype = jnp.result_type(*leaves) if leaves else jnp.zeros(()).dtype
-    as_floats = lambda x: jnp.asarray(x, dtype)  # noqa: E731
-
-    @jax.jit
-    def rates(trial, t, q, u, w):
-        moves = rates_of(trial, t, q, u, w)
-        others = [moves.u, configuration_residual(trial, t, q)]
-        return moves.q, jnp.concatenate(others if moves.x is None else [*others, moves.x])
-
-    notices = np.zeros((n_q + 1, n_q), bool)  # row: a rate, the last those of the speeds and the constraints
-    compared = 0
-    for k in range(_MOST_TRIALS):
-        # Parameters are about one; where these cannot be, those of the system itself.
-        trial = jax.tree.unflatten(treedef, [jnp.asarray(rng.uniform(0.5, 1.5, x.shape), x.dtype) for x in leaves])
-        if k >= _MOST_TRIALS // 2 and is_concrete(leaves):
-            trial = system
-        q, u = rng.uniform(-0.4, 0.4, n_q), rng.uniform(-1.0, 1.0, len(system.speeds))
-        size = _INPUTS[compared % len(_INPUTS)]
-        w = {
-            name: as_floats(size * rng.choice([-1, 1]) * rng.uniform(0.5, 1.5))
-            for name in (*system.inputs, *system.states)
-        }
-        t, u = as_floats(rng.uniform(0.0, 2.0)), as_floats(u)
-        at = lambda q, trial=trial, t=t, u=u, w=w: tuple(map(np.asarray, rates(trial, t, as_floats(q), u, w)))  # noqa: E731
-        here = at(q)
-        if not all(np.all(np.isfinite(x)) for x in here):
-            continue
-        for i in range(n_q):
-            for shift in _SHIFTS:
-                notices[:, i] |= _noticed(here, at(q + shift * np.eye(n_q)[i]), 1 + abs(shift))
-        compared += 1
-        if compared == _TRIALS:
-            break
-    if not compared:
-        raise ValueError(
-            f"{type(system).__name__}: which coordinates are cyclic cannot be found: at none of {_MOST_TRIALS} trial "
-            "states, with parameters of about one and with its own, are its accelerations finite."
-        )
-    kept = notices[-1].copy()  # not cyclic: the accelerations depend on them,
-    while (more := kept | notices[:-1][kept].any(axis=0)).sum() > kept.sum():
-        kept = more  # or the rate of one that is not cyclic does
-    return tuple(name for name, k in zip(names, kept, strict=True) if not k)
-
-
-def _noticed(here: tuple[np.ndarray, ...], there: tuple[np.ndarray, ...], rounding: float) -> np.ndarray:
-    """Which rates of the coordinates, and last whether any of the others, differ beyond rounding."""
-    eps = float(np.finfo(here[0].dtype).eps)
-    rows = []
-    for a, b in (*zip(here[0], there[0], strict=True), (here[1], there[1])):
-        a, b = np.atleast_1d(a), np.atleast_1d(b)
-        size = rounding * (1.0 + np.abs(a).max(initial=0.0))
-        # What is not finite after a shift of a cyclic coordinate was not finite before.
-        rows.append(not np.all(np.abs(b - a) <= eps**0.6 * size))
-    return np.array(rows)
-
-
-def inputs_by_name(system: System, w) -> dict[str, Any]:
-    return {k: w[i] for i, k in enumerate(system.inputs)}
-
-
-@jit
-def _rates(system, t, q, u, x, w):
-    rate = rates(system, t, q, u, values_of(system, x, inputs_by_name(system, w)))
-    return rate.q, rate.u, x if rate.x is None else rate.x, configuration_residual(system, t, q)
-
-
-def _tolerances(system: System, u) -> tuple[float, Any]:
-    """How far coordinates may be off the constraints, and rates from zero."""
-    tol = float(jnp.finfo(u.dtype).eps) ** 0.4
-    return tol, tol * (1.0 + jnp.max(jnp.abs(u), initial=0.0))
-
-
-def _still(system: System) -> np.ndarray:
-    """Places of the coordinates that stand still in a steady motion."""
-    cyclic = cyclic_coordinates(system)
-    return np.array([i for i, k in enumerate(system.coordinates) if k not in cyclic], int)
-
-
-def check_dependent(system: System, dependent: Sequence[str], n_h: int) -> None:
-    """**Raises:** `ValueError` where not as many coordinates are named as `n_h` configuration constraints determine."""
-    name = type(system).__name__
-    refuse_unknown(dependent, system.coordinates, f"{name}: `dependent` names coordinates; it has no", "it has")
-    if len(set(dependent)) != n_h:
-        raise ValueError(
-            f"{name}: {n_h} configuration constraints determine as many coordinates, but "
-            f"{len(set(dependent))} are named ({', '.join(dependent) or 'none'}). Give linearize(..., dependent=(...)) "
-            f"{n_h} of {', '.join(system.coordinates)}."
-        )
-
-
-def is_wrong(system: System, t, q, u, x, w, steady: bool):
-    """Whether a state is off the constraints, not finite or, where that is asked, not steady."""
-    q_dot, u_dot, x_dot, h = _rates(system, t, q, u, x, w)
-    tol, slack = _tolerances(system, u)
-    moving = jnp.concatenate([u_dot, q_dot[_still(system)], x_dot]) if steady else jnp.zeros(0, q.dtype)
-    fine = jnp.all(jnp.abs(h) <= tol) & jnp.all(jnp.abs(moving) <= slack)
-    return jax.lax.stop_gradient(~(fine & jnp.all(jnp.isfinite(jnp.concatenate([q, u, x, w, t[None]])))))
-
-
-def check_state(system: System, t, q, u, x, w, steady: bool) -> None:
-    name = type(system).__name__
-    q_dot, u_dot, x_dot, h = map(np.asarray, _rates(system, t, q, u, x, w))
-    tol, slack = _tolerances(system, u)
-    named = (
-        (system.coordinates, q),
-        (system.speeds, u),
-        (system.states, x),
-        (system.inputs, w),
-        (("t",), t[None]),
-    )
-    bad = [k for names, y in named for k, value in zip(names, np.asarray(y), strict=True) if not np.isfinite(value)]
-    if bad:
-        raise ValueError(f"{name}: {', '.join(bad)} is not finite: there is no linear model there.")
-    if h.size and not np.abs(h).max() <= tol:
-        raise ValueError(f"{name}: the coordinates violate the configuration constraints by {h}. Use assemble.")
-    if not np.all(np.isfinite(np.concatenate([q_dot, u_dot]))):
-        wrong = diagnosis(system, t, q, u, values_of(system, x, inputs_by_name(system, w)))
-        raise ValueError(wrong or f"{name}: rates are not finite there: there is no linear model.")
-    if not steady:
-        return
-    found = {f"{k} is accelerated by": y for k, y in zip(system.speeds, u_dot, strict=True)}
-    found |= {f"{system.coordinates[i]} changes with": q_dot[i] for i in _still(system)}
-    found |= {f"{k} changes with": y for k, y in zip(system.states, x_dot, strict=True)}
-    moving = [f"{k} {float(x):.3g}" for k, x in found.items() if not abs(x) <= float(slack)]
-    if moving:
-        raise ValueError(
-            f"{name}: this motion is not steady: {', '.join(moving)}. Find one with equilibrium or steady_turn; or ask "
-            "for the linear model of an instant with linearize(..., steady=False)."
-        )
-
-
-Held = Sequence[str] | Mapping[str, Any]
+Hold = Sequence[str] | Mapping[str, Any]
 
 
 class SteadyMotion(eqx.Module):
@@ -280,7 +66,7 @@ def equilibrium(
     q: Any = None,
     inputs: Mapping[str, Component] | None = None,
     *,
-    hold: Held = (),
+    hold: Hold = (),
     find: Sequence[str] = (),
     t: Component = 0.0,
 ) -> SteadyMotion:
@@ -292,10 +78,9 @@ def equilibrium(
 
     **Raises:** `ValueError` as `steady_turn`.
     """
-    held = hold if isinstance(hold, Mapping) else dict.fromkeys(as_names(hold))
+    hold = hold if isinstance(hold, Mapping) else dict.fromkeys(as_names(hold))
     check_is_system(system)
-    at_rest = dict.fromkeys(system.speeds, 0.0)
-    return steady_turn(system, q, None, inputs, hold={**at_rest, **held}, find=find, t=t)
+    return steady_turn(system, q, None, inputs, hold={**dict.fromkeys(system.speeds, 0.0), **hold}, find=find, t=t)
 
 
 def steady_turn(
@@ -304,7 +89,7 @@ def steady_turn(
     u: Any = None,
     inputs: Mapping[str, Component] | None = None,
     *,
-    hold: Held = (),
+    hold: Hold = (),
     find: Sequence[str] = (),
     t: Component = 0.0,
 ) -> SteadyMotion:
@@ -317,7 +102,7 @@ def steady_turn(
     **Arguments:**
 
     - `q` (n_q,), `u` (n_u,): an initial guess, or dicts by name in which what is left out is zero.
-    - `inputs`: numbers by name; those left out are zero. States of the first order may be given here: an
+    - `inputs`: numbers by name; those left out are zero. States of the first order may be given too, as an
         initial guess.
     - `hold`: what is to have a given value: names of coordinates and speeds (dependent ones too), kept at the guess;
         or a dict of names and values. Steady motions come in families; hold as many quantities as the family has
@@ -344,7 +129,7 @@ def steady_turn(
     unknown = sorted(set(find) - set(system.inputs))
     if unknown:
         raise ValueError(f"{name} has no input {', '.join(unknown)} to find; {hint(unknown, system.inputs, 'it has')}")
-    problem = Problem(system, (*find, *system.states), tuple(values))
+    equations = SteadyEquations(system, (*find, *system.states), tuple(values))
     for k, x in values.items():
         if x is not None and k in system.coordinates:
             q = q.at[system.coordinates.index(k)].set(jnp.asarray(x, q.dtype))
@@ -353,17 +138,17 @@ def steady_turn(
     check_time(name, t)
     t = jnp.asarray(t, q.dtype)
     check_system(system, t, q)
-    guess = problem.unknowns(q, u, known)
-    kept = [(k, values[k]) for k in problem.held]  # a cyclic coordinate stays where it is by itself
-    held = [problem.quantity(system, t, q, u, k) if x is None else x for k, x in kept]
-    held = jnp.stack([jnp.asarray(x, q.dtype) for x in held]) if held else jnp.zeros(0, q.dtype)
-    motion, slopes, J = _solve(problem, guess, (system, t, q, known, held))
+    guess = equations.unknowns(q, u, known)
+    targets = [(k, values[k]) for k in equations.hold]  # a cyclic coordinate stays where it is by itself
+    targets = [equations.quantity(system, t, q, u, k) if x is None else x for k, x in targets]
+    targets = jnp.stack([jnp.asarray(x, q.dtype) for x in targets]) if targets else jnp.zeros(0, q.dtype)
+    motion, slopes, J = _solve(equations, guess, (system, t, q, known, targets))
     if is_concrete(motion.q) and not bool(jnp.all(jnp.isfinite(motion.q))):
-        raise ValueError(_why_not(name, problem, motion, np.asarray(slopes), np.asarray(J)))
+        raise ValueError(_no_steady_motion(name, equations, float(motion.residual), np.asarray(slopes), np.asarray(J)))
     return motion
 
 
-class Problem(eqx.Module):
+class SteadyEquations(eqx.Module):
     """Which unknowns z = (non-cyclic q, u, inputs to find, states) a steady motion has, and its equations F(z) = 0.
 
     `inputs` are those and the states by name, as `loads` reads them.
@@ -371,17 +156,17 @@ class Problem(eqx.Module):
 
     names: tuple[str, ...] = eqx.field(static=True)
     places: tuple[int, ...] = eqx.field(static=True)  # of the coordinates that are not cyclic
-    found: tuple[str, ...] = eqx.field(static=True)
-    held: tuple[str, ...] = eqx.field(static=True)
+    find: tuple[str, ...] = eqx.field(static=True)
+    hold: tuple[str, ...] = eqx.field(static=True)
 
-    def __init__(self, system: System, found: tuple[str, ...], held: tuple[str, ...]):
+    def __init__(self, system: System, find: tuple[str, ...], hold: tuple[str, ...]):
         cyclic = cyclic_coordinates(system)
         self.places = tuple(i for i, c in enumerate(system.coordinates) if c not in cyclic)
-        self.names = (*(system.coordinates[i] for i in self.places), *system.speeds, *found)
-        self.found = found
-        self.held = tuple(k for k in held if k not in cyclic or k in system.speeds)
+        self.names = (*(system.coordinates[i] for i in self.places), *system.speeds, *find)
+        self.find = find
+        self.hold = tuple(k for k in hold if k not in cyclic or k in system.speeds)
         known = (*system.coordinates, *system.speeds, *system.dependent_speeds)
-        unknown = [k for k in held if k not in known]
+        unknown = [k for k in hold if k not in known]
         if unknown:
             raise ValueError(
                 f"{type(system).__name__} has no {', '.join(unknown)} to hold; {hint(unknown, known, 'it has')} Inputs "
@@ -389,22 +174,22 @@ class Problem(eqx.Module):
             )
 
     def unknowns(self, q, u, inputs) -> Array:
-        found = [jnp.reshape(inputs[k], (1,)) for k in self.found]
-        return jnp.concatenate([q[np.array(self.places, int)], u, *found])
+        trim = [jnp.reshape(inputs[k], (1,)) for k in self.find]
+        return jnp.concatenate([q[np.array(self.places, int)], u, *trim])
 
     def parts(self, z, q, inputs):
         """q, u and inputs of the unknowns z."""
-        n_s, n_f = len(self.places), len(self.found)
-        found = {k: z[len(z) - n_f + i] for i, k in enumerate(self.found)}
-        return q.at[np.array(self.places, int)].set(z[:n_s]), z[n_s : len(z) - n_f], {**inputs, **found}
+        n_s, n_f = len(self.places), len(self.find)
+        trim = {k: z[len(z) - n_f + i] for i, k in enumerate(self.find)}
+        return q.at[np.array(self.places, int)].set(z[:n_s]), z[n_s : len(z) - n_f], {**inputs, **trim}
 
     def residual(self, z, args) -> Array:
         """F (m,): accelerations, rates of the non-cyclic coordinates and of the states, constraints, what is held."""
-        system, t, q, inputs, held = args
+        system, t, q, inputs, targets = args
         q, u, inputs = self.parts(z, q, inputs)
         rate = rates(system, t, q, u, inputs)
-        free = [self.quantity(system, t, q, u, k) for k in self.held]
-        fixed = jnp.stack(free) - held if free else jnp.zeros(0, q.dtype)
+        holding = [self.quantity(system, t, q, u, k) for k in self.hold]
+        fixed = jnp.stack(holding) - targets if holding else jnp.zeros(0, q.dtype)
         of_states = [] if rate.x is None else [rate.x]
         still = [rate.u, rate.q[np.array(self.places, int)], *of_states]
         return jnp.concatenate([*still, configuration_residual(system, t, q), fixed])
@@ -419,16 +204,16 @@ class Problem(eqx.Module):
 
 
 @jit
-def _solve(problem: Problem, guess, args):
+def _solve(equations: SteadyEquations, guess, args):
     system, t, q, known, _ = args
-    z = root(problem.residual, guess, args)
-    r = jnp.max(jnp.abs(problem.residual(z, args)))
-    J = jacobian(lambda z: problem.residual(z, args), z)
+    z = levenberg_marquardt(equations.residual, guess, args)
+    r = jnp.max(jnp.abs(equations.residual(z, args)))
+    J = jacobian(lambda z: equations.residual(z, args), z)
     slopes = jnp.linalg.svd(J / jnp.maximum(jnp.linalg.norm(J, axis=0), 1e-300)[None, :], compute_uv=False)
     eps = float(jnp.finfo(z.dtype).eps)
     scale = 1.0 + jnp.max(jnp.abs(J)) * 1e-2
     good = (r <= eps**0.6 * scale) & (slopes[-1] > eps**0.6)
-    q, u, inputs = problem.parts(z, q, known)
+    q, u, inputs = equations.parts(z, q, known)
     return as_motion(system, t, q, u, inputs, r, ~good, (guess, args)), slopes, J
 
 
@@ -442,18 +227,224 @@ def as_motion(system, t, q, u, inputs, residual, missing=None, origin=()) -> Ste
     return SteadyMotion(q, u, u_dep, x, given, t, residual, names_of(system))
 
 
-def _why_not(name: str, problem: Problem, motion: SteadyMotion, slopes: np.ndarray, J: np.ndarray) -> str:
-    r = float(motion.residual)
+def _no_steady_motion(name: str, equations: SteadyEquations, r: float, slopes: np.ndarray, J: np.ndarray) -> str:
     if r < 1e-6 and np.all(np.isfinite(J)):
         free = int((slopes <= 1e-9).sum())
         _, _, Vt = np.linalg.svd(J)
         moves = np.abs(Vt[len(Vt) - max(free, 1) :]).max(axis=0)
-        which = ", ".join(k for k, x in zip(problem.names, moves, strict=True) if x > 1e-3)
+        which = ", ".join(k for k, x in zip(equations.names, moves, strict=True) if x > 1e-3)
         return (
             f"{name}: the steady motions here form a family of dimension {max(free, 1)}, along which {which} change. "
             f"Hold {max(free, 1)} more of them, e.g. hold=({which.split(', ')[0]!r},)."
         )
     return (
         f"{name}: no steady motion was found from this guess (the largest remaining acceleration, rate or constraint "
-        f"is {r:.3g}). Start nearer, or hold other quantities; held: {', '.join(problem.held) or 'none'}."
+        f"is {r:.3g}). Start nearer, or hold other quantities; held: {', '.join(equations.hold) or 'none'}."
     )
+
+
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def levenberg_marquardt(residual: Callable[[Array, Any], Array], z: Array, args: Any) -> Array:
+    """z (n,) with residual(z, args) = 0 (m >= n equations), by Levenberg and Marquardt's method from a guess.
+
+    Differentiable in `args`, any number of times, both modes:  dz = -F_z^+ F_args dargs. A solution is not promised:
+    look at the residual and at the rank of its derivative.
+    """
+    # Steps are kept while the residual falls; the damping vanishes near a solution, where this is Gauss and Newton's.
+    eps = float(jnp.finfo(z.dtype).eps)
+
+    def F(z):
+        return residual(z, args)
+
+    def cost(r):
+        return jnp.where(jnp.all(jnp.isfinite(r)), jnp.sum(r**2), jnp.inf)
+
+    def step(carry):
+        z, r, damping, small, k = carry
+        J = jacobian(F, z)
+        safe = jnp.all(jnp.isfinite(J))
+        J = jnp.where(safe, J, 0.0)
+        size = jnp.linalg.norm(J, axis=0)
+        size = jnp.where(size > 0, size, 1.0)  # of columns, so that units do not matter
+        U, s, Vt = jnp.linalg.svd(J / size[None, :], full_matrices=False)
+        filtered = jnp.where(s > 1e3 * eps * s[0], s / (s**2 + damping), 0.0)
+        dz = -(Vt.T @ (filtered * (U.T @ r))) / size
+        trial = F(z + dz)
+        better = cost(trial) < cost(r)
+        tiny = jnp.all(jnp.abs(dz) <= 4 * eps * (1 + jnp.abs(z)))
+        z, r = jnp.where(better, z + dz, z), jnp.where(better, trial, r)
+        small = jnp.where(tiny | ~safe | (~better & (damping < 1e-13)) | (damping > 1e8), 1, 0)
+        damping = jnp.where(better, damping * jnp.where(damping < 1e-6, 0.0, 0.03), 10 * jnp.maximum(damping, 1e-14))
+        return z, r, damping, small, k + 1
+
+    def going(carry):
+        return (carry[3] == 0) & (carry[4] < _MAX_STEPS)
+
+    r = F(z)
+    start = (z, r, jnp.asarray(1e-2, z.dtype), jnp.zeros((), int), jnp.zeros((), int))
+    return jax.lax.while_loop(going, step, start)[0]
+
+
+@levenberg_marquardt.defjvp
+def _levenberg_marquardt_jvp(residual, primals, tangents):
+    guess, args = primals
+    z = levenberg_marquardt(residual, guess, args)
+    _, dF = jax.jvp(lambda args: residual(z, args), (args,), (tangents[1],))
+    J = jacobian(lambda z: residual(z, args), z)
+    J = jnp.where(jnp.all(jnp.isfinite(J)), J, 0.0)  # without a solution there is no slope: NaN stands elsewhere
+    return z, -jnp.linalg.pinv(J) @ dF
+
+
+def jacobian(f: Callable[[Array], Any], x: Array) -> Any:
+    """df/dx (m, n) at x (n,), one column after the other."""
+    columns = jax.lax.map(lambda dx: jax.jvp(f, (x,), (dx,))[1], jnp.eye(x.shape[0], dtype=x.dtype))
+    return jax.tree.map(lambda y: jnp.moveaxis(y, 0, -1), columns)
+
+
+def cyclic_coordinates(system: System) -> tuple[str, ...]:
+    """Names of the cyclic (ignorable) coordinates: those that may be shifted without a change of any other rate.
+
+    Neither the accelerations, nor the configuration constraints, nor the rates of the other coordinates depend on
+    them: a bicycle's wheel angles, yaw and place. They may grow in a steady motion, in which the others stand still.
+
+    Found by shifting each coordinate at trial states, times, inputs and parameters, once for each class and shape of
+    the parameters: a dependence that vanishes for special parameters (a spring of zero stiffness), or as long as an
+    input is zero (a force that follows a steer angle), counts as one.
+
+    **Raises:** `ValueError` where no trial has finite accelerations.
+    """
+    check_is_system(system)
+    leaves, treedef = jax.tree.flatten(system)
+    shapes = tuple((jnp.shape(x), str(jnp.result_type(x))) for x in leaves)
+    key = (type(system), str(treedef), shapes, version_of(system))
+    with concretely():
+        return _CYCLIC.get(key, lambda: _search_cyclic(system, leaves, treedef))
+
+
+def _search_cyclic(system: System, leaves: list, treedef) -> tuple[str, ...]:
+    names, n_q = system.coordinates, len(system.coordinates)
+    rng = np.random.default_rng(0)
+    dtype = jnp.result_type(*leaves) if leaves else jnp.zeros(()).dtype
+    as_floats = lambda x: jnp.asarray(x, dtype)  # noqa: E731
+
+    @jax.jit
+    def all_rates(trial, t, q, u, w):
+        rate = rates(trial, t, q, u, w)
+        of_states = [] if rate.x is None else [rate.x]
+        return rate.q, jnp.concatenate([rate.u, configuration_residual(trial, t, q), *of_states])
+
+    depends = np.zeros((n_q + 1, n_q), bool)  # row: a rate, the last those of the speeds and the constraints
+    compared = 0
+    for k in range(_MOST_TRIALS):
+        # Parameters are about one; where these cannot be, those of the system itself.
+        trial = jax.tree.unflatten(treedef, [jnp.asarray(rng.uniform(0.5, 1.5, x.shape), x.dtype) for x in leaves])
+        if k >= _MOST_TRIALS // 2 and is_concrete(leaves):
+            trial = system
+        q, u = rng.uniform(-0.4, 0.4, n_q), rng.uniform(-1.0, 1.0, len(system.speeds))
+        size = _INPUTS[compared % len(_INPUTS)]
+        w = {
+            name: as_floats(size * rng.choice([-1, 1]) * rng.uniform(0.5, 1.5))
+            for name in (*system.inputs, *system.states)
+        }
+        t, u = as_floats(rng.uniform(0.0, 2.0)), as_floats(u)
+        at = lambda q, trial=trial, t=t, u=u, w=w: tuple(map(np.asarray, all_rates(trial, t, as_floats(q), u, w)))  # noqa: E731
+        before = at(q)
+        if not all(np.all(np.isfinite(x)) for x in before):
+            continue
+        for i in range(n_q):
+            for shift in _SHIFTS:
+                depends[:, i] |= _changed_rates(before, at(q + shift * np.eye(n_q)[i]), 1 + abs(shift))
+        compared += 1
+        if compared == _TRIALS:
+            break
+    if not compared:
+        raise ValueError(
+            f"{type(system).__name__}: which coordinates are cyclic cannot be found: at none of {_MOST_TRIALS} trial "
+            "states, with parameters of about one and with its own, are its accelerations finite."
+        )
+    non_cyclic = depends[-1].copy()  # the accelerations depend on them,
+    while (extended := non_cyclic | depends[:-1][non_cyclic].any(axis=0)).sum() > non_cyclic.sum():
+        non_cyclic = extended  # or the rate of one that is not cyclic does
+    return tuple(name for name, k in zip(names, non_cyclic, strict=True) if not k)
+
+
+def _changed_rates(before: tuple[np.ndarray, ...], after: tuple[np.ndarray, ...], rounding: float) -> np.ndarray:
+    """Which rates of the coordinates, and last whether any of the others, differ beyond rounding."""
+    eps = float(np.finfo(before[0].dtype).eps)
+    rows = []
+    for a, b in (*zip(before[0], after[0], strict=True), (before[1], after[1])):
+        a, b = np.atleast_1d(a), np.atleast_1d(b)
+        size = rounding * (1.0 + np.abs(a).max(initial=0.0))
+        # What is not finite after a shift of a cyclic coordinate was not finite before.
+        rows.append(not np.all(np.abs(b - a) <= eps**0.6 * size))
+    return np.array(rows)
+
+
+def inputs_by_name(system: System, w) -> dict[str, Any]:
+    return {k: w[i] for i, k in enumerate(system.inputs)}
+
+
+@jit
+def _all_rates(system, t, q, u, x, w):
+    rate = rates(system, t, q, u, values_of(system, x, inputs_by_name(system, w)))
+    return rate.q, rate.u, x if rate.x is None else rate.x, configuration_residual(system, t, q)
+
+
+def _tolerances(system: System, u) -> tuple[float, Any]:
+    """How far coordinates may be off the constraints, and rates from zero."""
+    tol = float(jnp.finfo(u.dtype).eps) ** 0.4
+    return tol, tol * (1.0 + jnp.max(jnp.abs(u), initial=0.0))
+
+
+def _non_cyclic(system: System) -> np.ndarray:
+    """Places of the coordinates that stand still in a steady motion."""
+    cyclic = cyclic_coordinates(system)
+    return np.array([i for i, k in enumerate(system.coordinates) if k not in cyclic], int)
+
+
+def check_dependent(system: System, dependent: Sequence[str], n_h: int) -> None:
+    """**Raises:** `ValueError` where not as many coordinates are named as `n_h` configuration constraints determine."""
+    name = type(system).__name__
+    refuse_unknown(dependent, system.coordinates, f"{name}: `dependent` names coordinates; it has no", "it has")
+    if len(set(dependent)) != n_h:
+        raise ValueError(
+            f"{name}: {n_h} configuration constraints determine as many coordinates, but "
+            f"{len(set(dependent))} are named ({', '.join(dependent) or 'none'}). Give linearize(..., dependent=(...)) "
+            f"{n_h} of {', '.join(system.coordinates)}."
+        )
+
+
+def is_not_steady(system: System, t, q, u, x, w, steady: bool):
+    """Whether a state is off the constraints, not finite or, with `steady`, not steady."""
+    q_dot, u_dot, x_dot, h = _all_rates(system, t, q, u, x, w)
+    tol, slack = _tolerances(system, u)
+    moving = jnp.concatenate([u_dot, q_dot[_non_cyclic(system)], x_dot]) if steady else jnp.zeros(0, q.dtype)
+    fine = jnp.all(jnp.abs(h) <= tol) & jnp.all(jnp.abs(moving) <= slack)
+    return jax.lax.stop_gradient(~(fine & jnp.all(jnp.isfinite(jnp.concatenate([q, u, x, w, t[None]])))))
+
+
+def check_steady(system: System, t, q, u, x, w, steady: bool) -> None:
+    name = type(system).__name__
+    q_dot, u_dot, x_dot, h = map(np.asarray, _all_rates(system, t, q, u, x, w))
+    tol, slack = _tolerances(system, u)
+    names = (*system.coordinates, *system.speeds, *system.states, *system.inputs, "t")
+    values = np.concatenate([np.asarray(y) for y in (q, u, x, w, t[None])])
+    bad = [k for k, value in zip(names, values, strict=True) if not np.isfinite(value)]
+    if bad:
+        raise ValueError(f"{name}: {', '.join(bad)} is not finite: there is no linear model there.")
+    if h.size and not np.abs(h).max() <= tol:
+        raise ValueError(f"{name}: the coordinates violate the configuration constraints by {h}. Use assemble.")
+    if not np.all(np.isfinite(np.concatenate([q_dot, u_dot]))):
+        wrong = diagnosis(system, t, q, u, values_of(system, x, inputs_by_name(system, w)))
+        raise ValueError(wrong or f"{name}: rates are not finite there: there is no linear model.")
+    if not steady:
+        return
+    changes = {f"{k} is accelerated by": y for k, y in zip(system.speeds, u_dot, strict=True)}
+    changes |= {f"{system.coordinates[i]} changes with": q_dot[i] for i in _non_cyclic(system)}
+    changes |= {f"{k} changes with": y for k, y in zip(system.states, x_dot, strict=True)}
+    moving = [f"{k} {float(x):.3g}" for k, x in changes.items() if not abs(x) <= float(slack)]
+    if moving:
+        raise ValueError(
+            f"{name}: this motion is not steady: {', '.join(moving)}. Find one with equilibrium or steady_turn; or ask "
+            "for the linear model of an instant with linearize(..., steady=False)."
+        )

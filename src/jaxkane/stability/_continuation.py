@@ -1,4 +1,4 @@
-"""Families of steady motions, followed through their folds. Knows the equations of a steady motion."""
+"""Families of steady motions by pseudo-arclength continuation, through their folds."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from .._common.lookup import by_name, hint
 from .._integrate.trajectory import refuse_other_system
 from .._scalarjit.cache_key import jit
 from .._system.system import System, names_of
-from ._steady import Problem, SteadyMotion, as_motion, jacobian
+from ._steady import SteadyEquations, SteadyMotion, as_motion, jacobian
 
 
 class Family(eqx.Module):
     """Steady motions along a curve, by name: `turns["steer"]` (m,).
 
     Attributes: `q` (m, n_q), `u` (m, n_u), `u_dep` (m, k), `x` (m, n_x); `arclength` (m,), in the scaled unknowns;
-    `residual` (m,); `inputs` by name; `reason`: why the family ends here. `turns.motion(i)` is the i-th
+    `residual` (m,); `inputs` by name; `reason`: why the family ends there. `turns.motion(i)` is the i-th
     `SteadyMotion`.
     """
 
@@ -91,39 +91,39 @@ def family(
     refuse_other_system(label, system, start)
     q, t = start.q, jnp.asarray(start.t, start.q.dtype)
     inputs = {**start.inputs, **{name: start.x[i] for i, name in enumerate(system.states)}}
-    find = (*find, *system.states)
-    problem = Problem(system, find, tuple(hold))
-    stops = Problem(system, find, (*hold, *(until or {})))
-    values = [float(problem.quantity(system, t, q, start.u, k)) for k in hold]
-    n_s, n = len(problem.places), len(system.speeds)
-    scale = np.ones(len(problem.names))
-    scale[n_s : n_s + n] = max(1.0, float(jnp.abs(start.u).max(initial=0.0)))
-    limits = np.array(list((until or {}).values()), float)
+    find, until = (*find, *system.states), dict(until or {})
+    equations = SteadyEquations(system, find, tuple(hold))
+    with_limits = SteadyEquations(system, find, (*hold, *until))
+    values = [float(equations.quantity(system, t, q, start.u, k)) for k in hold]
+    n_s = len(equations.places)
+    scale = np.ones(len(equations.names))
+    scale[n_s : n_s + len(system.speeds)] = max(1.0, float(jnp.abs(start.u).max(initial=0.0)))
+    limits = np.array(list(until.values()), float)
 
     def evaluate(y):
-        held = jnp.asarray([*values, *limits * 0.0], q.dtype)
-        F, J = _residual_and_slope(stops, jnp.asarray(y * scale, q.dtype), (system, t, q, inputs, held))
+        fixed = jnp.asarray([*values, *limits * 0.0], q.dtype)
+        F, J = _residual_and_slope(with_limits, jnp.asarray(y * scale, q.dtype), (system, t, q, inputs, fixed))
         F, J = np.asarray(F), np.asarray(J) * scale
         m = len(F) - len(limits)
         return F[:m], J[:m], F[m:] - limits, J[m:]
 
-    curve = _Curve(evaluate)
-    y = np.asarray(problem.unknowns(q, start.u, inputs)) / scale
+    curve = _SolutionCurve(evaluate)
+    y = np.asarray(equations.unknowns(q, start.u, inputs)) / scale
     tangent = curve.tangent(y, None)
-    tangent = tangent * _side(problem, system, towards, tangent, curve, y)
+    tangent = tangent * _direction_sign(equations, system, towards, tangent, curve, y)
     max_step = 4 * step if max_step is None else max_step
-    found, arc, met = curve.follow(y, tangent, step, max_step, steps)
+    points, arc, met = curve.follow(y, tangent, step, max_step, steps)
     reason = f"{steps} steps"
     if met is not None:
-        name, value = list((until or {}).items())[met]
+        name, value = list(until.items())[met]
         reason = f"{name} = {value:g}"
-    elif len(found) <= steps:
+    elif len(points) <= steps:
         reason = "no further motion was found: equations or coordinates become singular"
-    return _as_family(problem, system, t, q, inputs, values, np.array(found) * scale, arc, reason)
+    return _as_family(equations, system, t, q, inputs, values, np.array(points) * scale, arc, reason)
 
 
-class _Curve:
-    """Newton's method on a curve F(y) = 0 of more equations than unknowns, and its tangents."""
+class _SolutionCurve:
+    """Newton's method on a curve F(y) = 0 of fewer equations than unknowns, and its tangents."""
 
     def __init__(self, evaluate: Any):
         self.evaluate = evaluate
@@ -135,7 +135,7 @@ class _Curve:
         _, s, Vt = np.linalg.svd(J)
         if before is None:
             return Vt[-1]
-        # Where another family crosses, two directions lead on: keep to the one that led here.
+        # Where another family crosses, two directions lead on: keep to the one on which the curve came.
         null = Vt[np.append(s, np.zeros(len(Vt) - len(s))) < 1e-7 * s[0]]
         null = Vt[-1:] if len(null) == 0 else null
         ahead = null.T @ (null @ before)
@@ -143,8 +143,8 @@ class _Curve:
 
     def follow(self, y, tangent, step: float, max_step: float, steps: int):
         """Points from y on, their arclengths, and which limit was met, or None."""
-        found, arc, h = [y], [0.0], step
-        while len(found) <= steps and h >= 1e-4 * step:
+        points, arc, h = [y], [0.0], step
+        while len(points) <= steps and h >= 1e-4 * step:
             attempt = self.correct(y + h * tangent, tangent)
             new = None if attempt is None else self.tangent(attempt[0], tangent)
             if attempt is None or new is None or new @ tangent < 0.9:
@@ -158,12 +158,12 @@ class _Curve:
                 continue
             if ends:
                 z, met = min(ends, key=lambda end: np.linalg.norm(end[0] - y))
-                return [*found, z], [*arc, arc[-1] + float(np.linalg.norm(z - y))], met
+                return [*points, z], [*arc, arc[-1] + float(np.linalg.norm(z - y))], met
             arc.append(arc[-1] + float(np.linalg.norm(z - y)))
             y, tangent = z, new
-            found.append(y)
+            points.append(y)
             h = min(max_step, 1.5 * h) if quick else h
-        return found, arc, None
+        return points, arc, None
 
     def _passed(self, y, z) -> list[int]:
         """The limits that lie between two points of the curve; one that stands at the first was met before."""
@@ -208,14 +208,14 @@ class _Curve:
 
 
 @jit
-def _residual_and_slope(problem: Problem, z, args):
-    return problem.residual(z, args), jacobian(lambda z: problem.residual(z, args), z)
+def _residual_and_slope(equations: SteadyEquations, z, args):
+    return equations.residual(z, args), jacobian(lambda z: equations.residual(z, args), z)
 
 
-def _side(problem: Problem, system: System, towards, tangent, curve: _Curve, y) -> float:
+def _direction_sign(equations: SteadyEquations, system: System, towards, tangent, curve: _SolutionCurve, y) -> float:
     (name, sign), *more = towards.items()
-    if more or name not in problem.names:
-        one_of = hint(name, problem.names, "it is one of")
+    if more or name not in equations.names:
+        one_of = hint(name, equations.names, "it is one of")
         raise ValueError(f"family: `towards` is one name with +1 or -1, got {dict(towards)}; {one_of}")
     J = curve.evaluate(y)[1]
     s = np.zeros(J.shape[1])  # with inputs to find there are fewer equations than unknowns
@@ -223,29 +223,28 @@ def _side(problem: Problem, system: System, towards, tangent, curve: _Curve, y) 
     if s[-1] > 1e-8 * s[0]:
         raise ValueError(
             f"{type(system).__name__}: the start does not stand on a curve of steady motions: too much is held "
-            f"({', '.join(problem.held) or 'nothing'})."
+            f"({', '.join(equations.hold) or 'nothing'})."
         )
     if s[-2] < 1e-10 * s[0]:
         raise ValueError(
             f"{type(system).__name__}: more than one curve of steady motions passes here. Hold more quantities, or "
             "start beside a bifurcation."
         )
-    return float(np.sign(sign * tangent[problem.names.index(name)]) or 1.0)
+    return float(np.sign(sign * tangent[equations.names.index(name)]) or 1.0)
 
 
-def _as_family(problem: Problem, system: System, t, q, inputs, values, zs, arc, reason) -> Family:
-    held = jnp.asarray(values, q.dtype)
+def _as_family(equations: SteadyEquations, system: System, t, q, inputs, values, zs, arc, reason) -> Family:
+    fixed = jnp.asarray(values, q.dtype)
 
     @jax.jit
     @jax.vmap
     def members(z):
-        args = (system, t, q, inputs, held)
-        r = jnp.max(jnp.abs(problem.residual(z, args)))
-        here = as_motion(system, t, *problem.parts(z, q, inputs), r)
-        found = {k: here.inputs[k] for k in problem.found if k in here.inputs}
-        return (here.q, here.u, here.u_dep, here.x), here.residual, found
+        args = (system, t, q, inputs, fixed)
+        r = jnp.max(jnp.abs(equations.residual(z, args)))
+        motion = as_motion(system, t, *equations.parts(z, q, inputs), r)
+        trim = {k: motion.inputs[k] for k in equations.find if k in motion.inputs}
+        return (motion.q, motion.u, motion.u_dep, motion.x), motion.residual, trim
 
-    parts, residual, found = members(jnp.asarray(zs, q.dtype))
-    inputs = {k: x for k, x in {**inputs, **found}.items() if k not in system.states}
-    q_all, u_all, u_dep, x = parts
-    return Family(q_all, u_all, u_dep, x, jnp.asarray(arc), residual, inputs, t, names_of(system), reason)
+    columns, residual, trim = members(jnp.asarray(zs, q.dtype))
+    inputs = {k: x for k, x in {**inputs, **trim}.items() if k not in system.states}
+    return Family(*columns, jnp.asarray(arc), residual, inputs, t, names_of(system), reason)
