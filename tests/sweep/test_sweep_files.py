@@ -142,17 +142,16 @@ class Bead(jk.System):  # on a ring, pushed
     def events(self, t, q, u):
         return {b: q[0] - 2.0 for b in {"left", "right"}}
 
-from jaxkane.sweep._fingerprint import traced
-from jaxkane.sweep._members import members_of
-from jaxkane.sweep._solve import Job
-from jaxkane.sweep._table import as_table
-from jaxkane._integrate.settings import settings_for, checked_times
+from jaxkane.sweep._chunks import Task, trace
+from jaxkane.sweep._members import as_table, members_of
+from jaxkane._integrate.settings import settings_for
+from jaxkane._integrate.simulate import checked_times
 ts = checked_times(np.linspace(0.0, 1.0, 3), float)
 def found(k):
     start, push = jk.State(np.array([0.0, 1.0]), np.ones(1)), {"push": lambda t, s: k * s["x"]}
     members, shared, n = members_of(Bead(), start, push, as_table({"x": np.array([0.1, 0.2])}), ts)
     own = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), members)
-    return traced(Job(shared, ts, settings_for(ts, step=0.1), None, None), own)[0]
+    return trace(Task(shared, ts, settings_for(ts, step=0.1), None, None), own)[0]
 first = found(1.0), digest({"a": np.ones(2), "b": {"c", "d", "e"}})
 """
     here: dict[str, Any] = {}

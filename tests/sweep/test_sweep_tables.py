@@ -205,7 +205,7 @@ def test_a_row_may_be_read_as_any_mapping(read):
 
 def test_a_row_that_is_unpacked_is_read():
     start = lambda system, row: jk.State(jnp.stack([dict(**row)["push"], row.get("other", 0.0)]), jnp.zeros(2))  # noqa: E731
-    table = jk.sweep._table.as_table({"push": [0.1, 0.2]})
+    table = jk.sweep._members.as_table({"push": [0.1, 0.2]})
     assert members_of(PENDULUM, start, None, table, jnp.asarray(TS))[2] == 2
 
 

@@ -1,4 +1,4 @@
-"""Chunks of a sweep as compiled programs, on devices here or on a Dask cluster's workers. Knows no mechanism."""
+"""Chunks of a sweep as compiled programs, on the devices of this process or on the workers of a Dask cluster."""
 
 from __future__ import annotations
 
@@ -29,21 +29,18 @@ from ._members import start_of, system_and_signals
 GROUP = 32
 
 
-class Part(eqx.Module):
-    """What comes back of some members: `values` are what `reduce` made of a ride, or its (q, u, u_dep,
-    x, inputs, outputs, end, discontinuities)."""
+class ChunkResult(eqx.Module):
+    """The results of some members, with a leading axis: `values` are what `reduce` made of a `Trajectory`, or it, but
+    for its times, and for what stands beside it here."""
 
     values: Any
     status: Any
     t_end: Any
     stats: dict[str, Any]
-    names: tuple[tuple[str, ...], ...] = eqx.field(static=True)
     events: tuple[str, ...] = eqx.field(static=True)
-    adjoint: str = eqx.field(static=True)
-    units: tuple[tuple[str, str], ...] = eqx.field(static=True)
 
 
-class Job(eqx.Module):
+class Task(eqx.Module):
     """What all members of a sweep have in common."""
 
     shared: Any
@@ -51,24 +48,24 @@ class Job(eqx.Module):
     settings: Settings
     reduce: Callable[[Trajectory], Any] | None
     mesh: Mesh | None = eqx.field(static=True)
-    closures: tuple[Any, ...] = ()  # what is traced, and read from outside by the functions among these
+    closures: tuple[Any, ...] = ()  # traced numbers that functions among these read by closures
 
-    def whole(self, own: Any) -> Part:
+    def simulate(self, own: Any) -> ChunkResult:
         """The motion of one member."""
-        return self.from_start(own, start_of(own, self.shared, self.ts[0]))
+        return self.simulate_from(own, start_of(own, self.shared, self.ts[0]))
 
-    def from_start(self, own: Any, start: State) -> Part:
+    def simulate_from(self, own: Any, start: State) -> ChunkResult:
         """The motion of one member from its first state."""
         system, signals = system_and_signals(own, self.shared)
         start = with_possible_bodies(system, self.ts[0], start)
-        ride = solve(system, start, self.ts, signals, self.settings, closures=self.closures)
+        motion = solve(system, start, self.ts, signals, self.settings, closures=self.closures)
         if self.reduce is None:
-            values = (ride.q, ride.u, ride.u_dep, ride.x, ride.inputs, ride.outputs, ride.end, ride.discontinuities)
+            values: Any = dataclasses.replace(motion, t=None, status=None, t_end=None, stats=None)
         else:
-            values = jax.tree.map(jnp.asarray, self.reduce(ride))
-        return Part(values, ride.status, ride.t_end, ride.stats, ride.names, ride.events, ride.adjoint, ride.units)
+            values = jax.tree.map(jnp.asarray, self.reduce(motion))
+        return ChunkResult(values, motion.status, motion.t_end, motion.stats, motion.events)
 
-    def solve(self, members: Any, size: int) -> Part:
+    def solve(self, members: Any, size: int) -> ChunkResult:
         """The motions of a chunk (n, ...), n at most `size`: one program serves every chunk of a size."""
         n = jax.tree.leaves(members)[0].shape[0]
         # Padded to whole groups on every device with copies of the last member.
@@ -76,8 +73,8 @@ class Job(eqx.Module):
         lanes = size if size <= GROUP and self.mesh is None else unit * -(-size // unit)
         places = np.minimum(np.arange(lanes), n - 1)
         members = jax.tree.map(lambda x: jnp.asarray(x if lanes == n else x[places]), members)
-        part = _solve(members, _starts(members, self), self)
-        return part if lanes == n else jax.tree.map(lambda x: x[:n], part)
+        result = _solve(members, _starts(members, self), self)
+        return result if lanes == n else jax.tree.map(lambda x: x[:n], result)
 
 
 def mesh_of(devices: Sequence[Any] | None) -> Mesh | None:
@@ -89,17 +86,17 @@ def mesh_of(devices: Sequence[Any] | None) -> Mesh | None:
 
 
 @jit
-def _starts(members: Any, job: Job) -> State:
+def _starts(members: Any, task: Task) -> State:
     # A program of its own: lineax, which Newton's method calls, cannot be traced within shard_map.
-    return jax.vmap(lambda own: start_of(own, job.shared, job.ts[0]))(members)
+    return jax.vmap(lambda own: start_of(own, task.shared, task.ts[0]))(members)
 
 
 @jit
-def _solve(members: Any, starts: State, job: Job) -> Part:
-    arrays, static = eqx.partition(job, eqx.is_array)
+def _solve(members: Any, starts: State, task: Task) -> ChunkResult:
+    arrays, static = eqx.partition(task, eqx.is_array)
 
     def on_one_device(members, starts, arrays):
-        one = eqx.combine(arrays, static).from_start
+        one = eqx.combine(arrays, static).simulate_from
         n = starts.q.shape[0]
         if jax.default_backend() != "cpu":
             return jax.vmap(one)(members, starts)
@@ -107,18 +104,18 @@ def _solve(members: Any, starts: State, job: Job) -> Part:
         groups = jax.tree.map(lambda x: x.reshape(n // group, group, *x.shape[1:]), (members, starts))
         return jax.tree.map(lambda x: x.reshape(n, *x.shape[2:]), jax.lax.map(lambda g: jax.vmap(one)(*g), groups))
 
-    if job.mesh is None:
+    if task.mesh is None:
         return on_one_device(members, starts, arrays)
     each, all_ = P("members"), P()
-    across = jax.shard_map(on_one_device, mesh=job.mesh, in_specs=(each, each, all_), out_specs=each, check_vma=False)
+    across = jax.shard_map(on_one_device, mesh=task.mesh, in_specs=(each, each, all_), out_specs=each, check_vma=False)
     return across(members, starts, arrays)
 
 
-def traced(job: Job, own: Any) -> tuple[str, Part]:
-    """The digest of the program for one member, `own` (shapes and types), and the shapes of what it gives."""
-    numbers, rest = eqx.partition(job, eqx.is_array)  # numbers that are arguments are recorded by name elsewhere
-    whole = lambda own, numbers: eqx.combine(numbers, rest).whole(own)  # noqa: E731
-    program, like = jax.make_jaxpr(whole, return_shape=True)(own, numbers)
+def trace(task: Task, own: Any) -> tuple[str, ChunkResult]:
+    """The digest of the program for one member, `own` (shapes and types), and the shapes of its result."""
+    numbers, rest = eqx.partition(task, eqx.is_array)  # numbers that are arguments are recorded by name elsewhere
+    simulate = lambda own, numbers: eqx.combine(numbers, rest).simulate(own)  # noqa: E731
+    program, like = jax.make_jaxpr(simulate, return_shape=True)(own, numbers)
     return digest_of(program), like
 
 
@@ -129,8 +126,8 @@ def digest_of(program: Any) -> str:
 
 def versions() -> dict[str, str]:
     """Of what traces and runs a program, by name."""
-    found = {name: version(name) for name in ("jaxkane", "jax", "jaxlib", "diffrax", "equinox")}
-    return found | {"python": ".".join(python_version_tuple()[:2])}
+    libraries = {name: version(name) for name in ("jaxkane", "jax", "jaxlib", "diffrax", "equinox")}
+    return libraries | {"python": ".".join(python_version_tuple()[:2])}
 
 
 _FLAGS = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_numpy_rank_promotion")
@@ -143,9 +140,9 @@ _ANOTHER = (
 
 
 def on_cluster(
-    job: Job, starts: list[int], members_at: Callable[[int], Any], size: int, client: Any
-) -> Iterator[tuple[int, Part]]:
-    """(start, part) of every chunk, as they are finished. A task whose worker dies is given to another by Dask."""
+    task: Task, starts: list[int], members_at: Callable[[int], Any], size: int, client: Any
+) -> Iterator[tuple[int, ChunkResult]]:
+    """(start, result) of every chunk, as they are finished. A task whose worker dies is given to another by Dask."""
     try:
         import cloudpickle
         from distributed import as_completed
@@ -153,41 +150,41 @@ def on_cluster(
         raise ImportError("sweep(..., client=...) needs Dask: pip install 'jaxkane[cluster]'") from error
 
     # Arrays travel as numpy's: JAX's would be read before the worker knows their precision.
-    sent = jax.tree.map(_as_numpy, dataclasses.replace(job, mesh=None))
+    arrays = jax.tree.map(_as_numpy, dataclasses.replace(task, mesh=None))
     like = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), members_at(0))
-    common = cloudpickle.dumps((sent, like))
-    program = _program(jax.tree.map(_as_jax, sent), like)
+    common = cloudpickle.dumps((arrays, like))
+    program = _program(jax.tree.map(_as_jax, arrays), like)
     flags = {name: getattr(jax.config, name) for name in _FLAGS}
     with_kernels = kernels.is_on()
-    left, tasks = iter(starts), {}
+    remaining, futures = iter(starts), {}
     finished = as_completed()
 
     def submit() -> None:
         # Twice as many as there are threads keep all of them busy; a cluster may grow meanwhile.
-        while len(tasks) < max(2 * sum(client.nthreads().values()), 2):
-            start = next(left, None)
+        while len(futures) < max(2 * sum(client.nthreads().values()), 2):
+            start = next(remaining, None)
             if start is None:
                 return
             own = cloudpickle.dumps(members_at(start))
-            task = client.submit(solve_elsewhere, common, own, size, flags, with_kernels, program, pure=False)
-            tasks[task.key] = start
-            finished.add(task)
+            future = client.submit(solve_on_worker, common, own, size, flags, with_kernels, program, pure=False)
+            futures[future.key] = start
+            finished.add(future)
 
     try:
         submit()
-        while tasks:
-            task = next(finished)
-            yield tasks[task.key], task.result()
-            del tasks[task.key]
-            task.release()
+        while futures:
+            future = next(finished)
+            yield futures[future.key], future.result()
+            del futures[future.key]
+            future.release()
             submit()
     finally:
-        client.cancel([task for task in finished.futures if task.key in tasks])
+        client.cancel([future for future in finished.futures if future.key in futures])
 
 
-def solve_elsewhere(
+def solve_on_worker(
     common: bytes, own: bytes, size: int, flags: dict[str, Any], native: bool, program: tuple[str, str]
-) -> Part:
+) -> ChunkResult:
     """A chunk, on a worker; arrays of numpy go there and come back.
 
     **Raises:** `RuntimeError` where this worker would compute something else than `program`.
@@ -203,28 +200,27 @@ def solve_elsewhere(
             f"This worker has no native kernels, and would round differently: {kernels.why_not()}. Or call "
             "jaxkane.configure(native=False) where the sweep is started."
         )
-    job, like = _JOBS.get(common, lambda: _received(common))
-    libraries, computed = _PROGRAMS.get((common, version_of(job)), lambda: _program(job, like))
-    if libraries == program[0] and computed != program[1]:  # what another JAX has traced cannot be compared
+    task, like = _TASKS.get(common, lambda: _received(common))
+    libraries, digest_here = _PROGRAMS.get((common, version_of(task)), lambda: _program(task, like))
+    if libraries == program[0] and digest_here != program[1]:  # what another JAX has traced cannot be compared
         raise RuntimeError(_ANOTHER)
-    part = job.solve(cloudpickle.loads(own), size)
-    return jax.tree.map(np.asarray, part)
+    return jax.tree.map(np.asarray, task.solve(cloudpickle.loads(own), size))
 
 
-def _program(job: Job, like: Any) -> tuple[str, str]:
+def _program(task: Task, like: Any) -> tuple[str, str]:
     """The libraries with which a program is traced, and the digest of what it computes for one member."""
-    return repr(versions()), traced(job, like)[0]
+    return repr(versions()), trace(task, like)[0]
 
 
-# On a worker, once for all chunks: functions that are unpickled anew would be compiled anew.
-_JOBS, _PROGRAMS = Cache(8), Cache(8)
+# On a worker, once for all chunks: functions that are unpickled again would be compiled again.
+_TASKS, _PROGRAMS = Cache(8), Cache(8)
 
 
-def _received(common: bytes) -> tuple[Job, Any]:
+def _received(common: bytes) -> tuple[Task, Any]:
     import cloudpickle
 
-    job, like = cloudpickle.loads(common)
-    return jax.tree.map(_as_jax, job), like
+    task, like = cloudpickle.loads(common)
+    return jax.tree.map(_as_jax, task), like
 
 
 def _as_numpy(x: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Finished chunks as files, under a manifest and a digest of what is computed. Knows arrays and files."""
+"""Finished chunks as files, under a manifest of what they were computed from. Knows arrays and files."""
 
 from __future__ import annotations
 
@@ -35,27 +35,25 @@ def manifest_of(
     layout: Any,
 ) -> dict[str, Any]:
     """All that the results follow from, by name; `program` is the digest of what is computed from it."""
-    kind: dict[str, Any]
     if isinstance(system, System):
-        kind = {"class": type(system).__qualname__}
-        parameters = {field.name: _shown(getattr(system, field.name)) for field in dataclasses.fields(system)}
+        kind: dict[str, Any] = {"class": type(system).__qualname__}
+        parameters = {field.name: _entry(getattr(system, field.name)) for field in dataclasses.fields(system)}
     else:
-        kind, parameters = {"function": _shown(system)}, {}
+        kind, parameters = {"function": _entry(system)}, {}
     if isinstance(state, State):
-        places = {part: _shown(x) for part, x in vars(state).items() if x is not None}
+        initial = {name: _entry(x) for name, x in vars(state).items() if x is not None}
     else:
-        places = {"function": _shown(state)}
-    signals = {name: _shown(x) for name, x in (inputs or {}).items()} if not callable(inputs) else _shown(inputs)
+        initial = {"function": _entry(state)}
     return {
         "system": kind,
         "parameter": parameters,
-        "state": places,
-        "input": signals,
-        "table": {name: _shown(column) for name, column in table.columns.items()} if table else {},
+        "state": initial,
+        "input": _entry(inputs) if callable(inputs) else {name: _entry(x) for name, x in (inputs or {}).items()},
+        "table": {name: _entry(column) for name, column in table.columns.items()} if table else {},
         "shape": dict(zip(table.dims, table.shape, strict=True)) if table else {},
-        "times": _shown(ts),
-        "option": {f.name: _shown(getattr(settings, f.name)) for f in dataclasses.fields(settings)},
-        "reduce": _shown(reduce),
+        "times": _entry(ts),
+        "option": {f.name: _entry(getattr(settings, f.name)) for f in dataclasses.fields(settings)},
+        "reduce": _entry(reduce),
         "program": program,
         "layout": dict(layout),
         "device": jax.default_backend(),
@@ -64,15 +62,13 @@ def manifest_of(
     }
 
 
-def _shown(value: Any) -> Any:
+def _entry(value: Any) -> Any:
     """Numbers as they are, functions by name (what they compute is in the program), all else by a digest."""
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
     if isinstance(value, (jax.Array, np.ndarray, np.generic)):
         array = np.asarray(value)
-        if array.ndim == 0:
-            return array.item()
-        return f"{array.dtype}{list(array.shape)} {digest(array)}"
+        return array.item() if array.ndim == 0 else f"{array.dtype}{list(array.shape)} {digest(array)}"
     if inspect.isroutine(value):
         return value.__qualname__
     return f"{getattr(value, '__qualname__', type(value).__qualname__)} {digest(value)}"
@@ -94,17 +90,17 @@ class Folder:
         if self.path.exists() and not self.path.is_dir():
             raise ValueError(f"{self.path} is a file: `folder` is the name of a folder.")
         self.path.mkdir(parents=True, exist_ok=True)
-        described = self.path / MANIFEST
-        if not described.exists():
+        path = self.path / MANIFEST
+        if not path.exists():
             # What a writer that was killed left behind holds nothing.
             if any(not file.name.endswith(SCRATCH) for file in self.path.iterdir() if file.name != MANIFEST):
                 raise ValueError(
                     f"{self.path} is not empty, and holds no {MANIFEST}: a sweep wants a folder of its own."
                 )
             text = json.dumps(manifest, indent=1).encode()
-            if atomic_write(described, lambda file: file.write(text), replace=False):
+            if atomic_write(path, lambda file: file.write(text), replace=False):
                 return
-        _compare(self.path, _read(described), manifest)
+        _refuse_other(path, manifest)
 
     def file(self, start: int) -> Path:
         return self.path / f"chunk-{start:08d}.npz"
@@ -113,10 +109,10 @@ class Folder:
         """By which a chunk is known whose file was renamed, or came from another folder."""
         return {"chunk of": f"{self.sweep} from {start}"}
 
-    def write(self, start: int, part: Any) -> None:
+    def write(self, start: int, result: Any) -> None:
         """Keep the chunk that begins with a member."""
         try:
-            atomic_write(self.file(start), lambda file: np.savez(file, **self.mark(start), **_named(part)))
+            atomic_write(self.file(start), lambda file: np.savez(file, **self.mark(start), **_by_path(result)))
         except FileNotFoundError:
             # Another process was done with the whole sweep, this chunk too, and has tidied up.
             if not self.file(start).exists():
@@ -130,14 +126,14 @@ class Folder:
             return None
         try:
             with zipfile.ZipFile(path) as archive:
-                bad = archive.testzip()
-            if bad is not None:
-                raise ValueError(f"{bad} is damaged")
-            with np.load(path, allow_pickle=False) as found:
+                damaged = archive.testzip()
+            if damaged is not None:
+                raise ValueError(f"{damaged} is damaged")
+            with np.load(path, allow_pickle=False) as arrays:
                 for name, mark in self.mark(start).items():
-                    if name not in found or str(found[name]) != mark:
+                    if name not in arrays or str(arrays[name]) != mark:
                         raise ValueError("it belongs elsewhere: renamed, or of another sweep")
-                leaves = [_checked(name, found[name], leaf, size) for name, leaf in _named(like).items()]
+                leaves = [_checked(name, arrays[name], leaf, size) for name, leaf in _by_path(like).items()]
         except (MemoryError, PermissionError):
             raise
         except Exception as error:  # whatever a decoder says of bytes that are not its own
@@ -147,12 +143,12 @@ class Folder:
 
     def tidy(self) -> None:
         """Take away what writers that were killed left behind, once every chunk is there."""
-        for left in self.path.glob(f"*{SCRATCH}"):
-            left.unlink(missing_ok=True)
+        for scratch in self.path.glob(f"*{SCRATCH}"):
+            scratch.unlink(missing_ok=True)
 
 
-def _named(part: Any) -> dict[str, Any]:
-    leaves, _ = jax.tree_util.tree_flatten_with_path(part)
+def _by_path(tree: Any) -> dict[str, Any]:
+    leaves, _ = jax.tree_util.tree_flatten_with_path(tree)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
@@ -162,29 +158,25 @@ def _checked(name: str, array: np.ndarray, like: Any, size: int) -> np.ndarray:
     return array
 
 
-def _read(path: Path) -> Mapping[str, Any]:
-    """The manifest in a file."""
+def _refuse_other(path: Path, manifest: Mapping[str, Any]) -> None:
+    """**Raises:** `ValueError` where the file holds another manifest, or none."""
     try:
-        found = json.loads(path.read_bytes())
+        stored = json.loads(path.read_bytes())
     except ValueError as error:  # of JSON, or of its encoding
         raise ValueError(
             f"{path} cannot be read ({error}): it is damaged, or no manifest of a sweep, so it is unknown whose chunks "
             "stand beside it. Choose another folder, or delete this one."
         ) from None
-    if not isinstance(found, dict) or not {"system", "times", "layout"} <= found.keys():
+    if not isinstance(stored, dict) or not {"system", "times", "layout"} <= stored.keys():
         raise ValueError(f"{path} is no manifest of a sweep. Choose another folder: a sweep wants one of its own.")
-    return found
-
-
-def _compare(path: Path, there: Mapping[str, Any], here: Mapping[str, Any]) -> None:
-    if "program" not in there:
+    if "program" not in stored:
         raise ValueError(
             f"{path} holds a sweep of an earlier version of jaxkane, which kept no account of all that was computed: "
             "so it is unknown whether it is this one. Choose another folder, or delete this one."
         )
-    found = differences(there, here)
-    if found:
+    different = differences(stored, manifest)
+    if different:
         raise ValueError(
-            f"{path} holds another sweep. It differs in {found}. Choose another folder, or delete this one. (The "
+            f"{path} holds another sweep. It differs in {different}. Choose another folder, or delete this one. (The "
             "program is what the description, the inputs and the functions compute, with the numbers that they read.)"
         )

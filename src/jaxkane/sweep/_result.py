@@ -1,7 +1,8 @@
-"""What a sweep gives: arrays by name with an axis for every swept name. Knows names and numbers."""
+"""The result of a sweep: arrays by name with an axis for every swept name."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,8 +14,19 @@ from .._common.lookup import not_there
 from .._integrate.status import Status, reason
 from .._integrate.trajectory import Trajectory
 from .._scalarjit.compat import Tracer
-from ._chunks import Part
+from ._chunks import ChunkResult
 from ._members import Table
+
+_NO_MOTION = "This sweep kept what `reduce` made of the motions, in `values`, and no motion."
+
+
+def _of_trajectory(name: str) -> Any:
+    def attribute(sweep: Sweep) -> Any:
+        if sweep.trajectory is None:
+            raise AttributeError(_NO_MOTION)
+        return getattr(sweep.trajectory, name)
+
+    return property(attribute)
 
 
 class Sweep(eqx.Module):
@@ -40,20 +52,27 @@ class Sweep(eqx.Module):
     table: Table
     events: tuple[str, ...] = eqx.field(static=True)
 
+    t = _of_trajectory("t")
+    q = _of_trajectory("q")
+    u = _of_trajectory("u")
+    u_dep = _of_trajectory("u_dep")
+    x = _of_trajectory("x")
+    inputs = _of_trajectory("inputs")
+    outputs = _of_trajectory("outputs")
+    names = _of_trajectory("names")
+
     @classmethod
-    def of(cls, part: Part, table: Table, ts: Any, reduced: bool) -> Sweep:
+    def of(cls, result: ChunkResult, table: Table, ts: Any, reduced: bool) -> Sweep:
         """The results (b, ...) of all members, with the axes of their table."""
-        shaped = jax.tree.map(lambda x: x.reshape(*table.shape, *x.shape[1:]), part)
-        ride = None
+        result = jax.tree.map(lambda x: x.reshape(*table.shape, *x.shape[1:]), result)
+        own = {"status": result.status, "t_end": result.t_end, "stats": result.stats}
+        trajectory, values = None, result.values
         if not reduced:
-            q, u, u_dep, x, inputs, outputs, end, discontinuities = shaped.values
-            spread: Any = np.broadcast_to if isinstance(q, np.ndarray) else jax.numpy.broadcast_to
-            t = spread(ts if isinstance(ts, Tracer) else np.asarray(ts), (*table.shape, ts.shape[0]))
-            arrays: list[Any] = [t, q, u, u_dep, x, inputs, outputs, shaped.status, shaped.t_end, shaped.stats]
-            static = {"names": part.names, "events": part.events, "adjoint": part.adjoint, "units": part.units}
-            ride = Trajectory(*arrays, **static, end=end, discontinuities=discontinuities)
-        values = shaped.values if reduced else None
-        return cls(ride, values, shaped.status, shaped.t_end, shaped.stats, table, part.events)
+            t = ts if isinstance(ts, Tracer) else np.asarray(ts)
+            spread: Any = np.broadcast_to if isinstance(values.q, np.ndarray) else jax.numpy.broadcast_to
+            trajectory = dataclasses.replace(values, t=spread(t, (*table.shape, *t.shape)), **own)
+            values = None
+        return cls(trajectory, values, **own, table=table, events=result.events)
 
     @property
     def dims(self) -> tuple[str, ...]:
@@ -65,45 +84,6 @@ class Sweep(eqx.Module):
 
     def __len__(self) -> int:
         return self.shape[0]
-
-    @property
-    def _ride(self) -> Trajectory:
-        if self.trajectory is None:
-            raise AttributeError("This sweep kept what `reduce` made of the motions, in `values`, and no motion.")
-        return self.trajectory
-
-    @property
-    def t(self) -> Any:
-        return self._ride.t
-
-    @property
-    def q(self) -> Any:
-        return self._ride.q
-
-    @property
-    def u(self) -> Any:
-        return self._ride.u
-
-    @property
-    def u_dep(self) -> Any:
-        return self._ride.u_dep
-
-    @property
-    def x(self) -> Any:
-        return self._ride.x
-
-    @property
-    def inputs(self) -> dict[str, Any]:
-        return self._ride.inputs
-
-    @property
-    def outputs(self) -> dict[str, Any]:
-        return self._ride.outputs
-
-    @property
-    def names(self) -> tuple[tuple[str, ...], ...]:
-        """Of coordinates, independent and dependent speeds, and states."""
-        return self._ride.names
 
     @property
     def ok(self) -> Any:
@@ -126,14 +106,15 @@ class Sweep(eqx.Module):
             column = self.table[name]
             return column.reshape(*self.shape, *column.shape[1:])
         known = list(self.values) if isinstance(self.values, Mapping) else []
-        known += _names(self.trajectory) if self.trajectory is not None else []
-        raise not_there(name, [*known, *self.table.columns], "this sweep")
+        raise not_there(name, [*known, *_names(self.trajectory), *self.table.columns], "this sweep")
 
     def member(self, *place: int) -> Trajectory:
         """The motion of one member, by its place along every axis."""
         if len(place) != len(self.shape):
             raise ValueError(f"A member is found by {len(self.shape)} places ({', '.join(self.dims)}), got {place}.")
-        return jax.tree.map(lambda x: x[place], self._ride)
+        if self.trajectory is None:
+            raise AttributeError(_NO_MOTION)
+        return jax.tree.map(lambda x: x[place], self.trajectory)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -152,9 +133,9 @@ class Sweep(eqx.Module):
             import xarray
         except ImportError as error:
             raise ImportError("to_xarray needs xarray: pip install 'jaxkane[xarray]'") from error
-        ride, table = self.trajectory, self.table
-        moving = _names(ride) if ride is not None else []
-        inputs = list(ride.inputs) if ride is not None else []
+        trajectory, table = self.trajectory, self.table
+        moving = _names(trajectory)
+        inputs = [] if trajectory is None else list(trajectory.inputs)
         axis = {d: f"initial {d}" if d in moving and d not in inputs else d for d in (*self.dims, *table.columns)}
         dims = tuple(axis[d] for d in self.dims)
         coords: dict[str, Any] = {axis[d]: table.axis(d) for d in self.dims if d in table.columns}
@@ -162,17 +143,18 @@ class Sweep(eqx.Module):
             if name not in self.dims:
                 extra = tuple(f"{name}_{i}" for i in range(column.ndim - 1))
                 coords[axis[name]] = ((*dims, *extra), self[name] if name not in moving else column)
-        found: dict[str, Any] = {}
-        if ride is not None:
-            coords["t"] = np.asarray(ride.t).reshape(-1, ride.t.shape[-1])[0]
-            found = {name: ((*dims, "t"), np.asarray(ride[name])) for name in moving if name not in coords}
+        variables: dict[str, Any] = {}
+        if trajectory is not None:
+            coords["t"] = np.asarray(trajectory.t).reshape(-1, trajectory.t.shape[-1])[0]
+            names = [name for name in moving if name not in coords]
+            variables = {name: ((*dims, "t"), np.asarray(trajectory[name])) for name in names}
         for path, leaf in jax.tree_util.tree_flatten_with_path(self.values)[0]:
             name = jax.tree_util.keystr(path, simple=True, separator=".") or "value"
             extra = tuple(f"{name}_{i}" for i in range(leaf.ndim - len(dims)))
-            found[name] = ((*dims, *extra), np.asarray(leaf))
+            variables[name] = ((*dims, *extra), np.asarray(leaf))
         ends = {"status": self.status, "t_end": self.t_end, "steps": self.stats["steps"]}
-        found |= {name: (dims, np.asarray(x)) for name, x in ends.items() if name not in found}
-        return xarray.Dataset(found, coords)
+        variables |= {name: (dims, np.asarray(x)) for name, x in ends.items() if name not in variables}
+        return xarray.Dataset(variables, coords)
 
     def __repr__(self) -> str:
         if isinstance(self.status, Tracer):
@@ -184,5 +166,7 @@ class Sweep(eqx.Module):
         return f"Sweep({of}; {ended})"
 
 
-def _names(ride: Trajectory) -> list[str]:
-    return [*(name for names in ride.names for name in names), *ride.inputs, *ride.outputs]
+def _names(trajectory: Trajectory | None) -> list[str]:
+    if trajectory is None:
+        return []
+    return [*(name for names in trajectory.names for name in names), *trajectory.inputs, *trajectory.outputs]

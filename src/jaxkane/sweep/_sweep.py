@@ -1,4 +1,4 @@
-"""The front door of sweeps: chunk by chunk, here or on a cluster, into arrays and files."""
+"""`sweep`: chunk by chunk, in this process or on a cluster, into arrays and files."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from .._kane.arguments import is_concrete
 from .._scalarjit.cache_key import captured_tracers
 from .._scalarjit.components import Inputs
 from .._system.system import State, System
-from ._chunks import GROUP, Job, Part, mesh_of, on_cluster, traced
+from ._chunks import GROUP, ChunkResult, Task, mesh_of, on_cluster, trace
 from ._files import Folder, manifest_of
 from ._members import Row, Table, as_table, members_of
 from ._result import Sweep
@@ -92,103 +92,107 @@ def sweep(
     if isinstance(system, System):
         refuse_captured(system)
     members, shared, n = members_of(system, state, inputs, table, ts)
-    found = table if table is not None else Table({}, ("member",), (n,))
+    axes = table if table is not None else Table({}, ("member",), (n,))
     closures = captured_tracers(shared, reduce)
-    job = Job(shared, ts, settings, reduce, None if client is not None else mesh_of(devices), closures)
+    task = Task(shared, ts, settings, reduce, None if client is not None else mesh_of(devices), closures)
     own = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), members)
     if n == 0:
-        like = jax.eval_shape(job.whole, own)
-        return Sweep.of(jax.tree.map(lambda x: np.zeros((0, *x.shape), x.dtype), like), found, ts, reduce is not None)
+        like = jax.eval_shape(task.simulate, own)
+        return Sweep.of(jax.tree.map(lambda x: np.zeros((0, *x.shape), x.dtype), like), axes, ts, reduce is not None)
     if not is_concrete(members, shared, ts, closures):  # inside jit, grad or vmap
         if folder is not None or client is not None:
             raise ValueError("sweep: `folder` and `client` cannot be used inside jit, grad or vmap.")
-        given = members, shared, ts, closures
-        settings, (members, shared, ts, closures) = resolve_adjoint(settings, options.get("adjoint", "auto"), given)
-        job = Job(shared, ts, settings, reduce, job.mesh, closures)
-        return Sweep.of(job.solve(members, n), found, ts, reduce is not None)
+        arguments = members, shared, ts, closures
+        settings, (members, shared, ts, closures) = resolve_adjoint(settings, options.get("adjoint", "auto"), arguments)
+        task = Task(shared, ts, settings, reduce, task.mesh, closures)
+        return Sweep.of(task.solve(members, n), axes, ts, reduce is not None)
 
     size = n if n <= GROUP else GROUP * -(-min(chunk, n) // GROUP)
-    kept = like = None
+    files = like = None
     if folder is not None:
         layout = {"members": n, "chunk": size}
-        program, like = traced(job, own)
-        kept = Folder(folder, manifest_of(program, system, state, inputs, table, ts, settings, reduce, layout))
-    part = _in_chunks(job, jax.tree.map(np.asarray, members), n, size, kept, like, client, progress)
-    return Sweep.of(part, found, ts, reduce is not None)
+        program, like = trace(task, own)
+        files = Folder(folder, manifest_of(program, system, state, inputs, table, ts, settings, reduce, layout))
+    result = _in_chunks(task, jax.tree.map(np.asarray, members), n, size, files, like, client, progress)
+    return Sweep.of(result, axes, ts, reduce is not None)
 
 
 def _in_chunks(
-    job: Job, members: Any, n: int, size: int, kept: Folder | None, like: Part | None, client: Any, progress: bool
-) -> Part:
-    """The results of n members, `size` at a time: those that stand in the folder, then the others, here or on a
-    cluster. What is missing after Ctrl-C has the status `INTERRUPTED`."""
+    task: Task,
+    members: Any,
+    n: int,
+    size: int,
+    files: Folder | None,
+    like: ChunkResult | None,
+    client: Any,
+    progress: bool,
+) -> ChunkResult:
+    """The results of n members, `size` at a time: those that stand in the folder, then the rest, in this process or on
+    a cluster. What is missing after Ctrl-C has the status `INTERRUPTED`."""
     members_at = lambda start: jax.tree.map(lambda x: x[start : start + size], members)  # noqa: E731
-    result = _Result(n)
+    results = _Results(n)
     with tqdm(total=n, disable=not progress, unit="member", file=sys.stderr) as bar:
         try:
-            left = list(range(0, n, size))
-            for start, part in _finished(kept, left, like, n, size):
-                left.remove(start)
-                bar.update(result.put(start, part))
+            remaining = list(range(0, n, size))
+            for start, result in _finished(files, remaining, like, n, size):
+                remaining.remove(start)
+                bar.update(results.put(start, result))
             bar.initial = bar.n  # chunks that were read from files say nothing about the speed
             if client is None:
-                run = ((start, job.solve(members_at(start), size)) for start in left)
+                chunks = ((start, task.solve(members_at(start), size)) for start in remaining)
             else:
-                run = on_cluster(job, left, members_at, size, client)
-            for start, part in run:
-                part = jax.tree.map(np.asarray, part)
-                if kept is not None:
-                    kept.write(start, part)
-                bar.update(result.put(start, part))
+                chunks = on_cluster(task, remaining, members_at, size, client)
+            for start, result in chunks:
+                result = jax.tree.map(np.asarray, result)
+                if files is not None:
+                    files.write(start, result)
+                bar.update(results.put(start, result))
         except KeyboardInterrupt:
-            if result.all is None:
+            if results.arrays is None:
                 raise
-    if kept is not None and result.reached.all():
-        kept.tidy()
-    return result.filled()
+    if files is not None and results.reached.all():
+        files.tidy()
+    return results.filled()
 
 
 def _finished(
-    kept: Folder | None, starts: list[int], like: Part | None, n: int, size: int
-) -> Iterator[tuple[int, Part]]:
-    """(start, part) of the chunks that stand in the folder, each member of the shapes of `like`."""
-    if kept is None:
+    files: Folder | None, starts: list[int], like: ChunkResult | None, n: int, size: int
+) -> Iterator[tuple[int, ChunkResult]]:
+    """(start, result) of the chunks that stand in the folder, each member of the shapes of `like`."""
+    if files is None:
         return
     for start in tuple(starts):
-        part = kept.read(start, like, min(size, n - start))
-        if part is not None:
-            yield start, part
-    if kept.damaged:
+        result = files.read(start, like, min(size, n - start))
+        if result is not None:
+            yield start, result
+    if files.damaged:
         warnings.warn(
-            f"{kept.path}: {len(kept.damaged)} chunks cannot be read and are computed again: {kept.damaged[0]}"
-            + (", ..." if len(kept.damaged) > 1 else "."),
+            f"{files.path}: {len(files.damaged)} chunks cannot be read and are computed again: {files.damaged[0]}"
+            + (", ..." if len(files.damaged) > 1 else "."),
             stacklevel=3,
         )
 
 
-class _Result:
+class _Results:
     """The results of all members, filled chunk by chunk."""
 
     def __init__(self, n: int):
-        self.n, self.reached, self.all = n, np.zeros(n, bool), None
+        self.n, self.reached, self.arrays = n, np.zeros(n, bool), None
 
-    def put(self, start: int, part: Part) -> int:
-        """Take in the chunk that begins with a member. **Returns:** its size."""
-        if self.all is None:
-            self.all = jax.tree.map(lambda x: np.empty((self.n, *x.shape[1:]), x.dtype), part)
-        size = part.status.shape[0]
-        self.reached[start : start + size] = True
-
-        def copy(whole, some):
-            whole[start : start + size] = some
-
-        jax.tree.map(copy, self.all, part)
+    def put(self, start: int, result: ChunkResult) -> int:
+        """Fill in the chunk that begins with a member. **Returns:** its size."""
+        if self.arrays is None:
+            self.arrays = jax.tree.map(lambda x: np.empty((self.n, *x.shape[1:]), x.dtype), result)
+        size = result.status.shape[0]
+        chunk = slice(start, start + size)
+        self.reached[chunk] = True
+        jax.tree.map(lambda array, values: array.__setitem__(chunk, values), self.arrays, result)
         return size
 
-    def filled(self) -> Part:
+    def filled(self) -> ChunkResult:
         """With NaN, and the status `INTERRUPTED`, for members that were not reached."""
-        assert self.all is not None
-        for x in jax.tree.leaves(self.all):
+        assert self.arrays is not None
+        for x in jax.tree.leaves(self.arrays):
             x[~self.reached] = np.nan if jnp.issubdtype(x.dtype, jnp.inexact) else 0
-        self.all.status[~self.reached] = Status.INTERRUPTED
-        return self.all
+        self.arrays.status[~self.reached] = Status.INTERRUPTED
+        return self.arrays
