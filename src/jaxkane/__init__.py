@@ -54,8 +54,7 @@ from ._system.parameters import learned as learned
 from ._system.parameters import parameter as parameter
 from ._system.system import State as State
 from ._system.system import System as System
-
-__version__ = "0.1.0"
+from ._version import __version__ as __version__
 
 # Rooms that a description and its motion do not need, and what they import (scipy, optax), are imported when named.
 if _typing.TYPE_CHECKING:

@@ -43,9 +43,7 @@ from jaxkane.bicycles import (
     separate_rider,
 )
 from jaxkane.catalog import CATALOG
-from jaxkane.export._c import HELPERS, C
-from jaxkane.export._functions import identifiers
-from jaxkane.export._numpy import PYTHON
+from jaxkane.export._source import HELPERS, PYTHON, C, identifiers
 
 CC = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 needs_compiler = pytest.mark.skipif(CC is None, reason="no C compiler")
@@ -538,13 +536,15 @@ def test_every_operation_in_casadi():
     ca = pytest.importorskip("casadi")
     from jaxkane._scalarjit.backends.source import as_objects
     from jaxkane._scalarjit.graph import needed
-    from jaxkane.export._casadi import table
+    from jaxkane.export._programs import casadi_operations
 
     graph, nodes, outputs, _ = graph_of(every_in_float64, TAKEN)
     x = [ca.SX.sym(f"x{i}") for i in range(TAKEN.size)]
     given = dict(zip(map(int, nodes), x, strict=True))
-    found = as_objects(graph, needed(graph.nodes, outputs), given, table(ca), lambda v, _: ca.SX(float(v)), "CasADi")
-    assert {node.operation for node in graph.nodes} - {"input", "constant"} == {*table(ca)}
+    found = as_objects(
+        graph, needed(graph.nodes, outputs), given, casadi_operations(ca), lambda v, _: ca.SX(float(v)), "CasADi"
+    )
+    assert {node.operation for node in graph.nodes} - {"input", "constant"} == {*casadi_operations(ca)}
     f = ca.Function("f", x, [ca.vertcat(*(found[int(k)] for array in outputs for k in array.flat))])
     expected = np.concatenate([np.ravel(y) for y in jax.jit(every_in_float64)(TAKEN)])
     np.testing.assert_allclose(np.array(f(*TAKEN))[:, 0], expected, rtol=rtol, atol=1e-14)

@@ -1,0 +1,550 @@
+"""Equations as source code: C99 without dependencies, and Python that needs NumPy alone. Compiles and runs nothing.
+
+Both are written from one graph of scalars, by a `Language` each. What all exports share stands first: functions, names.
+"""
+
+from __future__ import annotations
+
+import builtins
+import keyword
+import re
+import unicodedata
+from collections.abc import Callable, Collection, Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from .._common.lookup import refuse_unknown
+from .._kane.formulas import JACOBIANS, OFFERED, Formulas
+from .._scalarjit.backends.numpy import NUMPY_NAMES
+from .._scalarjit.backends.source import (
+    ARITHMETIC,
+    COMPARED,
+    COMPARISONS,
+    LOOSE,
+    SIGNED,
+    SUM,
+    TIGHT,
+    Form,
+    Language,
+    as_source,
+    call,
+)
+from .._scalarjit.graph import DTYPES, LIBRARY, needed
+from .._system.system import System, unit_of, units_of
+from .._version import __version__
+
+_USUAL = ("rates", "equations", "dependent_speeds", *JACOBIANS)
+
+
+def function_names(
+    formulas: Formulas, functions: Sequence[str] | None, usual: Sequence[str] = _USUAL
+) -> tuple[str, ...]:
+    """Names of functions, checked; by default the usual ones that the system has."""
+    if functions is None:
+        needs = {"dependent_speeds": "u_dep", "input_jacobian": "inputs", "parameter_jacobian": "parameters"}
+        available = tuple(name for name in usual if name not in needs or formulas.names(needs[name]))
+        return (*available, "state_rates") if formulas.system.states else available
+    if isinstance(functions, str):
+        raise TypeError(f"functions is a sequence of names; one is ({functions!r},).")
+    functions = tuple(dict.fromkeys(functions))
+    if not functions:
+        raise ValueError(f"{formulas.name}: `functions` names none; leave it out for the usual ones.")
+    refuse_unknown(functions, OFFERED, f"{formulas.name}: there is no function", "there are")
+    return functions
+
+
+def check_function(formulas: Formulas, function: Any, exporter: str) -> None:
+    """Refuse what is not the name of one function."""
+    if not isinstance(function, str):
+        raise TypeError(f"{exporter} exports one function at a time; `function` is its name, got {function!r}.")
+    refuse_unknown([function], OFFERED, f"{formulas.name}: there is no function", "there are")
+
+
+def parameters(system: System) -> dict[str, np.ndarray]:
+    """A system's parameters by name, in the order in which exported functions take them.
+
+    A parameter of a part is called by its path, "frame.mass"; one with axes is an array.
+    """
+    return Formulas(system).values()
+
+
+def in_ascii(name: str) -> str:
+    """A name of letters, digits and underscores that begins with a letter: Greek letters by their names, accents
+    dropped, "frame.mass" as frame_mass, "moments[2]" as moments_2."""
+    words = []
+    for letter in unicodedata.normalize("NFKD", name):
+        if letter.isascii():
+            words.append(letter)
+        elif unicodedata.category(letter).startswith("L"):
+            letter_name = unicodedata.name(letter, f"u{ord(letter):x}")
+            greek = re.fullmatch(r"GREEK (SMALL|CAPITAL) LETTER (?:FINAL )?(\w+).*", letter_name)
+            words.append(
+                (greek[2].lower() if greek[1] == "SMALL" else greek[2].title()) if greek else f"u{ord(letter):x}"
+            )
+    word = re.sub(r"\W+", "_", "".join(words)).strip("_")
+    return word if word[:1].isalpha() else f"n{word}"
+
+
+def identifiers(names: Iterable[str], reserved: Collection[str], in_ascii_only: bool = True) -> list[str]:
+    """For each name an identifier of its own: what is reserved, or equal to another, gets an underscore or a number."""
+    unique: list[str] = []
+    used = set(reserved)
+    for name in names:
+        own = unicodedata.normalize("NFKC", name)  # as Python reads it
+        word = own if own.isidentifier() and not in_ascii_only else in_ascii(name)
+        candidates = (word, f"{word}_", *(f"{word}_{i}" for i in range(2, 10_000)))
+        unique.append(next(c for c in candidates if c not in used))
+        used.add(unique[-1])
+    return unique
+
+
+def write_file(path: str | Path, content: bytes) -> None:
+    Path(path).parent.mkdir(parents=True, exist_ok=True)
+    Path(path).write_bytes(content)
+
+
+def _variable_units(system: System) -> dict[str, str]:
+    """Units of coordinates, speeds and inputs, where they are declared."""
+    declared = units_of(system)
+    names = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.inputs, *system.states)
+    return {name: unit_of(name, declared) for name in names}
+
+
+def _title(formulas: Formulas) -> str:
+    return f"{formulas.name}: Kane's equations M u_dot = f, written by jaxkane {__version__}."
+
+
+def _meaning(formulas: Formulas, function: str) -> str:
+    """What the outputs of a function are, where their names do not say it."""
+    if function in JACOBIANS:
+        by = {"state_jacobian": "(q, u)", "input_jacobian": "the inputs"}
+        return f": derivatives of (q_dot, u_dot) by {by.get(function, 'the parameters, in their order')}"
+    return f": {', '.join(formulas.names('u_dep'))}" if function == "dependent_speeds" else ""
+
+
+def _is_read(word: str, text: str) -> bool:
+    """Whether source code reads a variable; members of other objects have the same names."""
+    return re.search(rf"(?<![\w.>]){re.escape(word)}(?!\w)", text) is not None
+
+
+def _constant(false_true: Sequence[str], nan: str, infinity: str, single: str = "") -> Callable[[Any, str], str]:
+    """How a language writes numbers; `single` stands behind those in single precision."""
+
+    def constant(value: Any, dtype: str) -> str:
+        if dtype == "bool":
+            return false_true[bool(value)]
+        if not np.isfinite(value):
+            return nan if np.isnan(value) else infinity if value > 0 else f"-{infinity}"
+        return f"{np.float32(value)!s}{single}" if dtype == "float32" else repr(float(value))
+
+    return constant
+
+
+# Words that C99, C++ or their compilers have reserved, macros of <math.h> and <stdio.h> among them.
+C_WORDS = frozenset(
+    """auto break case char const continue default do double else enum extern float for goto if inline int long register
+    restrict return short signed sizeof static struct switch typedef union unsigned void volatile while
+    alignas alignof and and_eq asm bitand bitor bool catch char16_t char32_t char8_t class co_await co_return co_yield
+    compl concept const_cast consteval constexpr constinit decltype delete dynamic_cast explicit export false friend
+    module mutable namespace new noexcept not not_eq nullptr operator or or_eq private protected public
+    reinterpret_cast requires static_assert static_cast template this thread_local throw true try typeid typename
+    typeof using virtual wchar_t xor xor_eq linux unix i386 errno stdin stdout stderr NULL EOF NAN INFINITY HUGE_VAL
+    HUGE_VALF HUGE_VALL DOMAIN SING OVERFLOW UNDERFLOW PLOSS TLOSS HUGE MAXFLOAT BUFSIZ L_tmpnam TMP_MAX FILENAME_MAX
+    FOPEN_MAX""".split()
+)
+
+
+TYPES = {"float64": "double", "float32": "float", "bool": "int"}
+_IN_LIBRARY = {"abs": "fabs", "rem": "fmod", **{name: name for name in (*LIBRARY, "sqrt", "floor")}}
+_C_FORMS = {
+    **ARITHMETIC,
+    **COMPARISONS,
+    **{name: call(f"{word}{{s}}", 1 + (name in ("rem", "pow", "atan2"))) for name, word in _IN_LIBRARY.items()},
+    "max": call("larger", 2),
+    "min": call("smaller", 2),
+    "and": Form("{0} && {1}", COMPARED, (TIGHT, TIGHT)),
+    "or": Form("{0} || {1}", COMPARED, (TIGHT, TIGHT)),
+    "xor": Form("{0} != {1}", COMPARED, (TIGHT, TIGHT)),
+    "select": Form("{0} ? {1} : {2}", LOOSE, (SUM, SUM, SUM)),
+    "convert": Form("({type}){0}", SIGNED, (TIGHT,)),
+}
+# As JAX has them: not a number where one of the two is not, and -0 is less than 0.
+HELPERS = {
+    "max": "static {type} larger({type} a, {type} b) {{\n"
+    "    return a != a || (a == b ? !signbit(a) : a > b) ? a : b;\n}}\n",
+    "min": "static {type} smaller({type} a, {type} b) {{\n"
+    "    return a != a || (a == b ? signbit(a) : a < b) ? a : b;\n}}\n",
+}
+
+
+C = Language(
+    "C99",
+    _C_FORMS,
+    _constant(("0", "1"), "NAN", "INFINITY", single="f"),
+    lambda name, text, dtype: f"const {TYPES[dtype]} {name} = {text};",
+    TYPES,
+    {"float64": "", "float32": "f", "bool": ""},
+)
+
+
+def _six_a_line(texts: Sequence[str]) -> str:
+    return ",\n    ".join(", ".join(texts[i : i + 6]) for i in range(0, len(texts), 6))
+
+
+def _in_comment(text: str) -> str:
+    """A text that cannot end the comment in which it stands."""
+    return text.replace("*/", "* /").replace("\\", "/")
+
+
+_COMPARE = """
+/* Prints the largest difference, as a part of the largest expected number. */
+static int compare(const char *name, int n, const {type} *computed, const {type} *expected) {{
+    double difference = 0.0, size = 0.0;
+    int i;
+    for (i = 0; i < n; i++) {{
+        const double d = fabs((double)computed[i] - (double)expected[i]);
+        if (computed[i] == expected[i] || (computed[i] != computed[i] && expected[i] != expected[i])) continue;
+        if (!(d <= difference)) difference = d; /* also where it is not a number */
+        if (fabs((double)expected[i]) > size) size = fabs((double)expected[i]);
+    }}
+    printf("%-40s %.1e\\n", name, size > 0.0 ? difference / size : difference);
+    return !(difference <= {tolerance} * size);
+}}
+"""
+
+
+class ExportedFiles(NamedTuple):
+    """The files that `jaxkane.export.c` has written."""
+
+    header: Path
+    source: Path
+    test: Path
+
+
+def c(
+    system: System,
+    path: str | Path,
+    functions: Sequence[str] | None = None,
+    *,
+    name: str | None = None,
+    dtype: str = "float64",
+) -> ExportedFiles:
+    """A system's equations as C99 that needs the mathematical library alone.
+
+        jk.export.c(bicycle, "generated/bicycle.c")
+        # cc -std=c99 -O3 generated/bicycle.c generated/bicycle_test.c -lm -o test && ./test
+
+    Every function takes `(t, q, u, inputs, parameters, outputs ...)`: time, arrays in the order of the declared names,
+    a struct of the parameters, and an array for each output, matrices row by row. Outputs must not overlap what is
+    read. The header says what is where, with units; `NAME_default` holds the parameters of this system. Nothing is
+    allocated, kept or read but the arguments, so that threads may share it. What is not a number comes out as NaN, as
+    by JAX.
+
+    **Arguments:**
+
+    - `path`: of the source, "FOLDER/NAME.c", whose folder is made; beside it `NAME.h`, and `NAME_test.c`,
+        a program that compares every function with numbers that JAX computed.
+    - `functions`: which; by default rates (q_dot, u_dot), equations (M, f), dependent_speeds, and the derivatives of
+        the rates, state_jacobian (by q, u), parameter_jacobian and input_jacobian. There are also
+        dependent_accelerations, constraint_jacobian, constraint_jacobian_rate, partial_velocities, kinetic_energy.
+    - `name`: what the names of all functions begin with; by default that of the file.
+    - `dtype`: "float64", or "float32" for `float`.
+
+    **Returns:** the paths `header`, `source` and `test`.
+
+    **Raises:** `ValueError` for a function that there is not, a batch of systems, and operations that cannot be written
+    as formulas of single numbers, as those of LAPACK for more than 12 speeds.
+    """
+    path = Path(path)
+    if path.suffix != ".c":
+        raise ValueError(f"`path` is that of the source, which ends with .c: 'generated/bicycle.c'; got {str(path)!r}.")
+    formulas = Formulas(system, dtype)
+    functions = function_names(formulas, functions)
+    module = _CModule(formulas, functions, name or path.stem)
+    files = ExportedFiles(path.with_suffix(".h"), path, path.with_name(f"{path.stem}_test.c"))
+    texts = (module.header(), module.source(files.header.name), module.test(files.header.name))
+    for file, text in zip(files, texts, strict=True):
+        write_file(file, text.encode())
+    return files
+
+
+class _CModule:
+    """The texts of the files for some functions of a system."""
+
+    def __init__(self, formulas: Formulas, functions: tuple[str, ...], name: str):
+        self.formulas, self.functions = formulas, functions
+        (self.name,) = identifiers([name], C_WORDS)
+        self.type = TYPES[formulas.dtype]
+        self.constant = lambda x: C.constant(x, formulas.dtype)
+        parameters = [a.name for a in formulas.of_kind("parameters")]
+        self.members = dict(zip(parameters, identifiers(parameters, C_WORDS), strict=True))
+        self.nodes = {function: formulas.nodes(function) for function in functions}
+        self.input_words = {
+            int(k): self._element(a.kind, a.name, i, a.shape)
+            for a, nodes in zip(formulas.arguments, formulas.inputs, strict=True)
+            for i, k in enumerate(nodes.flat)
+        }
+
+    def _element(self, kind: str, name: str, i: int, shape: tuple[int, ...]) -> str:
+        if kind == "parameters":
+            return f"p->{self.members[name]}" + (f"[{i}]" if shape else "")
+        return f"{kind}[{i}]" if shape else kind
+
+    def _comment(self) -> str:
+        title = _in_comment(_title(self.formulas))
+        return f"/* {title}\n   Every function is a formula of its arguments; {self.type} throughout. */\n"
+
+    def _signature(self, function: str) -> str:
+        read = f"{self.type} t, const {self.type} *q, const {self.type} *u, const {self.type} *inputs"
+        outputs = "".join(f", {self.type} *{output}" for output in self.nodes[function])
+        return f"void {self.name}_{function}({read}, const {self.name}_parameters *p{outputs})"
+
+    def header(self) -> str:
+        guard, unit_of = f"{self.name.upper()}_H", _variable_units(self.formulas.system)
+        lines = [self._comment(), f"#ifndef {guard}", f"#define {guard}", "", "#ifdef __cplusplus"]
+        lines += ['extern "C" {', "#endif", "", "typedef struct {"]
+        for a in self.formulas.of_kind("parameters"):
+            member = self.members[a.name]
+            notes = f" {a.name}" if member != a.name else ""
+            notes += f", {' x '.join(map(str, a.shape))}, row by row" if a.shape else ""
+            notes += f" [{a.info.unit}]" if a.info.unit else ""
+            comment = f" /* {_in_comment(notes.strip(', '))} */" if notes else ""
+            size = f"[{max(1, len(a.elements))}]" if a.shape else ""
+            lines.append(f"    {self.type} {member}{size};{comment}")
+        if not self.members:
+            lines.append("    char none; /* there are no parameters */")
+        lines += [f"}} {self.name}_parameters;", "", "/* The parameters that were exported. */"]
+        lines += [f"extern const {self.name}_parameters {self.name}_default;", ""]
+        lines += ["/* What the functions read:", "", "   t: time [s]"]
+        for kind in ("q", "u", "inputs"):
+            for i, name in enumerate(self.formulas.names(kind)):
+                unit = f" [{unit_of[name]}]" if unit_of.get(name) else ""
+                lines.append(_in_comment(f"   {kind}[{i}]: {name}{unit}"))
+            if not self.formulas.names(kind):
+                lines.append(f"   {kind}: none; may be null")
+        lines += ["", "   What they write, matrices row by row; it must not overlap what they read: */", ""]
+        for function in self.functions:
+            shapes = ", ".join(
+                f"{output} ({' x '.join(map(str, nodes.shape)) or 'a number'})"
+                for output, nodes in self.nodes[function].items()
+            )
+            lines.append(f"/* {shapes}{_in_comment(_meaning(self.formulas, function))} */")
+            lines += [f"{self._signature(function)};", ""]
+        return "\n".join([*lines, "#ifdef __cplusplus", "}", "#endif", "", "#endif", ""])
+
+    def source(self, header: str) -> str:
+        outputs = [nodes for by_output in self.nodes.values() for nodes in by_output.values()]
+        used = {self.formulas.graph.nodes[k].operation for k in needed(self.formulas.graph.nodes, outputs)}
+        helpers = [text.format(type=self.type) for operation, text in HELPERS.items() if operation in used]
+        texts = []
+        for x in self.formulas.values().values():
+            numbers = ", ".join(map(self.constant, x.flat))
+            texts.append(f"{{{numbers or '0'}}}" if x.shape else numbers)
+        default = f"const {self.name}_parameters {self.name}_default = {{\n    {_six_a_line(texts or ['0'])}\n}};\n"
+        parts = [self._comment(), f'#include "{header}"\n\n#include <math.h>\n', default, *helpers]
+        return "\n".join([*parts, *(self._body(function) for function in self.functions)])
+
+    def _body(self, function: str) -> str:
+        by_output = self.nodes[function]
+        lines, outputs = as_source(self.formulas.graph, list(by_output.values()), self.input_words, C)
+        for output, elements in zip(by_output, outputs, strict=True):
+            lines += [f"{output}[{i}] = {text};" for i, text in enumerate(elements)]
+        text = "\n    ".join(lines)
+        unused = [f"(void){word};" for word in ("t", "q", "u", "inputs", "p", *by_output) if not _is_read(word, text)]
+        return f"{self._signature(function)} {{\n    " + "\n    ".join([*unused, *lines]) + "\n}\n"
+
+    def test(self, header: str) -> str:
+        """A program that calls every function at one state, and compares."""
+        state, expected = _state_and_outputs(self.formulas, self.functions)
+        lines = [self._comment(), f'#include "{header}"\n\n#include <math.h>\n#include <stdio.h>\n']
+        lines += [self._array(kind, state[kind]) for kind in ("q", "u", "inputs")]
+        calls = []
+        for function in self.functions:
+            numbers_of = {f"{function}_{output}": numbers for output, numbers in expected[function].items()}
+            for name, numbers in numbers_of.items():
+                lines.append(self._array(name, numbers))
+                lines.append(f"static {self.type} computed_{name}[{max(1, numbers.size)}];")
+            outputs = "".join(f", computed_{name}" for name in numbers_of)
+            t = self.constant(state["t"])
+            calls.append(f"    {self.name}_{function}({t}, q, u, inputs, &{self.name}_default{outputs});")
+            for name, numbers in numbers_of.items():
+                calls.append(f'    wrong += compare("{name}", {numbers.size}, computed_{name}, {name});')
+        tolerance = "1e-11" if self.formulas.dtype == "float64" else "1e-3"
+        lines.append(_COMPARE.format(type=self.type, tolerance=tolerance))
+        return "\n".join([*lines, "int main(void) {", "    int wrong = 0;", *calls, "    return wrong;", "}", ""])
+
+    def _array(self, name: str, numbers: np.ndarray) -> str:
+        texts = [self.constant(x) for x in numbers.flat] or ["0"]
+        return f"static const {self.type} {name}[] = {{\n    {_six_a_line(texts)}\n}};"
+
+
+def _state_and_outputs(formulas: Formulas, functions: Iterable[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """A random state, and what JAX computes there for this system, all of it finite; or the last of twenty tried."""
+    state: dict[str, Any] = {}
+    expected: dict[str, dict[str, np.ndarray]] = {}
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        draw = lambda n, rng=rng: rng.uniform(0.2, 0.8, n).astype(formulas.dtype)  # noqa: E731
+        state = {"t": draw(()), **{kind: draw(len(formulas.names(kind))) for kind in ("q", "u", "inputs", "u_dep")}}
+        args = [*state.values(), *formulas.values().values()]
+        with jax.enable_x64(formulas.dtype == "float64"):
+            for function in functions:
+                outputs = jax.tree.map(np.asarray, formulas.by_jax(function, *args))
+                expected[function] = dict(zip(formulas.nodes(function), outputs, strict=True))
+        if all(np.all(np.isfinite(x)) for outputs in expected.values() for x in outputs.values()):
+            break
+    return state, expected
+
+
+_PYTHON_FORMS = {
+    **COMPARISONS,
+    **{
+        name: call(f"np.{word}", 1 + (name in ("pow", "atan2", "rem", "max", "min")))
+        for name, word in NUMPY_NAMES.items()
+    },
+    **ARITHMETIC,
+    "erf": call("_erf"),
+    "and": Form("{0} & {1}", COMPARED, (TIGHT, TIGHT)),
+    "or": Form("{0} | {1}", COMPARED, (TIGHT, TIGHT)),
+    "xor": Form("{0} ^ {1}", COMPARED, (TIGHT, TIGHT)),
+    "select": call("np.where", 3),
+    "convert": call("np.{type}"),
+}
+
+
+PYTHON = Language(
+    "NumPy",
+    _PYTHON_FORMS,
+    _constant(("False", "True"), "np.nan", "np.inf"),
+    lambda name, text, dtype: f"{name} = {text}",
+    {name: name for name in DTYPES},
+)
+# Names that the text of a function, or Python, uses.
+_RESERVED = frozenset(
+    (*keyword.kwlist, *keyword.softkwlist, *dir(builtins), *"np q u t inputs parameters _erf".split())
+)
+
+
+def numpy(
+    system: System,
+    path: str | Path | None = None,
+    functions: Sequence[str] | None = None,
+    *,
+    dtype: str = "float64",
+) -> str:
+    """A system's equations as the source of a Python module that needs NumPy alone.
+
+        print(jk.export.numpy(pendulum, functions=("equations",)))
+        jk.export.numpy(pendulum, "pendulum.py")  # import pendulum; pendulum.rates(0.0, q, u)
+
+    Every function is `f(t, q, u, inputs=(), parameters=PARAMETERS)`: arrays in the order of the declared names, inputs
+    that are left out being zero; and the parameters by name. What is not a number comes out as NaN, as by JAX, without
+    a warning.
+
+    **Arguments:**
+
+    - `path`: where the source is written; None writes none.
+    - `functions`: which, as `jaxkane.export.c`; by default rates, equations, and dependent_speeds where there are some.
+    - `dtype`: "float64", or "float32".
+
+    **Returns:** the source.
+
+    **Raises:** `ValueError` as `jaxkane.export.c`.
+    """
+    formulas = Formulas(system, dtype)
+    text = _source(formulas, function_names(formulas, functions, ("rates", "equations", "dependent_speeds")))
+    if path is not None:
+        write_file(path, text.encode())
+    return text
+
+
+def _source(formulas: Formulas, functions: Sequence[str]) -> str:
+    units = {a.name: a.info.unit for a in formulas.of_kind("parameters")}
+    unit_of = _variable_units(formulas.system)
+    bodies = [_function(formulas, function, unit_of) for function in functions]
+    title = _title(formulas).replace("\\", "/").replace('"""', "'''")
+    with_erf = any("_erf(" in body for body in bodies)
+    lines = [f'"""{title}"""', ""]
+    lines += ["import math", ""] * with_erf + ["import numpy as np", ""]
+    lines += ["_erf = np.vectorize(math.erf)", ""] * with_erf
+    lines.append("PARAMETERS = {")
+    for name, value in formulas.values().items():
+        number = _nested([PYTHON.constant(x, formulas.dtype) for x in value.flat], value.shape)
+        number = f"np.array({number}, np.{formulas.dtype})" if value.shape else f"np.{formulas.dtype}({number})"
+        lines.append(f"    {name!r}: {number}," + (f"  # [{units[name]}]" if units[name] else ""))
+    return "\n".join([*lines, "}", *bodies])
+
+
+class _Names:
+    """What variables, parameters and outputs of a function are called. A parameter may be called like a coordinate."""
+
+    def __init__(self, formulas: Formulas, outputs: Iterable[str]):
+        kinds = ("q", "u", "inputs", "parameters")
+        named = [(kind, name) for kind in kinds for name in _names_of(formulas, kind)]
+        named += [("outputs", name) for name in outputs]
+        self.words = identifiers([name for _, name in named], _RESERVED, in_ascii_only=False)
+        self.of = dict(zip(named, self.words, strict=True))
+
+    def input_words(self, formulas: Formulas) -> dict[int, str]:
+        """The names of input nodes."""
+        words = {}
+        for a, nodes in zip(formulas.arguments, formulas.inputs, strict=True):
+            for place, k in np.ndenumerate(nodes):
+                if a.kind == "parameters":
+                    index = f"[{', '.join(map(str, place))}]" if place else ""
+                    words[int(k)] = self.of["parameters", a.name] + index
+                elif a.kind != "u_dep":
+                    words[int(k)] = self.of[a.kind, a.elements[place[0]]] if place else "t"
+        return words
+
+    def temporary(self) -> str:
+        """The pattern of the names of intermediate results, which no other name fits."""
+        letters = ("x", "z", *(f"x{'_' * n}" for n in range(1, 10)))
+        return next(f"{x}{{}}" for x in letters if not any(re.fullmatch(rf"{x}\d+", word) for word in self.words))
+
+
+def _names_of(formulas: Formulas, kind: str) -> tuple[str, ...]:
+    """Of parameters with axes the whole, of the others every element."""
+    return tuple(a.name for a in formulas.of_kind(kind)) if kind == "parameters" else formulas.names(kind)
+
+
+def _function(formulas: Formulas, function: str, unit_of: dict[str, str]) -> str:
+    by_output = formulas.nodes(function)
+    names = _Names(formulas, by_output)
+    body, outputs = as_source(
+        formulas.graph, list(by_output.values()), names.input_words(formulas), PYTHON, names.temporary()
+    )
+    text = "\n".join([*body, *(e for elements in outputs for e in elements)])
+    lines = ["", '@np.errstate(all="ignore")']
+    lines.append(f"def {function}(t, q, u, inputs=(), parameters=PARAMETERS):")
+    lines.append(f'    """{", ".join(by_output)}{_meaning(formulas, function)}."""')
+    for kind in ("q", "u", "inputs"):
+        words = [names.of[kind, name] for name in formulas.names(kind)]
+        if any(_is_read(word, text) for word in words):
+            units = ", ".join(unit_of.get(name) or "-" for name in formulas.names(kind))
+            right = f"np.asarray({kind}, np.{formulas.dtype})"
+            if kind == "inputs":
+                right += f" if len(inputs) else np.zeros({len(words)}, np.{formulas.dtype})"
+            lines.append(f"    {', '.join(words)}{',' * (len(words) == 1)} = {right}  # [{units}]")
+    for name in _names_of(formulas, "parameters"):
+        word = names.of["parameters", name]
+        if _is_read(word, text):
+            lines.append(f"    {word} = np.{formulas.dtype}(parameters[{name!r}])")
+    lines += [f"    {line}" for line in body]
+    for output, nodes, elements in zip(by_output, by_output.values(), outputs, strict=True):
+        array = f"np.array({_nested(elements, nodes.shape)}, np.{formulas.dtype})"
+        array += "" if nodes.size else f".reshape({nodes.shape})"
+        lines.append(f"    {names.of['outputs', output]} = {array}")
+    results = ", ".join(names.of["outputs", output] for output in by_output)
+    return "\n".join([*lines, f"    return {results}", ""])
+
+
+def _nested(elements: Sequence[str], shape: tuple[int, ...]) -> str:
+    """Elements as nested lists of this shape."""
+    if not shape:
+        return elements[0]
+    step = int(np.prod(shape[1:]))
+    return f"[{', '.join(_nested(elements[i * step : (i + 1) * step], shape[1:]) for i in range(shape[0]))}]"
