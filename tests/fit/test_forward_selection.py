@@ -25,7 +25,7 @@ from jaxkane.fit import (
     forward_selection,
     save_report,
 )
-from jaxkane.fit._candidates import groups_of
+from jaxkane.fit._candidates import compatible_groups
 from jaxkane.fit._statistics import bic_change
 
 TS = np.linspace(0.0, 2.0, 41)
@@ -217,7 +217,7 @@ def test_what_data_cannot_tell_is_said(rubbing):
         fitted(rubbing.problem.trials, **posed), ["unused", Offset("torque"), Candidate("own", input_gain="torque")]
     )
     reasons = {row.name: row.reason for row in found.rounds[0]}
-    assert reasons["unused"] == "unused is not seen by these data"
+    assert reasons["unused"] == "these data do not depend on unused"
     assert reasons["offset of torque"] == "offset of torque cannot be distinguished from what is free"
     assert "unused" in str(found)
     assert np.isnan(next(row for row in found.rounds[0] if row.name == "unused").errors["unused"])
@@ -311,7 +311,7 @@ def test_a_delay_of_what_is_held_is_asked_by_itself(held):
     """Its jumps are ramps: beside it no other candidate would be compared with the fit as it stands."""
     problem = types.SimpleNamespace(system=None, model=types.SimpleNamespace(zero_order_hold=held))
     asked = [Candidate("a", "mass"), Candidate("late", Delay("push")), Candidate("b", "stiffness")]
-    groups = [[c.name for c in group] for group in groups_of(types.SimpleNamespace(problem=problem), asked)]
+    groups = [[c.name for c in group] for group in compatible_groups(types.SimpleNamespace(problem=problem), asked)]
     assert groups == ([["a", "b"], ["late"]] if held else [["a", "late", "b"]])
 
 

@@ -1,9 +1,9 @@
-"""Extensions of a model that are to be tried: checked, grouped, and as one augmented problem."""
+"""Candidate extensions of a model: checked, grouped, and together in one augmented problem."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -27,7 +27,7 @@ OF_TRIALS = ("sensor_bias", "sensor_gain", "input_bias", "input_gain", "input_de
 
 @dataclasses.dataclass(frozen=True)
 class Candidate:
-    """Something that a model may lack, to be tried by `forward_selection`.
+    """An extension of a model, to be tested by `forward_selection`.
 
         Candidate("motor lag", system=Lagging.from_parameters(values), free="lag", unknown="motor_torque")
         Candidate("the roll sensor", free=[Offset("roll"), Gain("roll_rate")])
@@ -35,15 +35,14 @@ class Candidate:
 
     **Arguments:**
 
-    - `name`: for tables. `free`: what is freed, as in `fit`: names, `Free`, `Gain`, `Offset`, `Delay`, `Inertia`. Where
-        it stands in the system is where it is neutral.
-    - `system`: another one, that has the parameters which are free in the fit under the same names; by default the
-        fit's. Where its motion is the same as long as nothing more is freed, one linearization says what it promises;
-        where it is not, it is fitted.
-    - `unknown`: starts that are to be found besides, as those of its states.
+    - `name`: for tables. `free`: parameters, as in `fit`: names, `Free`, `Gain`, `Offset`, `Delay`, `Inertia`. With the
+        system's values of them nothing changes.
+    - `system`: another one, with the free parameters of the fit under the same names; by default the fit's. Where its
+        motion is the same as long as nothing else is free, it is tested by linearization, else by a fit.
+    - `unknown`: additional unknown starts, as those of its states.
     - `sensor_bias`, `sensor_gain`, `input_bias`, `input_gain`, `input_delay`: what every trial has its own of, as in
         `fit`.
-    - `plausible`: by name of a parameter, (lower, upper), beyond which it is not believed; None for an open side.
+    - `plausible`: by name of a parameter, its plausible range (lower, upper); None for an open side.
     """
 
     name: str
@@ -63,51 +62,47 @@ class Candidate:
 
     @property
     def of_trials(self) -> dict[str, dict[str, float | None]]:
-        """What every trial has its own of, by the argument of `fit`."""
+        """The unknowns of the trials' own, by the argument of `fit`."""
         return {key: deviations_by_name(getattr(self, key)) for key in OF_TRIALS}
 
 
-def candidates_of(fit: Fit, given: Any) -> tuple[Candidate, ...]:
-    """What was given, as candidates.
-
-    **Raises:** `ValueError` for none, for one that frees nothing or what is free already, for names that repeat, and
+def checked_candidates(fit: Fit, candidates: Any) -> tuple[Candidate, ...]:
+    """**Raises:** `ValueError` for none, for one that frees nothing or what is free already, for names that repeat, and
     two that free the same differently.
     """
-    given = (given,) if isinstance(given, Candidate) else as_items(given)
-    found = tuple(_candidate(fit, each) for each in given)
-    if not found:
+    items = (candidates,) if isinstance(candidates, Candidate) else as_items(candidates)
+    candidates = tuple(_candidate(fit, item) for item in items)
+    if not candidates:
         raise ValueError("There is no candidate: name parameters, `Gain`s, `Offset`s, `Delay`s or `Candidate`s.")
-    names = [candidate.name for candidate in found]
+    names = [candidate.name for candidate in candidates]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise ValueError(f"Two candidates are called {', '.join(twice)}: give each a name, Candidate(name, ...).")
-    for candidate in found:
+    for candidate in candidates:
         _refuse_nothing_new(fit, candidate)
-    for group in groups_of(fit, found):
-        posed_with(fit, group)  # refuses two that free the same differently
-    return found
+    for group in compatible_groups(fit, candidates):
+        extended_specification(fit, group)  # refuses two that free the same differently
+    return candidates
 
 
-def _candidate(fit: Fit, each: Any) -> Candidate:
-    """A parameter alone, with its bounds as what is plausible where it stands on one of them, as friction on zero."""
-    if not isinstance(each, Candidate):
-        names = _named(fit.problem.system, _without_bounds_at_start(fit.problem.system, each)[0])
-        each = Candidate(", ".join(names), free=(each,))
-    system = each.system or fit.problem.system
+def _candidate(fit: Fit, item: Any) -> Candidate:
+    """A parameter alone, with its bounds as its plausible range where it starts on one of them, as friction at zero."""
+    if not isinstance(item, Candidate):
+        names = _names_of(fit.problem.system, _without_bounds_at_start(fit.problem.system, item)[0])
+        item = Candidate(", ".join(names), free=(item,))
+    system = item.system or fit.problem.system
     if not isinstance(system, System):
-        raise TypeError(f"{each.name}: `system` is a jaxkane.System, got {type(system).__name__}.")
-    items, plausible = [], {}
-    for item in each.items:
-        item, bounds = _without_bounds_at_start(system, item)
-        items.append(item)
-        plausible |= bounds
-    known = [name for item in items for name in _named(system, item)]
-    refuse_unknown(each.plausible, (*known, *fit.names), f"{each.name}: `plausible` names")
-    return dataclasses.replace(each, free=tuple(items), plausible={**plausible, **each.plausible})
+        raise TypeError(f"{item.name}: `system` is a jaxkane.System, got {type(system).__name__}.")
+    unbounded = [_without_bounds_at_start(system, one) for one in item.items]
+    free = tuple(one for one, _ in unbounded)
+    bounds = {name: pair for _, of_one in unbounded for name, pair in of_one.items()}
+    known = [name for one in free for name in _names_of(system, one)]
+    refuse_unknown(item.plausible, (*known, *fit.names), f"{item.name}: `plausible` names")
+    return dataclasses.replace(item, free=free, plausible={**bounds, **item.plausible})
 
 
 def _without_bounds_at_start(system: System, item: Any) -> tuple[Any, dict[str, Bounds]]:
-    """The same to be searched for on both sides, where it starts on a bound; and that bound."""
+    """The same without bounds, and these, where it starts on one of them; else as it is."""
     named = Free(item) if isinstance(item, str) or callable(item) else item
     if not isinstance(named, (Free, CalibrationTerm)):
         return item, {}
@@ -118,111 +113,94 @@ def _without_bounds_at_start(system: System, item: Any) -> tuple[Any, dict[str, 
     return dataclasses.replace(named, bounds=(None, None)), dict(zip(free.names, ends, strict=True))
 
 
-def _named(system: System, item: Any) -> tuple[str, ...]:
-    return parameters_of(system, [item]).names
+def _names_of(system: System, *items: Any) -> tuple[str, ...]:
+    return parameters_of(system, items).names if items else ()
 
 
 def _refuse_nothing_new(fit: Fit, candidate: Candidate) -> None:
-    system = candidate.system or fit.problem.system
-    names = parameters_of(system, candidate.items).names if candidate.items else ()
+    names = _names_of(candidate.system or fit.problem.system, *candidate.items)
     free = [name for name in names if name in fit.names]
     if free:
         raise ValueError(f"{candidate.name}: {', '.join(free)} is free in the fit already.")
-    asked, more = fit.problem.specification, candidate.of_trials
+    specification, of_trials = fit.problem.specification, candidate.of_trials
     for key in OF_TRIALS:
-        there = [name for name in more[key] if name in deviations_by_name(getattr(asked, key))]
-        if there:
-            raise ValueError(f"{candidate.name}: every trial has its own {key} of {', '.join(there)} already.")
-    starts = [name for name in deviations_by_name(candidate.unknown) if name in deviations_by_name(asked.unknown)]
+        both = [name for name in of_trials[key] if name in deviations_by_name(getattr(specification, key))]
+        if both:
+            raise ValueError(f"{candidate.name}: every trial has its own {key} of {', '.join(both)} already.")
+    known = deviations_by_name(specification.unknown)
+    starts = [name for name in deviations_by_name(candidate.unknown) if name in known]
     if starts:
         raise ValueError(f"{candidate.name}: the start of {', '.join(starts)} is unknown already.")
-    if not names and not any(more.values()) and not candidate.unknown and candidate.system is None:
+    if not names and not any(of_trials.values()) and not candidate.unknown and candidate.system is None:
         raise ValueError(f"{candidate.name}: nothing is freed, and nothing else is unknown.")
 
 
-def groups_of(fit: Fit, candidates: Sequence[Candidate]) -> Iterator[list[Candidate]]:
+def compatible_groups(fit: Fit, candidates: Sequence[Candidate]) -> list[list[Candidate]]:
     """Candidates that one problem can hold: those of the same system, with the same unknown starts.
 
-    What delays an input under a zero-order hold stands by itself: its jumps are then ramps of two steps, by which the
-    motion differs a little before anything is delayed.
+    A delay of an input under a zero-order hold is in a group of its own: the jumps of the input are then ramps of two
+    steps, by which the motion differs a little before anything is delayed.
     """
     groups: list[list[Candidate]] = []
     for candidate in candidates:
-        for group in groups:
-            if _same_frame(fit, group[0], candidate):
-                group.append(candidate)
-                break
-        else:
+        group = next((group for group in groups if _are_compatible(fit, group[0], candidate)), None)
+        if group is None:
             groups.append([candidate])
-    yield from groups
+        else:
+            group.append(candidate)
+    return groups
 
 
-def _same_frame(fit: Fit, a: Candidate, b: Candidate) -> bool:
-    systems = [c.system or fit.problem.system for c in (a, b)]
-    same = deviations_by_name(a.unknown) == deviations_by_name(b.unknown) and _held_and_late(fit, a) == _held_and_late(
-        fit, b
-    )
-    return same and bool(eqx.tree_equal(*systems))
+def _are_compatible(fit: Fit, a: Candidate, b: Candidate) -> bool:
+    same = deviations_by_name(a.unknown) == deviations_by_name(b.unknown) and _delayed(fit, a) == _delayed(fit, b)
+    return same and bool(eqx.tree_equal(*(c.system or fit.problem.system for c in (a, b))))
 
 
-def _held_and_late(fit: Fit, candidate: Candidate) -> set[str]:
+def _delayed(fit: Fit, candidate: Candidate) -> set[str]:
     """Inputs under a zero-order hold that a candidate delays."""
-    late = {item.what for item in candidate.items if isinstance(item, Delay)} | {
-        *deviations_by_name(candidate.input_delay)
-    }
-    return late & {*fit.problem.model.zero_order_hold}
+    delayed = {item.what for item in candidate.items if isinstance(item, Delay)}
+    return (delayed | {*deviations_by_name(candidate.input_delay)}) & {*fit.problem.model.zero_order_hold}
 
 
-def posed_with(fit: Fit, candidates: Sequence[Candidate]) -> ProblemSpec:
-    """What the fit was asked, with these candidates in it.
+def extended_specification(fit: Fit, candidates: Sequence[Candidate]) -> ProblemSpec:
+    """The specification of the fit, with these candidates in it.
 
     **Raises:** `ValueError` where two of them free the same differently, or are of systems that exclude each other.
     """
-    asked, system = fit.problem.specification, _system_of(fit, candidates)
-    items: list[tuple[Any, tuple[str, ...]]] = []
-    for item in (item for candidate in candidates for item in candidate.items):
-        names = _named(system, item)
-        same = [other for other, there in items if set(there) & set(names)]
-        if same and not all(_equal(other, item) for other in same):
-            raise ValueError(f"Two candidates free {', '.join(names)} in different ways.")
-        if not same:
-            items.append((item, names))
-    more: dict[str, Any] = {"free": [*asked.free, *(item for item, _ in items)]}
-    for key in ("unknown", *OF_TRIALS):
-        more[key] = deviations_by_name(getattr(asked, key))
-        for candidate in candidates:
-            more[key] |= deviations_by_name(getattr(candidate, key))
-    return dataclasses.replace(asked, system=system, **more)
-
-
-def _system_of(fit: Fit, candidates: Sequence[Candidate]) -> System:
-    system = fit.problem.system
+    specification, system = fit.problem.specification, fit.problem.system
     for candidate in candidates:
         other = candidate.system
         if other is None or bool(eqx.tree_equal(other, system)):
             continue
         if system is not fit.problem.system and not isinstance(other, type(system)):  # that of a candidate before
             if isinstance(system, type(other)):
-                continue  # the one there has what this one has
+                continue  # that one has all of this one
             raise ValueError(f"{candidate.name}: {type(other).__name__} is no {type(system).__name__}.")
         system = other
-    return system
-
-
-def _equal(a: Any, b: Any) -> bool:
-    return a is b or bool(a == b)
+    items: list[tuple[Any, tuple[str, ...]]] = []
+    for item in (item for candidate in candidates for item in candidate.items):
+        names = _names_of(system, item)
+        same = [other for other, other_names in items if set(other_names) & set(names)]
+        if any(other is not item and not bool(other == item) for other in same):
+            raise ValueError(f"Two candidates free {', '.join(names)} in different ways.")
+        if not same:
+            items.append((item, names))
+    changes: dict[str, Any] = {"free": [*specification.free, *(item for item, _ in items)]}
+    for key in ("unknown", *OF_TRIALS):
+        changes[key] = deviations_by_name(getattr(specification, key))
+        for candidate in candidates:
+            changes[key] |= deviations_by_name(getattr(candidate, key))
+    return dataclasses.replace(specification, system=system, **changes)
 
 
 @dataclasses.dataclass(frozen=True)
-class Extended:
-    """One problem in which all candidates of one system are free, at the point where the fit ended.
+class AugmentedProblem:
+    """One problem in which all candidates of a group are free, at the minimum of the restricted model.
 
-    - `names`: of all parameters; the first are those of the fit. `own_x`, `own_b`: by candidate, which parameters and
-        unknowns of trials are its own.
-    - `base_x`, `base_b`: which are the fit's.
+    - `base_x`, `base_b`: which parameters and unknowns of trials are free in the restricted model. `own_x`, `own_b`: by
+        candidate, which are its own.
     """
 
-    candidates: tuple[Candidate, ...]
     problem: Problem
     point: Unknowns
     base_x: tuple[int, ...]
@@ -230,92 +208,77 @@ class Extended:
     own_x: dict[str, tuple[int, ...]]
     own_b: dict[str, tuple[int, ...]]
 
+    @classmethod
+    def of(
+        cls,
+        fit: Fit,
+        minimum: tuple[Problem, Unknowns],
+        candidates: Sequence[Candidate],
+        selected: Sequence[Candidate],
+        order: Sequence[str],
+    ) -> AugmentedProblem:
+        """The fit's problem with these candidates; those `selected` before are free at the `minimum`.
+
+        All are in the `order` of their names, whichever are selected, so that each round runs the same compiled
+        program.
+
+        **Raises:** `ValueError` where a system lacks what is free in the fit, or two free the same differently.
+        """
+        both = sorted((*selected, *candidates), key=lambda c: order.index(c.name))
+        specification = extended_specification(fit, both)
+        if fit.problem.chooses_steps:  # the fit has chosen: nothing is tried again
+            step = float(np.median(np.asarray(fit.problem.windows.step)))
+            simulation = dataclasses.replace(specification.simulation or Simulation(), step=step)
+            specification = dataclasses.replace(specification, simulation=simulation)
+        problem = fit.problem.with_specification(specification)
+        names, of_trial = problem.parameters.names, problem.model.nuisance.trial
+        own_x = {c.name: tuple(map(names.index, _names_of(specification.system, *c.items))) for c in both}
+        own_b = {}
+        for c in both:  # as `Nuisance.trial` has them
+            keys = [(*key.split("_"), name) for key, by_name in c.of_trials.items() for name in by_name]
+            own_b[c.name] = tuple(of_trial.index((f"{kind} of {where}", name)) for where, kind, name in keys)
+        base_x = [names.index(name) for name in fit.names] + [i for c in selected for i in own_x[c.name]]
+        base_b = list(map(of_trial.index, fit.problem.model.nuisance.trial))
+        base_b += [i for c in selected for i in own_b[c.name]]
+        base_x, base_b = tuple(dict.fromkeys(base_x)), tuple(dict.fromkeys(base_b))
+        point = mapped_point(*minimum, problem, [names[i] for i in base_x])
+        return cls(problem, point, base_x, base_b, own_x, own_b)
+
     @property
     def names(self) -> tuple[str, ...]:
         return self.problem.parameters.names
 
-    def owned(self, active: Sequence[Candidate]) -> tuple[list[int], list[int]]:
-        """Which parameters, and which unknowns of trials, are the fit's or of these candidates."""
-        x, b = list(self.base_x), list(self.base_b)
-        for candidate in active:
-            x += [i for i in self.own_x[candidate.name] if i not in x]
-            b += [i for i in self.own_b[candidate.name] if i not in b]
-        return x, b
+    def places(self, candidate: Candidate) -> tuple[list[int], list[int]]:
+        """Which parameters, and which unknowns of trials, are the restricted model's or this candidate's."""
+        x, b = (*self.base_x, *self.own_x[candidate.name]), (*self.base_b, *self.own_b[candidate.name])
+        return list(dict.fromkeys(x)), list(dict.fromkeys(b))
 
-    def with_only(self, active: Sequence[Candidate], held: np.ndarray) -> tuple[Problem, Unknowns]:
-        """The problem in which of all candidates only these are free, and the same point of it.
+    def with_only(self, candidate: Candidate, fixed: np.ndarray) -> tuple[Problem, Unknowns]:
+        """The problem in which of all candidates only this one is free, and the same point of it.
 
-        Parameters of the others are left out; their unknowns of trials are held by priors of the deviations `held`. As
-        many free ones run the same compiled program.
+        The parameters of all other candidates are left out; their unknowns of trials are fixed by priors of the
+        deviations `fixed`. Any candidates with as many free parameters run the same compiled program.
         """
-        (free_x, free_b), model = self.owned(active), self.problem.model
+        (free_x, free_b), model = self.places(candidate), self.problem.model
         part = ParameterSubset(model.parameters, jnp.asarray(free_x, dtype=jnp.int32), self.point.x)
-        of_trial = np.array(model.nuisance.trial_deviation)
-        still = np.delete(np.arange(of_trial.size), free_b)
-        of_trial[still] = held[still]
+        deviation = np.array(fixed)
+        deviation[free_b] = np.asarray(model.nuisance.trial_deviation)[free_b]
         where = lambda m: (m.parameters, m.nuisance.trial_deviation)  # noqa: E731
-        model = eqx.tree_at(where, model, (part, jnp.asarray(of_trial, self.point.x.dtype)))
+        model = eqx.tree_at(where, model, (part, jnp.asarray(deviation, self.point.x.dtype)))
         point = eqx.tree_at(lambda p: p.x, self.point, self.point.x[part.places])
         return dataclasses.replace(self.problem, model=model), point
 
 
-def extended(
-    fit: Fit,
-    standing: tuple[Problem, Unknowns],
-    candidates: Sequence[Candidate],
-    taken: Sequence[Candidate],
-    order: Sequence[str],
-) -> Extended:
-    """The fit's problem with all that candidates of one group free; those `taken` before are free at `standing`.
-
-    All stand in the `order` of their names, whoever was taken, so that each round runs the same compiled program.
-
-    **Raises:** `ValueError` where a system lacks what is free in the fit, or two candidates free the same differently.
-    """
-    both = sorted((*taken, *candidates), key=lambda c: order.index(c.name))
-    asked = posed_with(fit, both)
-    if fit.problem.chooses_steps:  # the fit has chosen: nothing is tried again
-        step = float(np.median(np.asarray(fit.problem.windows.step)))
-        chosen = dataclasses.replace(asked.simulation or Simulation(), step=step)
-        asked = dataclasses.replace(asked, simulation=chosen)
-    problem = fit.problem.with_specification(asked)
-    names, trial, system = problem.parameters.names, problem.model.nuisance.trial, asked.system
-    own_x = {c.name: tuple(names.index(n) for n in _parameter_names(system, c)) for c in both}
-    own_b = {c.name: tuple(trial.index(pair) for pair in _pairs(c)) for c in both}
-    base_x = [names.index(name) for name in fit.names]
-    base_b = [trial.index(pair) for pair in fit.problem.model.nuisance.trial]
-    for before in taken:
-        base_x += [i for i in own_x[before.name] if i not in base_x]
-        base_b += [i for i in own_b[before.name] if i not in base_b]
-    point = carried(*standing, problem, [names[i] for i in base_x])
-    mine = [{c.name: own[c.name] for c in candidates} for own in (own_x, own_b)]
-    return Extended(tuple(candidates), problem, point, tuple(base_x), tuple(base_b), *mine)
-
-
-def _parameter_names(system: System, candidate: Candidate) -> tuple[str, ...]:
-    return parameters_of(system, candidate.items).names if candidate.items else ()
-
-
-def _pairs(candidate: Candidate) -> list[tuple[str, str]]:
-    """As `Nuisance.trial` has them."""
-    found = []
-    for key, names in candidate.of_trials.items():
-        where, kind = key.split("_")
-        found += [(f"{kind} of {where}", name) for name in names]
-    return found
-
-
-def carried(there: Problem, at: Unknowns, problem: Problem, names: Sequence[str]) -> Unknowns:
-    """A point of one problem as one of another that has more unknowns: what is new is where it starts."""
-    point, old, new = problem.start, there.model.nuisance, problem.model.nuisance
-    known, values = there.parameters.names, np.asarray(parameter_values(there.parameters, at.x))
-    if bool(eqx.tree_equal(problem.system, there.system)):
-        to, of = (
-            np.array([all_names.index(n) for n in names], dtype=int) for all_names in (problem.parameters.names, known)
-        )
+def mapped_point(source: Problem, at: Unknowns, problem: Problem, names: Sequence[str]) -> Unknowns:
+    """A point of one problem as one of another that has more unknowns; the new ones are where they start."""
+    point, old, new = problem.start, source.model.nuisance, problem.model.nuisance
+    source_names, targets = source.parameters.names, problem.parameters.names
+    if bool(eqx.tree_equal(problem.system, source.system)):
+        to, of = (np.array([one.index(name) for name in names], dtype=int) for one in (targets, source_names))
         point = eqx.tree_at(lambda p: p.x, point, point.x.at[to].set(at.x[of]))
     else:
-        point = problem.at({name: float(values[known.index(name)]) for name in names}, point)
+        values = np.asarray(parameter_values(source.parameters, at.x))
+        point = problem.at({name: float(values[source_names.index(name)]) for name in names}, point)
     b = [(new.trial.index(pair), i) for i, pair in enumerate(old.trial) if pair in new.trial]
     z = [(new.start.index(name), i) for i, name in enumerate(old.start)]
     for pairs, where in ((b, lambda p: p.b), (z, lambda p: p.z)):

@@ -1,4 +1,4 @@
-"""What a model may lack: candidates ranked by score tests, refitted, and decided on."""
+"""Forward selection of model extensions: candidates, score tests, refits, decisions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,14 @@ from tqdm import tqdm
 
 from .._common.lookup import refuse_unknown
 from ._block_lsq import Blocks, eliminate
-from ._candidates import Candidate, Extended, candidates_of, carried, extended, groups_of, posed_with
+from ._candidates import (
+    AugmentedProblem,
+    Candidate,
+    checked_candidates,
+    compatible_groups,
+    extended_specification,
+    mapped_point,
+)
 from ._compare import Plausible, plausible_of
 from ._covariance import parameter_slopes, parameter_values
 from ._fit import minimize, solve, uninterrupted
@@ -26,6 +33,7 @@ from ._problem import Problem, refuse_other
 from ._result import Fit
 from ._statistics import (
     LinearizedProblem,
+    Score,
     bic_change,
     check_level,
     effective_sample_fraction,
@@ -38,83 +46,22 @@ from ._statistics import (
 from ._tables import Rows, html_tables, text_tables
 from ._validate import folds_of
 
-Folds = Sequence[Sequence[int]] | None
-
-
-@dataclasses.dataclass(frozen=True)
-class Standing:
-    """Where a search stands: at a minimum of a problem of whose parameters `names` are free, the others held. `rows`
-    is its linearization there, in the columns of all its parameters; `freedom`: residuals less unknowns."""
-
-    problem: Problem
-    point: Unknowns
-    names: tuple[str, ...]
-    cost: float
-    freedom: int
-    correlation: float
-    rows: LinearizedProblem
-
-    @classmethod
-    def of(cls, fit: Fit) -> Standing:
-        problem, at = fit.problem, fit.linearization
-        if np.any(np.isfinite(np.asarray(fit.parameters.prior_deviation))):
-            again = without_priors(problem).linearize(fit.point)
-            assert again is not None
-            at = again
-        n_r, n_unknown = problem.size
-        rows = rows_of(problem, at, fit.point, range(fit.point.b.shape[1]))
-        return cls(problem, fit.point, fit.names, fit.cost, n_r - n_unknown, fit.autocorrelation, rows)
-
-    @property
-    def places(self) -> list[int]:
-        return [self.problem.parameters.names.index(name) for name in self.names]
-
-    @property
-    def values(self) -> dict[str, float]:
-        values = np.asarray(parameter_values(self.problem.parameters, self.point.x))
-        return {name: float(values[i]) for name, i in zip(self.names, self.places, strict=True)}
-
-    def held_out_cost(self, folds: Folds) -> float:
-        """The sum of squares of trials left out in turn, with the parameters that the others say; NaN without folds."""
-        return self.rows.cost_left_out(self.places, folds) if folds is not None else float("nan")
-
-    def carried_to(self, problem: Problem) -> Unknowns:
-        """The same point of a problem that has all these unknowns, and others."""
-        return carried(self.problem, self.point, problem, self.names)
-
-
-def without_priors(problem: Problem) -> Problem:
-    """The same without priors of parameters; nothing is compiled anew."""
-    return problem.with_priors(dict.fromkeys(problem.parameters.names, (0.0, float("inf"))))
-
-
-def rows_of(problem: Problem, at: Linearization, point: Unknowns, b: Sequence[int]) -> LinearizedProblem:
-    """A linearization without priors, starts and these unknowns of trials eliminated, the others held."""
-    blocks, parameters = at.blocks, problem.parameters
-    first = blocks.n_z + blocks.n_next
-    kept = [*range(first), *(first + i for i in b), *range(first + blocks.n_b, blocks.R.shape[-1])]
-    R = blocks.R[:, :, jnp.asarray(kept, dtype=jnp.int32)]
-    reduced = Blocks(R, blocks.windows, blocks.n_z, blocks.n_next, len(list(b)))
-    deviation, norms = np.asarray(parameters.prior_deviation, float)[:, None], np.asarray(blocks.column_norms, float)
-    slopes, off = np.asarray(parameter_slopes(parameters, point.x)), np.asarray(parameters.prior_residuals(point.x))
-    return LinearizedProblem(
-        np.asarray(eliminate(reduced, 0.0).R, float), np.column_stack([slopes / deviation, off]), norms
-    )
-
-
 HEAD = ("candidate", "estimate", "std. error", "predicted cost", "cost", "p", "criterion", "held-out cost", "decision")
+
+NESTED = 1e-6
+"""By what part of it the sum of squares may differ at the start of a nested candidate."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Extension:
-    """One candidate.
+    """A candidate and its tests.
 
-    - `parameters`: what it frees; `values`: by name, of these and of all that was free; `errors`: of these. Fitted
-        where `cost` is a number, else as the linearization has them.
-    - `predicted_cost`, `cost`: the sum of squares by the linearization, and fitted (NaN where it was not). `p`: of the
-        test, of what is nested. `criterion`: what decides beside the trials left
-        out: "score test" before it is fitted, "F test" or "t test" after; of what is not nested "trials left out"
-        alone, or "BIC" where none can be left out.
+    - `parameters`: those that it frees; `values`: by name, of these and of all that was free; `errors`: of these. Of
+        its fit where `cost` is a number, else of the linearization.
+    - `nested`: whether the motion is the same before anything is freed. `predicted_cost`: the sum of squares by the
+        linearization, where it is nested; `cost`: after a fit (NaN without).
+    - `p`: of the test, where it is nested. `criterion`: what decides beside the trials left out: "score test" before a
+        fit, "F test" or "t test" after it; of what is not nested "trials left out" alone, or "BIC" where there is one.
     - `held_out_cost`: the sum of squares of trials that are left out in turn; unknowns of the trials' own, which are
         estimated for those too, count twice the variance of a residual each.
     - `objections`: what is not plausible, in words. `accepted`, or the `reason` why not.
@@ -124,6 +71,7 @@ class Extension:
     parameters: tuple[str, ...] = ()
     values: Mapping[str, float] = dataclasses.field(default_factory=dict, hash=False)
     errors: Mapping[str, float] = dataclasses.field(default_factory=dict, hash=False)
+    nested: bool = True
     predicted_cost: float = math.nan
     cost: float = math.nan
     p: float = math.nan
@@ -134,36 +82,26 @@ class Extension:
     accepted: bool = False
 
     @property
-    def least(self) -> float:
-        """What is known of the sum of squares with it; infinite where nothing is."""
-        known = [x for x in (self.cost, self.predicted_cost) if not math.isnan(x)]
-        return known[0] if known else math.inf
-
-    @property
     def cells(self) -> tuple[str, ...]:
         number = lambda x, form=".5g": "" if math.isnan(x) else f"{x:{form}}"  # noqa: E731
         known = [name for name in self.parameters if not math.isnan(self.errors[name])]
         estimates = ", ".join(f"{self.values[name]:.4g}" for name in known)
         errors = ", ".join(f"{self.errors[name]:.2g}" for name in known)
-        tested = (number(self.predicted_cost), number(self.cost), number(self.p, ".2g"), self.criterion)
+        costs, decision = (number(self.predicted_cost), number(self.cost)), self.reason or "accepted"
         return (
-            self.name,
-            estimates,
-            errors,
-            *tested,
-            number(self.held_out_cost),
-            "accepted" if self.accepted else self.reason,
+            *(self.name, estimates, errors, *costs),
+            *(number(self.p, ".2g"), self.criterion, number(self.held_out_cost), decision),
         )
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class ForwardSelection:
-    """What `forward_selection` found; print it for the tables.
+    """The result of `forward_selection`; print it for the tables.
 
     - `rounds`: the candidates of each round, the accepted ones first. `costs`, `held_out_costs`: the sums of squares
-        with which each began, fitted and of trials held out in turn.
-    - `selected`: names of what was selected, in that order; `best`: the first one, or None. `fit`: with all of it
-        free; where nothing was selected, the one `before`.
+        with which each began, fitted and of trials left out in turn.
+    - `selected`: the names of the selected candidates, in that order; `best`: the first one, or None. `fit`: with all
+        of them; the one `before` where there is none.
     - `level`: of the test.
     """
 
@@ -183,23 +121,24 @@ class ForwardSelection:
     def tables(self) -> list[tuple[str, Rows]]:
         """A heading and rows, of which the first is the head, of every round."""
         tables: list[tuple[str, Rows]] = []
-        for i, (cost, out, rows) in enumerate(zip(self.costs, self.held_out_costs, self.rounds, strict=True)):
+        for i, extensions in enumerate(self.rounds):
             beside = f" with {', '.join(self.selected[:i])}" if i else ""
-            left = "one trial, nothing is left out" if math.isnan(out) else f"{out:.5g} of trials left out in turn"
-            heading = f"Sum of squares{beside} {cost:.6g}; {left}."
-            tables.append((heading, [HEAD, *(row.cells for row in rows)]))
+            held_out = f"{self.held_out_costs[i]:.5g} of trials left out in turn"
+            if math.isnan(self.held_out_costs[i]):
+                held_out = "one trial, nothing is left out"
+            heading = f"Sum of squares{beside} {self.costs[i]:.6g}; {held_out}."
+            tables.append((heading, [HEAD, *(extension.cells for extension in extensions)]))
         return tables
 
     @property
     def conclusion(self) -> str:
         if not self.selected:
             return f"Nothing is selected: no candidate is accepted at a level of {self.level:g}."
-        left = (
-            "" if math.isnan(self.held_out_costs[0]) else f" (of trials left out: {self.held_out_costs[0]:.5g} before)"
-        )
-        best = zip(self.selected, self.rounds, strict=False)
-        taken = [f"{name} (not nested: by {r[0].criterion})" if math.isnan(r[0].p) else name for name, r in best]
-        return f"Selected: {', '.join(taken)}. Sum of squares {self.before.cost:.6g} -> {self.fit.cost:.6g}{left}."
+        held_out = self.held_out_costs[0]
+        left_out = "" if math.isnan(held_out) else f" (of trials left out: {held_out:.5g} before)"
+        best = [extensions[0] for extensions in self.rounds[: len(self.selected)]]
+        names = [one.name if one.nested else f"{one.name} (not nested: by {one.criterion})" for one in best]
+        return f"Selected: {', '.join(names)}. Sum of squares {self.before.cost:.6g} -> {self.fit.cost:.6g}{left_out}."
 
     def __str__(self) -> str:
         return f"{text_tables(self.tables, (0, len(HEAD) - 1))}\n\n{self.conclusion}"
@@ -208,230 +147,6 @@ class ForwardSelection:
 
     def _repr_html_(self) -> str:
         return f"{html_tables(self.tables)}<p>{html.escape(self.conclusion)}</p>"
-
-
-NEUTRAL = 1e-6
-"""By what part of it the sum of squares may differ where a candidate changes nothing at first."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Trying:
-    """What is the same for all candidates of a round."""
-
-    fit: Fit
-    standing: Standing
-    selected: tuple[Candidate, ...]
-    order: tuple[str, ...]  # of all candidates
-    share: float  # of the level, for each
-    said: Mapping[str, Any]
-    folds: Folds
-
-    def all_of(
-        self, left: Sequence[Candidate], refits: int | None, bar: Any
-    ) -> tuple[tuple[Extension, ...], dict[str, Standing]]:
-        """What every candidate promises, and of the promising ones what they keep; with where the search stands then.
-        Those that stand come first, the best at the top."""
-        promises = [promise for group in groups_of(self.fit, left) for promise in self._linearized(group, bar)]
-        rows, found = {promise.row.name: promise.row for promise in promises}, {}
-        able = [h for h in promises if h.extended is not None and not h.row.reason]
-        nested, others = ([h for h in able if h.nested is nested] for nested in (True, False))
-        if refits is not None:
-            nested = [h for h in nested if h.row.p < self.share]
-            nested = sorted(nested, key=lambda h: (bool(h.objections), h.row.predicted_cost))[:refits]
-        for promise in nested + (others if refits != 0 else []):  # what is not nested promises nothing before its fit
-            bar.set_postfix_str(promise.row.name)
-            rows[promise.row.name], after = self._fitted(promise)
-            found |= {} if after is None else {promise.row.name: after}
-            bar.update()
-        done = [self._judged(row) for row in rows.values()]
-        best = lambda row: (not row.accepted, row.held_out_cost if row.accepted and self.folds else row.least)  # noqa: E731
-        return tuple(sorted(done, key=best)), found
-
-    def _linearized(self, group: Sequence[Candidate], bar: Any) -> list[Promise]:
-        """The candidates of one system, by one linearization."""
-        bar.set_postfix_str(f"{len(group)} linearized")
-        try:
-            more = extended(self.fit, (self.standing.problem, self.standing.point), group, self.selected, self.order)
-            at, why = without_priors(more.problem).linearize(more.point), "cannot be simulated where it starts"
-        except ValueError as error:
-            more, at, why = None, None, str(error)
-        bar.update()
-        if more is None or at is None or not usable(at):
-            return [Promise(c, Extension(c.name, reason=why)) for c in group]
-        said = {name: value for c in group for name, value in c.plausible.items()}
-        said |= {name: value for name, value in self.said.items() if name in more.names}
-        # What was free has started where the fit did, whatever another system begins with.
-        ranges = {
-            p: r
-            for of in (more.problem.parameters, self.fit.parameters)
-            for p, r in plausible_of(of, said).ranges.items()
-        }
-        common = Common(more, at, _held(at), Plausible(ranges))
-        return [self._promised(candidate, common) for candidate in group]
-
-    def _promised(self, candidate: Candidate, common: Common) -> Promise:
-        more, (x, b) = common.extended, common.extended.owned([candidate])
-        new = [i for i in x if i not in more.base_x]
-        rows, was = rows_of(more.problem, common.at, more.point, b), self.standing
-        count = self._unknowns(candidate, more)
-        without = None
-        if count:  # what the fit has without them, in its own rows
-            without = rows_of(more.problem, common.at, more.point, more.base_b).minimum(more.base_x)[1]
-        found = score_test(
-            rows,
-            more.base_x,
-            new,
-            degrees_of_freedom=was.freedom,
-            more=count,
-            correlation=was.correlation,
-            without=without,
-        )
-        A, r = rows.of(x)
-        here = common.at.cost + float(np.sum(rows.priors[x, -1] ** 2))
-        nested = abs(here - was.cost) <= NEUTRAL * was.cost + 1e-9
-        slopes = np.asarray(parameter_slopes(more.problem.parameters, more.point.x))
-        moved = np.zeros(len(more.names))
-        moved[x] = solved(A, r)
-        values = np.asarray(parameter_values(more.problem.parameters, more.point.x)) + slopes @ moved
-        left_out = float("nan")
-        if nested and self.folds is not None:
-            freedom = was.freedom - len(new) - count
-            left_out = rows.cost_left_out(x, self.folds) + _own_share(
-                count, found.minimal_cost, freedom, was.correlation
-            )
-        row_names = tuple(more.names[i] for i in new)
-        row = Extension(
-            name=candidate.name,
-            parameters=row_names,
-            values={more.names[i]: float(values[i]) for i in x},
-            errors=_errors(row_names, slopes[np.ix_(new, new)], found.covariance),
-            predicted_cost=was.cost - found.drop if nested else float("nan"),
-            p=found.p if nested else float("nan"),
-            criterion="score test" if nested else "",
-            held_out_cost=left_out,
-            reason=_undetermined(more, new, found) if nested else "",
-        )
-        objections = common.plausible.bound_violations(row.values)
-        return Promise(candidate, row, more, common, nested, tuple(objections))
-
-    def _fitted(self, promise: Promise) -> tuple[Extension, Standing | None]:
-        """After a fit of all that is free and this."""
-        more, was, row, common = promise.extended, self.standing, promise.row, promise.common
-        assert more is not None
-        assert common is not None
-        problem, start = more.with_only([promise.candidate], common.held)
-        try:
-            found = uninterrupted(minimize(problem, LeastSquares(), start=start))
-            at = without_priors(problem).linearize(found.point)
-        except ValueError as error:
-            return dataclasses.replace(row, reason=str(error)), None
-        if at is None or not usable(at) or found.status != "converged":
-            return dataclasses.replace(row, reason=f"its fit has not converged ({found.status})"), None
-        n, count = len(more.base_x), self._unknowns(promise.candidate, more)
-        k = len(found.names) - n + count
-        rows = rows_of(problem, at, found.point, more.owned([promise.candidate])[1])
-        after = Standing(problem, found.point, found.names, found.cost, was.freedom - k, found.autocorrelation, rows)
-        now = score_test(
-            rows,
-            range(n),
-            range(n, len(found.names)),
-            degrees_of_freedom=was.freedom,
-            more=count,
-            correlation=after.correlation,
-        )
-        slopes = np.asarray(parameter_slopes(problem.parameters, found.point.x))
-        p, criterion, reason = float("nan"), "trials left out", ""
-        if promise.nested:
-            p, criterion = f_test(was.cost - after.cost, k, after.cost, after.freedom, after.correlation), "F test"
-            if not count and use_clusters(rows, len(found.names), after.correlation):
-                p = wald_test(np.asarray(found.point.x - start.x)[n:], now.covariance, len(rows.data))
-                criterion = "t test"
-        elif self.folds is None:
-            change, criterion = bic_change(was.cost, after.cost, k, self.fit.problem.size[0], after.correlation), "BIC"
-            reason = "" if change < 0 else f"its BIC is higher by {change:.3g}"
-        before = set(common.plausible.bound_violations(was.values))
-        row = dataclasses.replace(
-            row,
-            values=after.values,
-            errors=_errors(found.names[n:], slopes[n:, n:], now.covariance),
-            cost=after.cost,
-            p=p,
-            criterion=criterion,
-            reason=reason,
-            held_out_cost=after.held_out_cost(self.folds)
-            + _own_share(count, after.cost, after.freedom, after.correlation),
-            objections=tuple(o for o in common.plausible.bound_violations(after.values) if o not in before),
-        )
-        return row, after
-
-    def _unknowns(self, candidate: Candidate, more: Extended) -> int:
-        """How many of the trials' and windows' own come with a candidate."""
-        n_b = len(set(more.own_b[candidate.name]) - set(more.base_b)) * more.problem.clusters
-        return n_b + more.point.z.size - self.standing.point.z.size
-
-    def _judged(self, row: Extension) -> Extension:
-        """With the reason, in the order in which doubts are raised."""
-        was, fitted = self.standing, np.isfinite(row.cost)
-        doubts = (
-            (bool(row.reason), row.reason),
-            (not np.isnan(row.p) and row.p >= self.share, "no more than chance"),
-            (not fitted and np.isnan(row.p), "not nested, not fitted"),
-            (not fitted, "promising, not fitted"),
-            (fitted and not row.cost < was.cost, "its fit lowers nothing"),
-            (bool(row.objections), f"not plausible: {', '.join(row.objections)}"),
-            (row.held_out_cost >= was.held_out_cost(self.folds), "does not predict trials left out"),
-        )
-        reason = next((words for doubted, words in doubts if doubted), "")
-        return dataclasses.replace(row, reason=reason, accepted=not reason)
-
-
-@dataclasses.dataclass(frozen=True)
-class Common:
-    """Of the candidates of one system: their problem, linearized, how unknowns of trials are held, what is believed."""
-
-    extended: Extended
-    at: Linearization
-    held: np.ndarray
-    plausible: Plausible
-
-
-@dataclasses.dataclass(frozen=True)
-class Promise:
-    """A candidate and what it promises; `nested`: whether it changes nothing where it starts."""
-
-    candidate: Candidate
-    row: Extension
-    extended: Extended | None = None
-    common: Common | None = None
-    nested: bool = True
-    objections: tuple[str, ...] = ()
-
-
-def _held(at: Linearization) -> np.ndarray:
-    """Deviations of priors that hold unknowns of trials (n_b,) much closer than any data could tell."""
-    blocks, first = at.blocks, at.blocks.n_z + at.blocks.n_next
-    norms = np.linalg.norm(np.asarray(blocks.R)[:, :, first : first + blocks.n_b], axis=(0, 1))
-    return float(jnp.finfo(blocks.R.dtype).eps) ** 0.4 / np.where(norms > 0, norms, 1.0)
-
-
-def _own_share(count: int, cost: float, freedom: int, correlation: float) -> float:
-    """What unknowns of the trials' own flatter a prediction by: trials that are left out find theirs, which takes away
-    a variance each, and adds one to what comes after (as in Akaike's criterion)."""
-    return 2.0 * count * cost / freedom / effective_sample_fraction(correlation) if count and freedom > 0 else 0.0
-
-
-def _errors(names: Sequence[str], slopes: np.ndarray, covariance: np.ndarray) -> dict[str, float]:
-    deviations = np.sqrt(np.diagonal(slopes @ covariance @ slopes.T)) if names else []
-    return {name: float(deviation) for name, deviation in zip(names, deviations, strict=True)}
-
-
-def _undetermined(more: Extended, new: Sequence[int], found: Any) -> str:
-    """What the data do not determine, in words."""
-    unseen = [more.names[i] for i, seen in zip(new, found.sensitive, strict=True) if not seen]
-    if unseen:
-        return f"{', '.join(unseen)} is not seen by these data"
-    lost = [more.names[i] for i, apart in zip(new, found.distinguishable, strict=True) if not apart]
-    return f"{', '.join(lost)} cannot be distinguished from what is free" if lost else ""
 
 
 def forward_selection(
@@ -445,39 +160,38 @@ def forward_selection(
     folds: int | Sequence[Sequence[int]] | None = None,
     progress: bool = False,
 ) -> ForwardSelection:
-    """Which of these extensions a model lacks: what each would lower the sum of squares by, whether it can be believed,
-    and whether it predicts trials that were left out.
+    """Model extensions by forward selection: by how much each lowers the sum of squares, whether it is plausible, and
+    whether it predicts trials that were left out.
 
         candidates = ["dry_friction", Gain("torque"), Offset("angle"), Candidate("lag", system=Lagging())]
         selection = forward_selection(fit, candidates)
         print(selection)
-        selection.fit                                       # with what was selected
+        selection.fit                                       # with the selected ones
 
-    All candidates of a system are linearized together, once, where the fit ended; what is free and unknown already is
-    eliminated. That says how much each promises, its estimate with its error, and by a score test (Rao 1948) whether
-    chance promises as much. Residuals that are correlated count as what they are (see the page on identification).
-    The most promising ones are then fitted, together with all that is free, from the same compiled program.
+    All candidates of a system are linearized together, once, at the minimum of the fit; all that is free and unknown
+    there is eliminated. This gives of each the predicted cost, an estimate with its error, and the p-value of a score
+    test (Rao 1948). Residuals that are correlated count as what they are (see the page on model extensions). Those of
+    the lowest predicted costs are then fitted, together with all that is free, by the same compiled program.
 
-    A nested candidate, which changes nothing where it starts, stands where (1) chance promises so much with a
-    probability below `level`, over all candidates together (Bonferroni); (2) fitted, it keeps that; (3) no parameter
-    becomes implausible, its own or one that was free; (4) trials left out in turn are predicted better with it.
-    Of those that stand, the one that predicts best is taken; with `depth` above one the others are tried again beside
-    it, and so on, until none stands.
+    A nested candidate, which changes nothing where it starts, is accepted where (1) its p-value is below `level`, over
+    all candidates together (Bonferroni); (2) so it is after the fit; (3) no parameter becomes implausible, its own or
+    one that was free; (4) trials left out in turn are predicted better with it. Of the accepted ones the one that
+    predicts best is selected; with `depth` above one all others are tested again beside it, until none is accepted.
 
-    What is not nested, as another system whose motion differs from the start, promises nothing before it is fitted, and
-    always is, besides the `refits`. In the place of (1) nothing is asked where trials can be left out, and where there
-    is one alone, whether the Bayesian information criterion is lower. The `criterion` of each says what decided.
+    A candidate that is not nested, as another system whose motion differs from the start, has no predicted cost. It is
+    always fitted, besides the `refits`. Instead of (1) nothing is tested where trials can be left out, and where there
+    is one trial, whether the Bayesian information criterion is lower. The `criterion` of each says what decided.
 
     **Arguments:**
 
     - `fit`: one that has converged. `candidates`: a list of names of parameters, `Free`, `Gain`, `Offset`, `Delay`,
         `Inertia`, and `Candidate`, which may be several of these together, what every trial has its own of, or another
-        system. Each starts where it is neutral.
-    - `depth`: how many may be taken, one after the other. `refits`: how many that are nested are fitted in each round;
-        None for all that the data can distinguish, 0 for none at all. `level`: of the test.
-    - `plausible`: by name, (lower, upper), or a share of the start such as 0.2. Else what `Candidate.plausible` says,
-        three deviations of a prior, and two bounds, of which it must stay away. What starts on a bound, given
-        or declared, as friction at zero, is searched for on both sides and believed on one.
+        system. Each starts where it changes nothing.
+    - `depth`: how many may be selected. `refits`: how many nested candidates are fitted in each round; None for all
+        that the data can distinguish, 0 for no fit at all. `level`: of the test.
+    - `plausible`: by name, (lower, upper), or a share of the start such as 0.2. By default `Candidate.plausible`,
+        three deviations of a prior, or two bounds, without their ends. A parameter that starts on a bound, as friction
+        at zero, is searched for on both sides and plausible on one.
     - `folds`: trials that are left out together, as in `cross_validate`. `progress`: a bar.
 
     **Returns:** `ForwardSelection`: print it for the table.
@@ -486,43 +200,38 @@ def forward_selection(
     already, and names that do not exist.
     """
     refuse_other(fit, Fit, "forward_selection", "forward_selection(fit(...), candidates)")
-    _check(fit, depth, refits, level)
-    left = list(candidates_of(fit, candidates))
-    order = tuple(candidate.name for candidate in left)
-    said = dict(plausible or {})
+    _check_arguments(fit, depth, refits, level)
+    rest = list(checked_candidates(fit, candidates))
+    order, plausible = tuple(candidate.name for candidate in rest), dict(plausible or {})
     T, groups = len(fit.problem.trials), None
     if T >= 2:
         groups = folds_of((T if T <= 10 else 5) if folds is None else folds, T)
     elif folds is not None:
         raise ValueError("`folds`: one trial alone cannot be left out: cut it with `Trial.between`.")
-    standing, taken, rounds = Standing.of(fit), [], []
-    with tqdm(disable=not progress, desc="forward_selection", unit=" step") as bar:
-        for _ in range(depth):
-            round = Trying(fit, standing, tuple(taken), order, level / len(left), said, groups)
-            rows, ways = round.all_of(left, refits, bar)
-            best = next((row for row in rows if row.accepted), None)
-            rounds.append((standing.cost, standing.held_out_cost(groups), rows))
-            if best is None:
+    model, selected, rounds = RestrictedModel.of(fit), [], []
+    with tqdm(disable=not progress, desc="forward selection", unit=" step") as bar:
+        while rest and len(rounds) < depth:
+            round = SelectionRound(fit, model, tuple(selected), order, level / len(rest), plausible, groups, bar)
+            extensions, models = round.run(rest, refits)
+            rounds.append((model.cost, model.held_out_cost(groups), extensions))
+            best = extensions[0]
+            if not best.accepted:
                 break
-            taken.append(next(c for c in left if c.name == best.name))
-            left = [c for c in left if c.name != best.name]
-            standing = ways[best.name]
-            if not left:
-                break
-    names = {name for _, _, rows in rounds for row in rows for name in row.values}
-    refuse_unknown(said, (*fit.names, *names), "`plausible` names")
-    return ForwardSelection(
-        before=fit,
-        rounds=tuple(rows for *_, rows in rounds),
-        costs=tuple(cost for cost, *_ in rounds),
-        held_out_costs=tuple(out for _, out, _ in rounds),
-        selected=tuple(c.name for c in taken),
-        level=level,
-        fit=_fitted(fit, taken, standing) if taken else fit,
-    )
+            selected += [c for c in rest if c.name == best.name]
+            rest = [c for c in rest if c.name != best.name]
+            model = models[best.name]
+    names = {name for _, _, extensions in rounds for one in extensions for name in one.values}
+    refuse_unknown(plausible, (*fit.names, *names), "`plausible` names")
+    after = fit
+    if selected:  # as a user would pose it
+        problem = fit.problem.with_specification(extended_specification(fit, selected))
+        start = mapped_point(model.problem, model.point, problem, model.names)
+        after = solve(problem, LeastSquares(), start=start)
+    costs, held_out_costs, extensions = zip(*rounds, strict=True)
+    return ForwardSelection(fit, extensions, costs, held_out_costs, tuple(c.name for c in selected), level, after)
 
 
-def _check(fit: Fit, depth: Any, refits: Any, level: float) -> None:
+def _check_arguments(fit: Fit, depth: Any, refits: Any, level: float) -> None:
     if fit.problem.specification.noise is not None:
         raise ValueError(
             "forward_selection compares sums of squares of fits without process noise; this fit has process noise, "
@@ -530,18 +239,295 @@ def _check(fit: Fit, depth: Any, refits: Any, level: float) -> None:
         )
     if fit.status != "converged":
         raise ValueError(
-            f"The fit has not converged ({fit.status}): what is asked beside it is asked at a minimum. Go on with "
+            f"The fit has not converged ({fit.status}), and a score test is one at a minimum. Go on with "
             "`minimize(fit.problem, LeastSquares(), start=fit.point)`."
         )
-    for name, value, least in (("depth", depth, 1), ("refits", refits, 0)):
-        if value is None and name == "refits":
-            continue
-        if not isinstance(value, int) or value < least:
-            raise ValueError(f"`{name}` is a whole number of {least} at least, got {value!r}.")
+    for name, value, smallest in (("depth", depth, 1), ("refits", 0 if refits is None else refits, 0)):
+        if not isinstance(value, int) or value < smallest:
+            raise ValueError(f"`{name}` is a whole number of {smallest} at least, got {value!r}.")
     check_level(level)
 
 
-def _fitted(fit: Fit, taken: Sequence[Candidate], standing: Standing) -> Fit:
-    """The fit with what was taken, as a user would pose it."""
-    problem = fit.problem.with_specification(posed_with(fit, taken))
-    return solve(problem, LeastSquares(), start=standing.carried_to(problem))
+@dataclasses.dataclass(frozen=True)
+class RestrictedModel:
+    """The minimum of a problem of whose parameters `names` are free. `linearized`: there, in the columns of all its
+    parameters; `degrees_of_freedom`: residuals less unknowns; `correlation`: of neighbouring residuals."""
+
+    problem: Problem
+    point: Unknowns
+    names: tuple[str, ...]
+    cost: float
+    degrees_of_freedom: int
+    correlation: float
+    linearized: LinearizedProblem
+
+    @classmethod
+    def of(cls, fit: Fit) -> RestrictedModel:
+        at: Any = fit.linearization
+        if np.any(np.isfinite(np.asarray(fit.parameters.prior_deviation))):
+            at = without_priors(fit.problem).linearize(fit.point)
+        n_r, n_unknown = fit.problem.size
+        linearized = linearized_problem(fit.problem, at, fit.point, range(fit.point.b.shape[1]))
+        return cls(fit.problem, fit.point, fit.names, fit.cost, n_r - n_unknown, fit.autocorrelation, linearized)
+
+    @property
+    def places(self) -> list[int]:
+        return [self.problem.parameters.names.index(name) for name in self.names]
+
+    @property
+    def values(self) -> dict[str, float]:
+        values = np.asarray(parameter_values(self.problem.parameters, self.point.x))[self.places]
+        return dict(zip(self.names, values.tolist(), strict=True))
+
+    def held_out_cost(self, folds: Sequence[Sequence[int]] | None) -> float:
+        """The sum of squares of trials left out in turn, linearized; NaN without folds."""
+        return self.linearized.cost_left_out(self.places, folds) if folds is not None else math.nan
+
+
+def without_priors(problem: Problem) -> Problem:
+    """The same without priors of parameters; nothing is compiled anew."""
+    return problem.with_priors(dict.fromkeys(problem.parameters.names, (0.0, math.inf)))
+
+
+def linearized_problem(problem: Problem, at: Linearization, point: Unknowns, b: Sequence[int]) -> LinearizedProblem:
+    """A linearization without priors, with starts and these unknowns of trials eliminated, all others fixed."""
+    blocks, parameters = at.blocks, problem.parameters
+    first = blocks.n_z + blocks.n_next
+    columns = [*range(first), *(first + i for i in b), *range(first + blocks.n_b, blocks.R.shape[-1])]
+    R = blocks.R[:, :, jnp.asarray(columns, dtype=jnp.int32)]
+    reduced = eliminate(Blocks(R, blocks.windows, blocks.n_z, blocks.n_next, len(b)), 0.0)
+    slopes = np.asarray(parameter_slopes(parameters, point.x)) / np.asarray(parameters.prior_deviation, float)[:, None]
+    priors = np.column_stack([slopes, np.asarray(parameters.prior_residuals(point.x))])
+    return LinearizedProblem(np.asarray(reduced.R, float), priors, np.asarray(blocks.column_norms, float))
+
+
+@dataclasses.dataclass(frozen=True)
+class Group:
+    """Candidates of one system: their augmented problem, linearized, and what is plausible. `fixed` (n_b,): deviations
+    of priors that fix the unknowns of trials of all candidates but one."""
+
+    augmented: AugmentedProblem
+    at: Linearization
+    plausible: Plausible
+    fixed: np.ndarray
+
+
+@dataclasses.dataclass(frozen=True)
+class SelectionRound:
+    """One round: every candidate is tested beside those selected before."""
+
+    fit: Fit
+    model: RestrictedModel
+    selected: tuple[Candidate, ...]
+    order: tuple[str, ...]  # of all candidates
+    level: float  # of each test
+    plausible: Mapping[str, Any]
+    folds: Sequence[Sequence[int]] | None
+    bar: Any
+
+    def run(
+        self, candidates: Sequence[Candidate], refits: int | None
+    ) -> tuple[tuple[Extension, ...], dict[str, RestrictedModel]]:
+        """The candidates, the best accepted one first, and the restricted models of the next round."""
+        extensions: dict[str, Extension] = {}
+        models: dict[str, RestrictedModel] = {}
+        testable: list[tuple[Candidate, Group]] = []
+        for members in compatible_groups(self.fit, candidates):
+            self.bar.set_postfix_str(f"{len(members)} linearized")
+            try:
+                augmented, at = self._linearized(members)
+            except ValueError as error:
+                extensions |= {c.name: Extension(c.name, reason=str(error)) for c in members}
+            else:
+                group = self._group(members, augmented, at)
+                extensions |= {c.name: self._score_tested(c, group) for c in members}
+                testable += [(c, group) for c in members if not extensions[c.name].reason]
+            self.bar.update()
+        for candidate, group in self._to_refit(testable, extensions, refits):
+            self.bar.set_postfix_str(candidate.name)
+            extension, model = self._refitted(candidate, group, extensions[candidate.name])
+            extensions[candidate.name] = extension
+            models |= {} if model is None else {candidate.name: model}
+            self.bar.update()
+        decided = sorted(map(self._decided, extensions.values()), key=self._rank)
+        return tuple(decided), models
+
+    def _to_refit(
+        self, testable: Sequence[tuple[Candidate, Group]], extensions: Mapping[str, Extension], refits: int | None
+    ) -> list[tuple[Candidate, Group]]:
+        """Nested candidates of the lowest predicted costs, plausible ones first; and those that are not nested."""
+        nested = [(c, group) for c, group in testable if extensions[c.name].nested]
+        rest = [(c, group) for c, group in testable if not extensions[c.name].nested]
+        if refits is not None:
+
+            def rank(item: tuple[Candidate, Group]) -> tuple[bool, float]:
+                extension = extensions[item[0].name]
+                return bool(item[1].plausible.bound_violations(extension.values)), extension.predicted_cost
+
+            nested = sorted((item for item in nested if extensions[item[0].name].p < self.level), key=rank)[:refits]
+        return nested + (rest if refits != 0 else [])
+
+    def _linearized(self, members: Sequence[Candidate]) -> tuple[AugmentedProblem, Linearization]:
+        """**Raises:** `ValueError` where the augmented problem cannot be posed or simulated."""
+        minimum = self.model.problem, self.model.point
+        augmented = AugmentedProblem.of(self.fit, minimum, members, self.selected, self.order)
+        at = without_priors(augmented.problem).linearize(augmented.point)
+        if at is None or not usable(at):
+            raise ValueError("cannot be simulated where it starts")
+        return augmented, at
+
+    def _group(self, members: Sequence[Candidate], augmented: AugmentedProblem, at: Linearization) -> Group:
+        plausible = {name: bounds for c in members for name, bounds in c.plausible.items()}
+        plausible |= {name: bounds for name, bounds in self.plausible.items() if name in augmented.names}
+        # What was free has started where the fit did, whatever another system begins with.
+        ranges = [plausible_of(parameters, plausible).ranges
+                  for parameters in (augmented.problem.parameters, self.fit.parameters)]  # fmt: skip
+        # Much closer than any data could determine.
+        first = at.blocks.n_z + at.blocks.n_next
+        norms = np.linalg.norm(np.asarray(at.blocks.R)[:, :, first : first + at.blocks.n_b], axis=(0, 1))
+        fixed = float(jnp.finfo(at.blocks.R.dtype).eps) ** 0.4 / np.where(norms > 0, norms, 1.0)
+        return Group(augmented, at, Plausible({**ranges[0], **ranges[1]}), fixed)
+
+    def _score_tested(self, candidate: Candidate, group: Group) -> Extension:
+        augmented, model = group.augmented, self.model
+        problem, point, base_x = augmented.problem, augmented.point, augmented.base_x
+        x, b = augmented.places(candidate)
+        new, count = x[len(base_x) :], self._unknowns_of_trials(candidate, augmented)
+        linearized = linearized_problem(problem, group.at, point, b)
+        without = None
+        if count:  # with the candidate's unknowns of trials fixed
+            without = linearized_problem(problem, group.at, point, augmented.base_b).minimum(base_x)[1]
+        score = score_test(
+            linearized,
+            base_x,
+            new,
+            degrees_of_freedom=model.degrees_of_freedom,
+            more=count,
+            correlation=model.correlation,
+            without=without,
+        )
+        slopes, step = np.asarray(parameter_slopes(problem.parameters, point.x)), np.zeros(len(augmented.names))
+        step[x] = solved(*linearized.of(x))
+        values = np.asarray(parameter_values(problem.parameters, point.x)) + slopes @ step
+        names = tuple(augmented.names[i] for i in new)
+        cost = group.at.cost + float(np.sum(linearized.priors[x, -1] ** 2))
+        extension = Extension(
+            name=candidate.name,
+            parameters=names,
+            values={augmented.names[i]: float(values[i]) for i in x},
+            errors=_errors(names, slopes[np.ix_(new, new)], score.covariance),
+            nested=abs(cost - model.cost) <= NESTED * model.cost + 1e-9,
+        )
+        if not extension.nested:
+            return extension
+        held_out_cost = math.nan
+        if self.folds is not None:
+            freedom = model.degrees_of_freedom - len(new) - count
+            optimism = _optimism(count, score.minimal_cost, freedom, model.correlation)
+            held_out_cost = linearized.cost_left_out(x, self.folds) + optimism
+        return dataclasses.replace(
+            extension,
+            predicted_cost=model.cost - score.drop,
+            p=score.p,
+            criterion="score test",
+            held_out_cost=held_out_cost,
+            reason=_undetermined(names, score),
+        )
+
+    def _refitted(
+        self, candidate: Candidate, group: Group, extension: Extension
+    ) -> tuple[Extension, RestrictedModel | None]:
+        """After a fit of all that is free and this candidate."""
+        model, augmented = self.model, group.augmented
+        problem, start = augmented.with_only(candidate, group.fixed)
+        try:
+            fit = uninterrupted(minimize(problem, LeastSquares(), start=start))
+            at = without_priors(problem).linearize(fit.point)
+        except ValueError as error:
+            return dataclasses.replace(extension, reason=str(error)), None
+        if at is None or not usable(at) or fit.status != "converged":
+            return dataclasses.replace(extension, reason=f"its fit has not converged ({fit.status})"), None
+        n, count = len(augmented.base_x), self._unknowns_of_trials(candidate, augmented)
+        new, k = range(n, len(fit.names)), len(fit.names) - n + count
+        linearized = linearized_problem(problem, at, fit.point, augmented.places(candidate)[1])
+        freedom, correlation = model.degrees_of_freedom - k, fit.autocorrelation
+        after = RestrictedModel(problem, fit.point, fit.names, fit.cost, freedom, correlation, linearized)
+        score = score_test(
+            linearized,
+            range(n),
+            new,
+            degrees_of_freedom=model.degrees_of_freedom,
+            more=count,
+            correlation=correlation,
+        )
+        p, criterion, reason = math.nan, "trials left out", ""
+        if extension.nested:
+            p, criterion = f_test(model.cost - fit.cost, k, fit.cost, freedom, correlation), "F test"
+            if not count and use_clusters(linearized, len(fit.names), correlation):
+                p = wald_test(np.asarray(fit.point.x - start.x)[n:], score.covariance, len(linearized.data))
+                criterion = "t test"
+        elif self.folds is None:
+            change, criterion = bic_change(model.cost, fit.cost, k, self.fit.problem.size[0], correlation), "BIC"
+            reason = "" if change < 0 else f"its BIC is higher by {change:.3g}"
+        before = group.plausible.bound_violations(model.values)
+        slopes = np.asarray(parameter_slopes(problem.parameters, fit.point.x))
+        extension = dataclasses.replace(
+            extension,
+            values=after.values,
+            errors=_errors(fit.names[n:], slopes[n:, n:], score.covariance),
+            cost=fit.cost,
+            p=p,
+            criterion=criterion,
+            held_out_cost=after.held_out_cost(self.folds) + _optimism(count, fit.cost, freedom, correlation),
+            objections=tuple(o for o in group.plausible.bound_violations(after.values) if o not in before),
+            reason=reason,
+        )
+        return extension, after
+
+    def _decided(self, extension: Extension) -> Extension:
+        """Accepted, or with the first reason against it."""
+        model, is_fitted = self.model, np.isfinite(extension.cost)
+        reasons: tuple[tuple[Any, str], ...] = (
+            (extension.reason, extension.reason),
+            (extension.p >= self.level, "no more than chance"),
+            (not is_fitted and np.isnan(extension.p), "not nested, not fitted"),
+            (not is_fitted, "promising, not fitted"),
+            (is_fitted and not extension.cost < model.cost, "its fit lowers nothing"),
+            (extension.objections, f"not plausible: {', '.join(extension.objections)}"),
+            (extension.held_out_cost >= model.held_out_cost(self.folds), "does not predict trials left out"),
+        )
+        reason = next((words for applies, words in reasons if applies), "")
+        return dataclasses.replace(extension, reason=reason, accepted=not reason)
+
+    def _rank(self, extension: Extension) -> tuple[bool, float]:
+        """Accepted ones first; by the held-out cost, or by the cost as far as it is known."""
+        if extension.accepted and self.folds:
+            return False, extension.held_out_cost
+        costs = [x for x in (extension.cost, extension.predicted_cost) if not math.isnan(x)]
+        return not extension.accepted, costs[0] if costs else math.inf
+
+    def _unknowns_of_trials(self, candidate: Candidate, augmented: AugmentedProblem) -> int:
+        """How many unknowns of the trials' and windows' own come with a candidate."""
+        own = set(augmented.own_b[candidate.name]) - set(augmented.base_b)
+        return len(own) * augmented.problem.clusters + augmented.point.z.size - self.model.point.z.size
+
+
+def _optimism(count: int, cost: float, freedom: int, correlation: float) -> float:
+    """By how much unknowns of the trials' own make a prediction look better: they are estimated from the trials that
+    are left out, which takes away a variance each, and adds one to what comes after (as in Akaike's criterion)."""
+    if not count or freedom <= 0:
+        return 0.0
+    return 2.0 * count * cost / freedom / effective_sample_fraction(correlation)
+
+
+def _errors(names: Sequence[str], slopes: np.ndarray, covariance: np.ndarray) -> dict[str, float]:
+    deviations = np.sqrt(np.diagonal(slopes @ covariance @ slopes.T)) if names else []
+    return {name: float(deviation) for name, deviation in zip(names, deviations, strict=True)}
+
+
+def _undetermined(names: Sequence[str], score: Score) -> str:
+    """Which parameters the data do not determine, in words."""
+    insensitive, collinear = (", ".join(np.array(names, str)[~ok]) for ok in (score.sensitive, score.distinguishable))
+    if insensitive:
+        return f"these data do not depend on {insensitive}"
+    return f"{collinear} cannot be distinguished from what is free" if collinear else ""
