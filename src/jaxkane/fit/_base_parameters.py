@@ -327,7 +327,7 @@ def _texts_with_lengths(structure: BaseParameters, spec: RegressorSpec, states: 
     texts = []
     for j, place in enumerate(places):
         factors = [f"{abs(x):.4g}" for x in matrix[j]]
-        for c in np.flatnonzero(B[j]):
+        for c in np.flatnonzero(B[j]).tolist():
             product = _product(abs(B[j, c]), [(name, value, powers[j, c]) for name, value, powers in powers_of])
             factors[rest[c]] = product or factors[rest[c]]
         texts.append(_text(structure.names, matrix[j], place, factors))
