@@ -1,4 +1,4 @@
-"""What instruments say: gyroscopes, accelerometers, encoders, markers, cameras, load cells; and their filters.
+"""Sensors: gyroscopes, accelerometers, encoders, markers, cameras, load cells; and their filters.
 
 For `System.outputs`, and the filters for `System.state_rates`:
 
@@ -8,9 +8,8 @@ For `System.outputs`, and the filters for `System.state_rates`:
 
     ride["imu.ay"], Trial(t, {"imu.gz": rate}, sigma=0.01)
 
-What a sensor's place, mounting, gain, offset and lag are, are parameters of the system like any other, which a fit can
-free. Noise is the trial's `sigma`. Values are those of the ideal instrument; nothing is rounded unless a resolution is
-given.
+A sensor's place, mounting, gain, offset and lag are parameters of the system like any other, which a fit can free.
+Noise is the trial's `sigma`. Values are those of the ideal instrument; nothing is rounded unless a resolution is given.
 """
 
 from __future__ import annotations
@@ -174,10 +173,10 @@ def delayed(signal: Component, x: Any, delay: Component) -> tuple[tuple[Componen
 
 
 def _states(x: Any, sizes: tuple[int, ...], name: str) -> tuple[Component, ...]:
-    given = tuple(x) if not hasattr(x, "shape") and hasattr(x, "__iter__") else (x,)
-    if len(given) not in sizes:
-        raise ValueError(f"sensors.{name} has {' or '.join(map(str, sizes))} states, got {len(given)}.")
-    return given
+    states = tuple(x) if not hasattr(x, "shape") and hasattr(x, "__iter__") else (x,)
+    if len(states) not in sizes:
+        raise ValueError(f"sensors.{name} has {' or '.join(map(str, sizes))} states, got {len(states)}.")
+    return states
 
 
 def _along(vector: Vector, frame: Frame) -> Named:

@@ -110,7 +110,7 @@ def test_newtons_method_finds_in_numbers_what_it_finds_compiled(base, start):
     system = eqx.tree_at(lambda s: s.base, Rods(), jnp.array(base))
     q = jnp.array([*start, 0.2])
     found, right = (f(system, q, jnp.array(0.0), (0, 1), False) for f in (newton_in_numbers, newton))
-    assert bool(found.good) == bool(right.good)
-    assert float(found.remainder) == pytest.approx(float(right.remainder), abs=1e-12) or not right.good
-    if right.good:
+    assert bool(found.converged) == bool(right.converged)
+    assert float(found.remainder) == pytest.approx(float(right.remainder), abs=1e-12) or not right.converged
+    if right.converged:
         np.testing.assert_allclose(found.q, right.q, atol=1e-14 if base < 2.0 else 1e-11)  # of a double root

@@ -114,10 +114,8 @@ def refuse_incomplete(system: System, q: Any, u: Any) -> None:
     Where nothing is solved for, a dependent coordinate left out is no zero: it is not known.
     """
     name = type(system).__name__
-    for label, values, names in (
-        ("q", q, system.coordinates),
-        ("u", u, (*system.speeds, *system.dependent_speeds)),
-    ):
+    speeds = (*system.speeds, *system.dependent_speeds)
+    for label, values, names in (("q", q, system.coordinates), ("u", u, speeds)):
         if isinstance(values, Mapping):
             refuse_unknown(values, names, f"{name}: {label} has no", "it has")
     missing = [c for c in system.dependent_coordinates if c not in q] if isinstance(q, Mapping) else []
@@ -126,10 +124,10 @@ def refuse_incomplete(system: System, q: Any, u: Any) -> None:
             f"{name}: {', '.join(missing)} is left out of q, and follows from the other coordinates: find the state "
             "with jaxkane.assemble(system, q, u), and give its state.q; or name the value here."
         )
-    given = [s for s in system.dependent_speeds if s in u] if isinstance(u, Mapping) else []
-    if given:
+    dependent = [s for s in system.dependent_speeds if s in u] if isinstance(u, Mapping) else []
+    if dependent:
         raise ValueError(
-            f"{name}: {', '.join(given)} is a dependent speed, which follows from the others: leave it out of u. "
+            f"{name}: {', '.join(dependent)} is a dependent speed, which follows from the others: leave it out of u. "
             "(jaxkane.assemble compares it with what the velocity residuals say.)"
         )
 
@@ -157,18 +155,17 @@ def checked_inputs(system: System, inputs: Mapping[str, Component] | None) -> di
 
 def checked_values(system: System, values: Mapping[str, Component] | None) -> dict[str, Component]:
     """All inputs and states of a system by name, as `loads` reads them; those left out are exactly zero."""
-    if not system.states:
-        return checked_inputs(system, values)
-    return _checked(system, values, (*system.inputs, *system.states), "input or state")
+    return _checked(system, values, (*system.inputs, *system.states), "input or state" if system.states else "input")
 
 
-def _checked(system: System, values: Any, names: Sequence[str], what: str) -> dict[str, Component]:
-    own = type(system).__name__
+def _checked(system: System, values: Any, names: Sequence[str], kind: str) -> dict[str, Component]:
+    title = type(system).__name__
     if not isinstance(values, (Mapping, type(None))):
-        raise TypeError(f"{own}: the inputs are numbers by name, {{name: number}}, got {values!r}.")
-    values = dict(values or {})
-    refuse_unknown(values, names, f"{own} has no {what} named", "it has")
+        raise TypeError(f"{title}: the inputs are numbers by name, {{name: number}}, got {values!r}.")
+    if not values:
+        return dict.fromkeys(names, 0.0)
+    refuse_unknown(values, names, f"{title} has no {kind} named", "it has")
     for name, value in values.items():
         if not is_one_number(value):
-            raise TypeError(f"{own}: the {what} {name!r} must be one number, got {value!r}.")
+            raise TypeError(f"{title}: the {kind} {name!r} must be one number, got {value!r}.")
     return {name: component(values.get(name, 0.0)) for name in names}

@@ -150,8 +150,8 @@ def _is_semidefinite(A: Any) -> Any:
     # By principal minors: LAPACK's eigenvalues of many small matrices would be slow, and wait for each other.
     size = jnp.max(jnp.abs(A))
     det = jnp.dot(A[0], jnp.cross(A[1], A[2]))
-    least = [(jnp.min(jnp.diag(A)), size), (jnp.min(jnp.stack(_minors(A))), size**2), (det, size**3)]
-    return jnp.all(jnp.stack([x >= -1e-6 * scale for x, scale in least]))
+    minors = [(jnp.min(jnp.diag(A)), size), (jnp.min(jnp.stack(_minors(A))), size**2), (det, size**3)]
+    return jnp.all(jnp.stack([x >= -1e-6 * scale for x, scale in minors]))
 
 
 def _minors(A: Any) -> list[Any]:
@@ -353,6 +353,7 @@ class _Consistency:
         self.speeds = (*system.speeds, *system.dependent_speeds)
         self.inputs = {name: np.asarray(0.7, q.dtype) for name in (*system.inputs, *system.states)}
         self.tolerance = float(jnp.finfo(q.dtype).eps) ** 0.5
+        self.has_constraints = False
 
     def check(self) -> bool:
         """Refuse what contradicts itself. **Returns:** whether there were finite numbers to judge by."""
@@ -386,6 +387,7 @@ class _Consistency:
     def _check_affine(self, q: np.ndarray) -> None:
         a, b = self._random_speeds(), self._random_speeds()
         zero, at_a, at_b, at_both = (self._read(q, u) for u in (0.0 * a, a, b, a + b))
+        self.has_constraints = bool(_of_kind(zero, "constraint"))
         scaled = {s: self._read(q, s * a) for s in _SIZES}
         for key, z in zero.items():
             x, y, both = at_a[key], at_b[key], at_both[key]
@@ -428,10 +430,12 @@ class _Consistency:
 
     def _on_constraints(self, q: np.ndarray) -> np.ndarray:
         """The nearest coordinates that meet the configuration constraints; NaN where there are none nearby."""
+        if not self.has_constraints:
+            return q
         residual = lambda q: configuration_residual.numpy(self.system, self.t, q).astype(float)  # noqa: E731
         h, step = residual(q), self.tolerance
         for _ in range(20):
-            if not h.size or np.max(np.abs(h)) <= 0.1 * self.tolerance:
+            if np.max(np.abs(h)) <= 0.1 * self.tolerance:
                 return q
             displaced = [residual(q + step * e.astype(q.dtype)) for e in np.eye(len(q))]
             G = (np.array(displaced) - h).T / step  # (h,n_q)

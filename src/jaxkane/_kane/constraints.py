@@ -173,8 +173,8 @@ class DependentSpeeds(eqx.Module):
 
     def __str__(self) -> str:
         rows = [f"{condition:>10.3g}  {', '.join(names)}" for names, condition in self.choices[:10]]
-        more = [f"... and {len(self.choices) - 10} more"] if len(self.choices) > 10 else []
-        return "\n".join([f"{self.name}: {self.advice()}", " condition  dependent speeds", *rows, *more])
+        rows += [f"... and {len(self.choices) - 10} more"] if len(self.choices) > 10 else []
+        return "\n".join([f"{self.name}: {self.advice()}", " condition  dependent speeds", *rows])
 
     __repr__ = __str__
 
@@ -207,9 +207,9 @@ def best_dependent_speeds(system: System, t: Component, q: Any) -> DependentSpee
 @ScalarFunction
 def constraint_rows(system: System, t: Component, q: Array) -> tuple[Array, Array]:
     """C (k, n + k) and c0 (k,) of the velocity residuals."""
-    now = KaneEquations(system, t, q, jnp.zeros(len(system.speeds), q.dtype))
-    rows = [(*a, *b) for a, b in zip(now.C_ind, now.C_dep, strict=True)]
-    c0 = now.residuals(now.t, now.q, (0.0,) * (now.n + now.k))
+    kane = KaneEquations(system, t, q, jnp.zeros(len(system.speeds), q.dtype))
+    rows = [(*a, *b) for a, b in zip(kane.C_ind, kane.C_dep, strict=True)]
+    c0 = kane.residuals(kane.t, kane.q, (0.0,) * (kane.n + kane.k))
     return stack(rows).astype(q.dtype), as_vector(c0, q)
 
 
@@ -247,9 +247,8 @@ def _best_choices(C: np.ndarray) -> dict[tuple[int, ...], float]:
     best = tuple(sorted(factors[1][:k].tolist()))
     conditions = {best: relative_condition(C, best)}
     while True:
-        others = [j for j in range(n) if j not in best]
-        beside = [tuple(sorted({*best, j} - {i})) for i in best for j in others]
-        conditions = {c: conditions.get(c) or relative_condition(C, c) for c in (best, *beside)}
+        exchanged = [tuple(sorted({*best, j} - {i})) for i in best for j in range(n) if j not in best]
+        conditions = {c: conditions.get(c) or relative_condition(C, c) for c in (best, *exchanged)}
         better = min(conditions, key=lambda c: conditions[c])
         if not conditions[better] < conditions[best]:
             return conditions

@@ -47,8 +47,8 @@ class Function(NamedTuple):
 
 def _all_rates(system, t, q, u, w, u_dep):
     """Rates of the coordinates by all speeds, dependent ones too."""
-    now = DescriptionEvaluator(system)
-    return (as_vector(now.rates(t, as_row(q, system.coordinates, "q"), (*u, *u_dep)), q),)
+    evaluator = DescriptionEvaluator(system)
+    return (as_vector(evaluator.rates(t, as_row(q, system.coordinates, "q"), (*u, *u_dep)), q),)
 
 
 def _velocity_residuals(system, t, q, u, w, u_dep):
@@ -87,7 +87,7 @@ OFFERED = (*(name for name, f in FUNCTIONS.items() if f.evaluate.__name__ == "<l
 
 
 class Argument(NamedTuple):
-    """What functions read: an array, with the name of each element; a parameter is one by itself."""
+    """An array that functions read, with the name of each element; a parameter is one by itself."""
 
     kind: str  # "t", "q", "u", "inputs", "u_dep" or "parameters"
     name: str
@@ -123,13 +123,13 @@ class Formulas:
         check_system(system, 0.0, None)
         paths, self.structure = jax.tree_util.tree_flatten_with_path(system)
         self.leaves = [leaf for _, leaf in paths]
-        self.moves = [bool(jnp.issubdtype(jnp.result_type(leaf), jnp.floating)) for leaf in self.leaves]
+        self.is_float = [bool(jnp.issubdtype(jnp.result_type(leaf), jnp.floating)) for leaf in self.leaves]
         parameters = [
             Argument(
                 "parameters", name := leaf_name(path), np.shape(x), _elements(name, np.shape(x)), declared(system, path)
             )
-            for (path, x), moves in zip(paths, self.moves, strict=True)
-            if moves
+            for (path, x), is_float in zip(paths, self.is_float, strict=True)
+            if is_float
         ]
         vectors = {"q": system.coordinates, "u": system.speeds}
         # At one time a state of the first order is one more number that loads read.
@@ -152,8 +152,8 @@ class Formulas:
 
     def values(self) -> dict[str, np.ndarray]:
         """The system's own parameters by name."""
-        numbers = [np.asarray(x, self.dtype) for x, moves in zip(self.leaves, self.moves, strict=True) if moves]
-        return {a.name: x for a, x in zip(self.of_kind("parameters"), numbers, strict=True)}
+        floats = [x for x, is_float in zip(self.leaves, self.is_float, strict=True) if is_float]
+        return {a.name: np.asarray(x, self.dtype) for a, x in zip(self.of_kind("parameters"), floats, strict=True)}
 
     def of_kind(self, kind: str) -> list[Argument]:
         return [a for a in self.arguments if a.kind == kind]
@@ -165,8 +165,8 @@ class Formulas:
     def evaluate(self, function: str, *args: Any) -> tuple[Any, ...]:
         """A function of `FUNCTIONS` at arrays that stand as `arguments` do."""
         t, q, u, w, u_dep, *parameters = args
-        given = iter(parameters)
-        leaves = [next(given) if moves else leaf for leaf, moves in zip(self.leaves, self.moves, strict=True)]
+        values = iter(parameters)
+        leaves = [next(values) if is_float else x for x, is_float in zip(self.leaves, self.is_float, strict=True)]
         inputs = {name: w[i] for i, name in enumerate((*self.system.inputs, *self.system.states))}
         return tuple(FUNCTIONS[function].evaluate(jax.tree.unflatten(self.structure, leaves), t, q, u, inputs, u_dep))
 
@@ -187,37 +187,37 @@ class Formulas:
             return {"jacobian": np.concatenate([*blocks.values()])}
         program = self.program(function)
         try:
-            found = unrolled(program, self.inputs, self.graph)
+            outputs = unrolled(program, self.inputs, self.graph)
         except NotScalarError as error:
             raise ValueError(self._refusal(function, error)) from None
-        return dict(zip(FUNCTIONS[function].outputs, found, strict=True))
+        return dict(zip(FUNCTIONS[function].outputs, outputs, strict=True))
 
     def derivatives(self, function: str, kinds: tuple[str, ...]) -> dict[str, np.ndarray]:
         """The derivatives (..., d) of a function's outputs by all numbers of some kinds, as nodes."""
         directions = [(i, e) for i, a in enumerate(self.arguments) if a.kind in kinds for e in range(len(a.elements))]
         try:
             with jax.enable_x64(self.dtype == "float64"):
-                found = jacobian(self.program(function), self.inputs, directions, self.graph)
+                outputs = jacobian(self.program(function), self.inputs, directions, self.graph)
         except NotScalarError as error:
             raise ValueError(self._refusal(function, error)) from None
-        return dict(zip(FUNCTIONS[function].outputs, found, strict=True))
+        return dict(zip(FUNCTIONS[function].outputs, outputs, strict=True))
 
     def by_jax(self, function: str, *args: Any) -> tuple[Any, ...]:
-        """What JAX gives for a function, Jacobians among them, at arrays that stand as `arguments` do."""
+        """The values of a function by JAX, Jacobians among them, at arrays that stand as `arguments` do."""
         if function not in JACOBIANS:
             return tuple(jaxpr_as_fun(self.program(function))(*args))
         places = [i for i, a in enumerate(self.arguments) if a.kind in JACOBIANS[function]]
 
-        def rates(moving):
+        def rates_of(values):
             full = list(args)
-            for i, x in zip(places, moving, strict=True):
+            for i, x in zip(places, values, strict=True):
                 full[i] = x
             return jnp.concatenate(jaxpr_as_fun(self.program("rates"))(*full))
 
         n = len(self.system.coordinates) + len(self.system.speeds)
         if not any(self.arguments[i].elements for i in places):
             return (jnp.zeros((n, 0), self.dtype),)
-        blocks = jax.jacfwd(rates)([jnp.asarray(args[i]) for i in places])
+        blocks = jax.jacfwd(rates_of)([jnp.asarray(args[i]) for i in places])
         return (jnp.concatenate([block.reshape(n, -1) for block in blocks], axis=1),)
 
     def _refusal(self, function: str, error: NotScalarError) -> str:

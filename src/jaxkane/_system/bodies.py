@@ -107,8 +107,8 @@ def parallel_axis(I: tuple[Triple, Triple, Triple], m: Component, r: Triple) -> 
     rows = []
     for i in range(3):
         across = add(squares[(i + 1) % 3], squares[(i + 2) % 3])
-        moved = [across if i == j else mul(-1.0, mul(r[i], r[j])) for j in range(3)]
-        rows.append(tuple(sub(I[i][j], mul(m, moved[j])) for j in range(3)))
+        point_mass = [across if i == j else mul(-1.0, mul(r[i], r[j])) for j in range(3)]
+        rows.append(tuple(sub(I[i][j], mul(m, point_mass[j])) for j in range(3)))
     return tuple(rows)  # type: ignore[return-value]
 
 

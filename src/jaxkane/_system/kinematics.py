@@ -194,9 +194,9 @@ class Vector:
         return count(self) >= count(other)
 
 
-def check_vector(given: Any, verb: str) -> None:
-    if not isinstance(given, Vector):
-        raise TypeError(f"{verb} takes a Vector such as 3.0 * N.x, got {given!r}.")
+def check_vector(value: Any, verb: str) -> None:
+    if not isinstance(value, Vector):
+        raise TypeError(f"{verb} takes a Vector such as 3.0 * N.x, got {value!r}.")
 
 
 def _meet(a: Vector, b: Vector) -> tuple[Frame, Triple, Triple]:

@@ -17,7 +17,7 @@ from jaxtyping import Array
 
 from .._common.lookup import as_names, hint, real_number, refuse_unknown
 from .._integrate.trajectory import Trajectory
-from .._kane.assembly import NoConfiguration, euler_parameters, found_of
+from .._kane.assembly import AssemblyProblem, NoConfiguration, euler_parameters
 from .._kane.constraints import has_configuration_constraints
 from .._kane.rhs import output_names
 from .._system.system import System
@@ -164,8 +164,8 @@ def start_assembly(system: System, trials: Sequence[Trial], unknown: Sequence[st
     named = [c for c in system.coordinates if any(c in names for names in by_trial)]
     fours = [(four, {system.coordinates[i] for i in four}) for four in euler_parameters(system)]
     quaternions = tuple(four for four, names in fours if all(names <= known for known in by_trial))
-    moved = found_of(system, named)[0]
-    guess = found_of(system, [c for c in named if c not in unknown])[1]
+    moved = AssemblyProblem.of(system, dict.fromkeys(named, 0.0)).moved
+    guess = AssemblyProblem.of(system, dict.fromkeys([c for c in named if c not in unknown], 0.0)).guess
     q = jnp.zeros(len(system.coordinates))
     if system.dependent_coordinates or not has_configuration_constraints(system, jnp.zeros(()), q):
         return StartAssembly(None, quaternions, guess)
