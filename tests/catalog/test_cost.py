@@ -7,7 +7,6 @@ from test_laws import QUICK, SLOW
 
 import jaxkane as jk
 from jaxkane._kane.kane import _motion_rates
-from jaxkane._scalarjit import function as fuse
 from jaxkane._scalarjit.backends.native import Scalars
 from jaxkane._scalarjit.function import Program
 from jaxkane.catalog import CATALOG
@@ -48,8 +47,8 @@ def test_every_public_function_is_one_program_of_scalars(name, monkeypatch):
     """Traced, and not compiled: what cannot be part of one function is told of, and is an error here."""
     entry, programs = CATALOG[name], []
     system, q, u = entry.example(), jnp.array(entry.q), jnp.array(entry.u)
-    prepared = fuse.Program.__init__
-    monkeypatch.setattr(fuse.Program, "__init__", lambda self, *args: prepared(self, *args) or programs.append(self))
+    prepared = Program.__init__
+    monkeypatch.setattr(Program, "__init__", lambda self, *args: prepared(self, *args) or programs.append(self))
     jk.forget()
     names = f"{OF_STATES} {OF_CONSTRAINTS if system.dependent_speeds else ''}".split()
     for f in (getattr(jk, name) for name in names):

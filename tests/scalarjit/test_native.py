@@ -7,7 +7,7 @@ import pytest
 
 import jaxkane as jk
 from jaxkane._kane.kane import _motion_rates, motion_rates
-from jaxkane._scalarjit import function as fuse
+from jaxkane._scalarjit import function
 from jaxkane._scalarjit.backends import native as native_kernels
 from jaxkane._scalarjit.function import Program, ScalarFunction
 
@@ -185,7 +185,7 @@ def test_numbers_that_stay_are_one_argument_of_a_kernel():
 def test_what_cannot_be_written_is_left_to_xla():
     whole = lambda x: x.astype(jnp.int32).astype(x.dtype)  # noqa: E731
     f = ScalarFunction(lambda x: whole(x) + jnp.sin(x))
-    fuse._told.clear()
+    function._told.clear()
     with pytest.raises(native_kernels.NotScalarError, match="convert_element_type of float64"):
         native_kernels.Scalars(jax.make_jaxpr(whole)(jnp.array(1.0)))
     match = "uses convert_element_type of float64, which native kernels do not know"

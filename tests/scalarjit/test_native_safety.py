@@ -17,7 +17,7 @@ from jaxkane._scalarjit.backends import compiler as objects
 from jaxkane._scalarjit.backends import ffi as handler
 from jaxkane._scalarjit.backends import native, probe
 from jaxkane._scalarjit.backends import native as available
-from jaxkane._scalarjit.backends.compiler import Machine
+from jaxkane._scalarjit.backends.compiler import LLVMCompiler
 from jaxkane._scalarjit.function import ScalarFunction
 
 pytestmark = pytest.mark.usefixtures("native")
@@ -73,9 +73,10 @@ CUBE = SQUARE.replace("ret double %y", "%z = fmul double %y, %x\nret double %z")
 
 def value(text, folder):
     """f(3), compiled or read by a machine that has compiled nothing yet."""
-    machine = Machine()
-    found = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(machine.compile(text, objects.Objects(folder))[0])(3.0)
-    return found, machine  # whose code must live while it is called
+    compiler = LLVMCompiler()
+    address, _ = compiler.compile(text, objects.ObjectCache(folder))
+    found = ctypes.CFUNCTYPE(ctypes.c_double, ctypes.c_double)(address)(3.0)
+    return found, compiler  # whose code must live while it is called
 
 
 def truncated(path, _):
@@ -104,9 +105,9 @@ def one_bit(path, _):
 def test_damaged_code_is_thrown_away_by_name(damage, tmp_path):
     files = []
     for text, expected in ((SQUARE, 9.0), (CUBE, 27.0)):
-        found, machine = value(text, tmp_path)
+        found, compiler = value(text, tmp_path)
         assert found == expected
-        files.append(tmp_path / f"{machine.name_of(text)}.o")
+        files.append(tmp_path / f"{compiler.name_of(text)}.o")
     damage(*files)
     with pytest.warns(UserWarning, match=rf"{files[0]} is damaged: it is thrown away and made again") as told:
         assert value(SQUARE, tmp_path)[0] == 9.0
@@ -128,7 +129,7 @@ def test_a_folder_that_goes_and_many_who_write(tmp_path):
         file.unlink()
     folder.rmdir()
     assert value(CUBE, folder)[0] == 27.0
-    store, code, read = objects.Objects(folder), bytes(range(256)) * 4096, []
+    store, code, read = objects.ObjectCache(folder), bytes(range(256)) * 4096, []
 
     def write_and_read():
         for _ in range(5):
@@ -291,6 +292,6 @@ def test_an_error_of_llvm_leaves_the_work_to_xla(monkeypatch):
 
 def test_a_function_that_is_missing_leaves_the_work_to_xla(monkeypatch):
     """LLVM would end the process."""
-    monkeypatch.setattr(Machine, "has", lambda self, function: function != "fmod")
+    monkeypatch.setattr(LLVMCompiler, "has", lambda self, function: function != "fmod")
     with pytest.warns(UserWarning, match=r"uses fmod \(not in the mathematical library here\)"):
         np.testing.assert_allclose(jax.jit(ScalarFunction(lambda x: jax.lax.rem(x, 0.7)))(2.0), 2.0 % 0.7)

@@ -11,7 +11,7 @@ from typing import Any, BinaryIO
 
 def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
     """In what two descriptions differ, in words: `option rtol (1e-08 there, 1e-06 here)`."""
-    found = []
+    items = []
     for group in dict.fromkeys((*there, *here)):
         old, new = there.get(group, {}), here.get(group, {})
         if not isinstance(old, dict) or not isinstance(new, dict):
@@ -20,8 +20,8 @@ def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
             a, b = (x.get(key) for x in (old, new))
             if a != b:
                 a, b = ("nothing" if x in (None, {}) else x for x in (a, b))
-                found.append(f"{group} {key}".strip() + f" ({a} there, {b} here)")
-    return "; ".join(found)
+                items.append(f"{group} {key}".strip() + f" ({a} there, {b} here)")
+    return "; ".join(items)
 
 
 SCRATCH = ".tmp"

@@ -41,10 +41,10 @@ def label_of(name: str) -> str:
     return name.replace("$", r"\$")
 
 
-def refuse_unknown(given: Iterable[str], known: Iterable[str], message: str, have: str = "there are") -> None:
+def refuse_unknown(names: Iterable[str], known: Iterable[str], message: str, have: str = "there are") -> None:
     """`ValueError` for names that are not known; `message` stands before them: "Bicycle: q has no"."""
     known = tuple(known)
-    wrong = [str(name) for name in dict.fromkeys(given) if name not in known]
+    wrong = [str(name) for name in dict.fromkeys(names) if name not in known]
     if wrong:
         raise ValueError(f"{message} {', '.join(wrong)}; {hint(wrong, known, have)}")
 

@@ -208,8 +208,8 @@ def trace_with_snapshot(f: Callable[..., Any]) -> Callable[..., Any]:
         finally:
             _tracing.captured = outer
         for values in before:
-            now = _captured.known(id(values.root), None)
-            if now is not None and now.version == values.version and not now.unchanged():
+            stored = _captured.known(id(values.root), None)
+            if stored is not None and stored.version == values.version and not stored.unchanged():
                 after = CapturedValues(values.root)
                 after.version = values.version
                 if not after.tracers:

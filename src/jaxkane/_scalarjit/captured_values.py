@@ -68,14 +68,13 @@ def is_of_library(kind: type) -> bool:
 
 
 class CapturedValues:
-    """All places that the code of `root` reads, with what was found there; `version` is a digest of it.
+    """All places that the code of `root` reads, with their values; `version` is a digest of these.
 
     `lasting`: the digest is the same in another process, where what cannot be looked into is told by its pickle.
     """
 
     def __init__(self, root: Any, lasting: bool = False):
         self.root, self.lasting = root, lasting
-        self.used = 0
         self.tracers: list[Tracer] = []  # what is being traced in it, and must not be held on to
         self.named: list[tuple[Mapping[str, Any], str, Any]] = []
         self.attributes: list[tuple[Any, str, Any]] = []
@@ -91,7 +90,7 @@ class CapturedValues:
         self.seen = walk.seen  # an identity means nothing once its object is gone
 
     def unchanged(self) -> bool:
-        """Whether every place still holds what was found there."""
+        """Whether every place still has its value."""
         try:
             for names, name, value in self.named:
                 if names.get(name, _MISSING) is not value:
@@ -100,8 +99,8 @@ class CapturedValues:
                 if f.__code__ is not code or f.__defaults__ is not defaults or f.__kwdefaults__ is not more:
                     return False
             for mapping, keys, values in self.mappings:
-                now = tuple(mapping.values())
-                if len(now) != len(values) or not all(map(is_, now, values)) or tuple(mapping) != keys:
+                present = tuple(mapping.values())
+                if len(present) != len(values) or not all(map(is_, present, values)) or tuple(mapping) != keys:
                     return False
             return (
                 all(_inside(cell) is value for cell, value in self.cells)
@@ -127,15 +126,15 @@ def _same_numbers(array: np.ndarray, copy: np.ndarray) -> bool:
 class _Walk:
     """Goes from a root to everything that its code reads, noting the places and hashing what stands there."""
 
-    def __init__(self, reads: CapturedValues):
-        self.reads = reads
+    def __init__(self, captured: CapturedValues):
+        self.captured = captured
         self.sha = hashlib.blake2b(digest_size=16)
         self.seen: dict[Any, tuple[int, Any]] = {}
         self.depth = 0
         self.names: set[str] = set()  # in all the code: of a module, what these name is read
         self.modules: list[types.ModuleType] = []
 
-    def say(self, *words: Any) -> None:
+    def add(self, *words: Any) -> None:
         for word in words:
             data = word if isinstance(word, bytes) else str(word).encode()
             self.sha.update(b"%d:" % len(data))
@@ -143,7 +142,7 @@ class _Walk:
 
     def is_new(self, key: Any, keep: Any) -> bool:
         if key in self.seen:
-            self.say("again", self.seen[key][0])
+            self.add("again", self.seen[key][0])
             return False
         self.seen[key] = len(self.seen), keep
         return True
@@ -151,9 +150,9 @@ class _Walk:
     def value(self, value: Any) -> None:
         kind = type(value)
         if kind in NUMBERS:
-            self.say(kind.__name__, value if kind is bytes else repr(value))
+            self.add(kind.__name__, value if kind is bytes else repr(value))
         elif isinstance(value, types.ModuleType):
-            self.say("module", value.__name__)
+            self.add("module", value.__name__)
             if not _is_library(value.__name__) and self.is_new(id(value), value):
                 self.modules.append(value)
         elif self.is_new(id(value), value):
@@ -177,16 +176,16 @@ class _Walk:
         elif isinstance(value, functools.cached_property):
             self.parts("property", (value.func,))
         elif isinstance(value, Tracer):
-            self.reads.tracers.append(value)
+            self.captured.tracers.append(value)
             self.opaque(value)
         elif isinstance(value, np.ndarray):
             self.array(value)
         elif isinstance(value, np.generic):
-            self.say("number", value.dtype.str, value.tobytes())
+            self.add("number", value.dtype.str, value.tobytes())
         elif isinstance(value, (list, tuple, set, frozenset, collections.deque)):
-            self.say(type(value).__qualname__)
+            self.add(type(value).__qualname__)
             if not isinstance(value, (tuple, frozenset)):
-                self.reads.sequences.append((value, tuple(value)))
+                self.captured.sequences.append((value, tuple(value)))
             is_set = isinstance(value, (set, frozenset))  # whose order differs from process to process
             self.parts("items", tuple(sorted(value, key=repr) if is_set else value))
             self.own(value)
@@ -199,13 +198,13 @@ class _Walk:
             self.an_object(value)
 
     def parts(self, kind: str, parts: tuple[Any, ...]) -> None:
-        self.say(kind, len(parts))
+        self.add(kind, len(parts))
         for part in parts:
             self.value(part)
 
     def mapping(self, mapping: Mapping[Any, Any]) -> None:
         items = tuple(mapping.items())
-        self.reads.mappings.append((mapping, tuple(k for k, _ in items), tuple(v for _, v in items)))
+        self.captured.mappings.append((mapping, tuple(k for k, _ in items), tuple(v for _, v in items)))
         for key, value in items:
             self.parts("entry", (key, value))
 
@@ -224,17 +223,17 @@ class _Walk:
         """What stands in a dict of globals, or of modules, by name."""
         if self.is_new((id(where), name), None):
             value = where.get(name, _MISSING)
-            self.reads.named.append((where, name, value))
-            self.say(name)
+            self.captured.named.append((where, name, value))
+            self.add(name)
             self.value(value)
 
     def function(self, f: types.FunctionType) -> None:
-        self.say("function", f.__qualname__)
-        self.reads.functions.append((f, f.__code__, f.__defaults__, f.__kwdefaults__))
+        self.add("function", f.__qualname__)
+        self.captured.functions.append((f, f.__code__, f.__defaults__, f.__kwdefaults__))
         cells = f.__closure__ or ()
         if _is_library(f.__globals__.get("__name__") or "__main__"):
             # Of a library's decorator, what it decorates; IPython's autoreload changes the attribute, not the closure.
-            self.reads.named.append((vars(f), "__wrapped__", vars(f).get("__wrapped__", _MISSING)))
+            self.captured.named.append((vars(f), "__wrapped__", vars(f).get("__wrapped__", _MISSING)))
             inside = [_inside(cell) for cell in cells] + [vars(f).get("__wrapped__")]
             self.parts("decorates", tuple(x for x in inside if callable(x)))
             return
@@ -248,52 +247,52 @@ class _Walk:
                 self.place(sys.modules, module)
         for cell in cells:
             value = _inside(cell)
-            self.reads.cells.append((cell, value))
+            self.captured.cells.append((cell, value))
             self.value(value)
         self.parts("defaults", (f.__defaults__, f.__kwdefaults__))
         if vars(f):
             self.mapping(vars(f))
 
     def code(self, code: types.CodeType) -> None:
-        self.say("code", code.co_code, *code.co_names, "|", *code.co_varnames, "|", *code.co_freevars)
+        self.add("code", code.co_code, *code.co_names, "|", *code.co_varnames, "|", *code.co_freevars)
         for constant in code.co_consts:
             if isinstance(constant, types.CodeType):
                 self.code(constant)
             else:
                 is_set = isinstance(constant, frozenset)
-                self.say(type(constant).__name__, sorted(map(repr, constant)) if is_set else repr(constant))
+                self.add(type(constant).__name__, sorted(map(repr, constant)) if is_set else repr(constant))
 
     def a_class(self, cls: type) -> None:
-        self.say("class", cls.__module__, cls.__qualname__)
+        self.add("class", cls.__module__, cls.__qualname__)
         for base in cls.__mro__:
             own = vars(base)
             if is_of_library(base):
                 continue
-            self.reads.mappings.append((own, tuple(own), tuple(own.values())))
+            self.captured.mappings.append((own, tuple(own), tuple(own.values())))
             for name, value in tuple(own.items()):
                 plain = not (name.startswith("__") and name.endswith("__")) and name != "_abc_impl"
                 if plain or (isinstance(value, types.FunctionType) and value.__code__.co_filename != "<string>"):
-                    self.say(name)
+                    self.add(name)
                     self.value(value)
 
     def array(self, array: np.ndarray) -> None:
         if array.dtype == object:
-            self.reads.sequences.append((array, tuple(array)))
+            self.captured.sequences.append((array, tuple(array)))
             return self.parts("objects", (array.shape, *array.flat))
         if array.nbytes > _LARGEST_ARRAY or array.dtype.hasobject:
             return self.opaque(array)
-        self.reads.arrays.append((array, array.copy()))
-        self.say("array", array.dtype.str, array.shape, array.tobytes())
+        self.captured.arrays.append((array, array.copy()))
+        self.add("array", array.dtype.str, array.shape, array.tobytes())
 
     def an_object(self, thing: Any) -> None:
         kind = type(thing)
         if not is_of_library(kind) or kind in _NAMESPACES:
-            self.say("object")
+            self.add("object")
             return self.own(thing)
         attributes = getattr(thing, "__dict__", None)
         wrapped = attributes.get("__wrapped__") if isinstance(attributes, dict) else None
         if isinstance(attributes, dict) and dataclasses.is_dataclass(thing):
-            self.say("object", kind.__qualname__)
+            self.add("object", kind.__qualname__)
             self.mapping(attributes)
         elif wrapped is not None:  # a function that is compiled, or remembers
             self.parts("wrapper", (wrapped,))
@@ -312,18 +311,18 @@ class _Walk:
             for name, member in vars(base).items():
                 if isinstance(member, types.MemberDescriptorType) and not is_of_library(base):
                     value = getattr(thing, name, _MISSING)
-                    self.reads.attributes.append((thing, name, value))
+                    self.captured.attributes.append((thing, name, value))
                     self.parts("slot", (name, value))
 
     def opaque(self, thing: Any) -> None:
         """What cannot be looked into is told by which object it is, or by its pickle."""
         which: Any = None
-        if not self.reads.lasting:
+        if not self.captured.lasting:
             which = _serial(thing)
         else:
             with contextlib.suppress(Exception):  # a lock, a stream: it has no numbers
                 which = pickle.dumps(thing)
-        self.say("opaque", type(thing).__qualname__, which)
+        self.add("opaque", type(thing).__qualname__, which)
 
 
 class _Names(NamedTuple):

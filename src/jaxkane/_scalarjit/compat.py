@@ -88,7 +88,7 @@ def evaluated(equation: Any, inputs: Sequence[Any]) -> Sequence[Any]:
     return results if primitive.multiple_results else [results]
 
 
-def programs_in(equation: Any) -> list[ClosedJaxpr]:
+def programs_in(equation: Any) -> list[Any]:
     """The programs that an equation runs."""
     values = [x for p in equation.params.values() for x in (p if isinstance(p, (tuple, list)) else [p])]
     programs = [x for x in values if isinstance(x, (ClosedJaxpr, Jaxpr))]

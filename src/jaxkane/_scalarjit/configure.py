@@ -122,12 +122,12 @@ def _float32_arrays() -> int:
 
 def _has_started() -> bool:
     # JAX has no public question for this, but refuses a new number of CPU devices once it has started.
-    now = jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue]
+    number = jax.config.jax_num_cpu_devices  # pyright: ignore[reportAttributeAccessIssue]
     try:
-        jax.config.update("jax_num_cpu_devices", now + 1)
+        jax.config.update("jax_num_cpu_devices", number + 1)
     except RuntimeError:  # raised for nothing else: the setting is only written down
         return True
-    jax.config.update("jax_num_cpu_devices", now)
+    jax.config.update("jax_num_cpu_devices", number)
     return False
 
 
@@ -150,9 +150,9 @@ def _split_cpu(devices: int) -> None:
 def _folder(cache: bool | str | os.PathLike[str]) -> Path:
     if not isinstance(cache, bool):
         return Path(cache).expanduser().absolute()
-    given: Any = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
-    if given:
-        return Path(given)
+    folder: Any = jax.config.jax_compilation_cache_dir  # pyright: ignore[reportAttributeAccessIssue]
+    if folder:
+        return Path(folder)
     home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or "~/.cache"
     return Path(home).expanduser() / "jaxkane"
 

@@ -42,38 +42,38 @@ class _Hash:
         self.add(value)
         return self.sha.hexdigest()[:16]
 
-    def say(self, *words: Any) -> None:
+    def words(self, *words: Any) -> None:
         for word in words:
             data = word if isinstance(word, bytes) else str(word).encode()
             self.sha.update(str(len(data)).encode() + b":" + data)
 
     def add(self, value: Any) -> None:
         if value is None or isinstance(value, (bool, int, float, complex, str, bytes)):
-            self.say(type(value).__name__, value if isinstance(value, bytes) else repr(value))
+            self.words(type(value).__name__, value if isinstance(value, bytes) else repr(value))
         elif isinstance(value, Tracer):  # a rule of an operation that was traced within another, which holds the value
-            self.say("traced", value.dtype, value.shape)
+            self.words("traced", value.dtype, value.shape)
         elif isinstance(value, (np.ndarray, np.generic, jax.Array)):
             array = np.asarray(value)
-            self.say("array", array.dtype.str, array.shape, np.ascontiguousarray(array).tobytes())
+            self.words("array", array.dtype.str, array.shape, np.ascontiguousarray(array).tobytes())
         elif isinstance(value, enum.Enum):
-            self.say("enum", type(value).__qualname__, value.name)
+            self.words("enum", type(value).__qualname__, value.name)
         elif isinstance(value, Mapping):
-            self.say("dict", len(value))
+            self.words("dict", len(value))
             for key, item in value.items():
                 self.add(key)
                 self.add(item)
         elif isinstance(value, (list, tuple)):
-            self.say("sequence", len(value))
+            self.words("sequence", len(value))
             for item in value:
                 self.add(item)
         elif isinstance(value, (set, frozenset)):
-            self.say("set", *sorted(digest(item, self.code) for item in value))
+            self.words("set", *sorted(digest(item, self.code) for item in value))
         elif hasattr(value, "eqns") or (hasattr(value, "jaxpr") and hasattr(value, "consts")):
             if id(value) not in self.programs:
                 inner = _Hash(self.code, self.programs)
                 inner.program(value)
                 self.programs[id(value)] = value, inner.sha.hexdigest()
-            self.say(self.programs[id(value)][1])
+            self.words(self.programs[id(value)][1])
         else:
             self.thing(value)
 
@@ -83,24 +83,24 @@ class _Hash:
         if inner is not None:  # of scalars, see `_scalarjit.function`
             self.add(inner)
         elif isinstance(params, Mapping):  # an operation that holds programs itself: `jax.lax.custom_root`
-            self.say("operation", type(value).__qualname__)
+            self.words("operation", type(value).__qualname__)
             self.add(params)
         elif self.code is not None and hasattr(value, "callback_func"):  # of `jax.pure_callback`, `io_callback`
-            self.say("called back", self.code(value.callback_func))
+            self.words("called back", self.code(value.callback_func))
         elif isinstance(value, (type, types.BuiltinFunctionType, np.dtype)):
-            self.say("named", getattr(value, "__qualname__", value))
+            self.words("named", getattr(value, "__qualname__", value))
         elif dataclasses.is_dataclass(value):
-            self.say("object", type(value).__qualname__)
+            self.words("object", type(value).__qualname__)
             for field in dataclasses.fields(value):
-                self.say(field.name)
+                self.words(field.name)
                 self.add(getattr(value, field.name, None))
         elif not jax.tree_util.all_leaves([value]):
-            self.say("object", type(value).__qualname__)
+            self.words("object", type(value).__qualname__)
             self.add(jax.tree.leaves(value))
         elif callable(value):
-            self.say("named", type(value).__qualname__, getattr(value, "__qualname__", ""))
+            self.words("named", type(value).__qualname__, getattr(value, "__qualname__", ""))
         else:
-            self.say(type(value).__qualname__, _ADDRESS.sub("", str(value)))
+            self.words(type(value).__qualname__, _ADDRESS.sub("", str(value)))
 
     def program(self, program: Any) -> None:
         """Operations in their order, variables by the places where they were made."""
@@ -109,23 +109,23 @@ class _Hash:
         numbers: dict[Any, int] = {}
 
         def name(variables: Sequence[Any]) -> None:
-            self.say("variables", len(variables))
+            self.words("variables", len(variables))
             for v in variables:
                 if hasattr(v, "val"):
-                    self.say("literal", v.aval)
+                    self.words("literal", v.aval)
                     self.add(v.val)
                 else:
-                    self.say(numbers.setdefault(v, len(numbers)), v.aval)
+                    self.words(numbers.setdefault(v, len(numbers)), v.aval)
 
-        self.say("program")
+        self.words("program")
         name((*program.constvars, *program.invars))
         self.add(tuple(constants))
         for equation in program.eqns:
-            self.say(equation.primitive.name)
+            self.words(equation.primitive.name)
             name(equation.invars)
             for key, value in sorted(equation.params.items()):
                 if key not in _NOT_COMPUTED:
-                    self.say(key)
+                    self.words(key)
                     self.add(value)
             name(equation.outvars)
         name(program.outvars)

@@ -241,17 +241,17 @@ class Program:
     def _transposed(self, linear: tuple[bool, ...]) -> Program:
         """(the other inputs, cotangents of the outputs) -> cotangents of the linear inputs."""
         places = [i for i, is_linear in enumerate(linear) if is_linear]
-        others = [i for i, is_linear in enumerate(linear) if not is_linear]
+        fixed = [i for i, is_linear in enumerate(linear) if not is_linear]
         specs = specs_of(self.in_avals)
 
         def cotangents(*args):
-            known, cts = args[: len(others)], args[len(others) :]
-            full = replaced([None] * len(linear), others, known)
+            known, cts = args[: len(fixed)], args[len(fixed) :]
+            full = replaced([None] * len(linear), fixed, known)
             of_linear = lambda *ys: self.evaluate(*replaced(full, places, ys))  # noqa: E731
             return jax.linear_transpose(of_linear, *[specs[i] for i in places])(list(cts))
 
-        program = jax.make_jaxpr(cotangents)(*[specs[i] for i in others], *specs_of(self.out_avals))
-        return Program(program, self.label, frozenset(j for j, i in enumerate(others) if i in self.loop_invariant))
+        program = jax.make_jaxpr(cotangents)(*[specs[i] for i in fixed], *specs_of(self.out_avals))
+        return Program(program, self.label, frozenset(j for j, i in enumerate(fixed) if i in self.loop_invariant))
 
     def _batched(self, sizes: tuple[int, ...], where: Where) -> Program:
         """The program over leading axes of these sizes, of which input i has those in `where[i]`."""
@@ -412,9 +412,9 @@ def _by_xla(*args, program, sizes, where):
 
 def _in_chunks(args, program, sizes, where):
     """A large batch, some of its first axis at a time; the last chunk begins earlier, so that all are alike."""
-    n, others = sizes[0], sizes[1:]
-    size = max(1, min(n, _MOST_LANES // math.prod(others)))
-    bind = functools.partial(_program_p.bind, program=program, sizes=(size, *others), where=where)
+    n, inner = sizes[0], sizes[1:]
+    size = max(1, min(n, _MOST_LANES // math.prod(inner)))
+    bind = functools.partial(_program_p.bind, program=program, sizes=(size, *inner), where=where)
 
     def chunk(i, outputs):
         start = jnp.minimum(i * size, n - size)

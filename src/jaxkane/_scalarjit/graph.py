@@ -162,15 +162,15 @@ def applied(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.ndarra
         inner = equation.params[_OPENED[equation.primitive.name]]
         return unrolled(inner, xs, graph)
     avals: list[Any] = [v.aval for v in equation.outvars]
-    found = zip(_operation(equation, xs, graph), avals, strict=True)
-    return [x if x.shape == aval.shape else np.broadcast_to(x, aval.shape) for x, aval in found]
+    results = zip(_operation(equation, xs, graph), avals, strict=True)
+    return [x if x.shape == aval.shape else np.broadcast_to(x, aval.shape) for x, aval in results]
 
 
 def _each(f: Callable[..., int], *xs: np.ndarray) -> np.ndarray:
     if any(x.shape != xs[0].shape for x in xs):
         xs = np.broadcast_arrays(*xs)
-    found = [f(*numbers) for numbers in zip(*(x.ravel().tolist() for x in xs), strict=True)]
-    return np.array(found, np.int64).reshape(xs[0].shape)
+    results = [f(*numbers) for numbers in zip(*(x.ravel().tolist() for x in xs), strict=True)]
+    return np.array(results, np.int64).reshape(xs[0].shape)
 
 
 _name_of = functools.cache(str)  # of a dtype; NumPy composes it anew each time
@@ -285,12 +285,12 @@ def _full(shape: Sequence[int], value: Any, graph: Graph, dtype: str) -> np.ndar
 
 
 def _power(x: np.ndarray, y: int, each: Callable[..., np.ndarray], one: np.ndarray) -> np.ndarray:
-    found, factor, n = one, x, abs(y)
+    power, factor, n = one, x, abs(y)
     while n:
         if n & 1:
-            found = each("mul", found, factor)
+            power = each("mul", power, factor)
         factor, n = each("mul", factor, factor) if n > 1 else factor, n >> 1
-    return found if y >= 0 else each("div", one, found)
+    return power if y >= 0 else each("div", one, power)
 
 
 def _rounded(x: np.ndarray, to_even: bool, each: Callable[..., np.ndarray], graph: Graph, dtype: str) -> np.ndarray:

@@ -203,7 +203,8 @@ def jacobian(
     """The derivatives (..., d) of each output by d elements of the inputs, as nodes of the graph."""
     moving = sorted({i for i, _ in directions})
     tangents = cse(tangent_program(program, moving))
-    jaxpr, avals = tangents.jaxpr, types_of(program)
+    jaxpr: Any = tangents.jaxpr
+    avals = types_of(program)
     values = dict(zip(jaxpr.invars, inputs, strict=False)) | {
         v: as_constants(x, graph) for v, x in zip(jaxpr.constvars, tangents.consts, strict=True)
     }

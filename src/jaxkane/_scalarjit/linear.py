@@ -111,14 +111,14 @@ def _part(A: Rows, rows: list[int], columns: list[int]) -> Rows:
 
 
 def _solved_by_blocks(A: Rows, rights: Sequence[Sequence[Component]], blocks: list[Block]) -> list:
-    found: list[dict[int, Component]] = [{} for _ in rights]
+    solutions: list[dict[int, Component]] = [{} for _ in rights]
     for rows, columns in blocks:
         remaining = []
-        for b, x in zip(rights, found, strict=True):
+        for b, x in zip(rights, solutions, strict=True):
             remaining.append([functools.reduce(sub, (mul(A[i][j], x[j]) for j in x), b[i]) for i in rows])
-        for x, solved in zip(found, solve(_part(A, rows, columns), *remaining), strict=True):
+        for x, solved in zip(solutions, solve(_part(A, rows, columns), *remaining), strict=True):
             x.update(zip(columns, solved, strict=True))
-    return [tuple(x[j] for j in range(len(A))) for x in found]
+    return [tuple(x[j] for j in range(len(A))) for x in solutions]
 
 
 def _solved_by_lapack_rows(A: Rows, rights: Sequence[Sequence[Component]]) -> list:
@@ -190,8 +190,8 @@ def _regular(pivot: Component, diagonal: Component) -> Component:
     """The pivot, or NaN where it is no more than what rounding has left of the diagonal entry."""
     if is_exact(pivot) and is_exact(diagonal):
         return pivot if pivot > rounding_of_pivots(float) * diagonal else math.nan
-    least = rounding_of_pivots(jnp.result_type(pivot, diagonal)) * diagonal
-    return jnp.where(pivot > least, pivot, math.nan)
+    threshold = rounding_of_pivots(jnp.result_type(pivot, diagonal)) * diagonal
+    return jnp.where(pivot > threshold, pivot, math.nan)
 
 
 def _quotient(a: Component, b: Component) -> Component:

@@ -9,13 +9,11 @@ import contextlib
 import ctypes.util
 import functools
 import hashlib
-import os
 import platform
-import tempfile
 import threading
 import warnings
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import jax
 
@@ -29,7 +27,7 @@ def cache_folder() -> Path | None:
     return Path(folder) / "jaxkane" if folder and "://" not in folder else None
 
 
-class Objects(NamedTuple):
+class ObjectCache(NamedTuple):
     """A folder of compiled code."""
 
     folder: Path
@@ -50,8 +48,11 @@ class Objects(NamedTuple):
         return None
 
     def write(self, name: str, code: bytes) -> None:
+        from ..._common.files import atomic_write  # the probe's worker loads this file alone, and writes nothing
+
         try:
-            atomic_write(self.folder / f"{name}.o", _seal(name, code) + code)
+            self.folder.mkdir(parents=True, exist_ok=True)
+            atomic_write(self.folder / f"{name}.o", lambda file: file.write(_seal(name, code) + code))
         except OSError as error:
             text = f"Compiled code could not be kept in {self.folder}: {error.strerror or error}."
             warnings.warn(text, stacklevel=2)
@@ -61,34 +62,11 @@ def _seal(name: str, code: bytes) -> bytes:
     return _MARK + hashlib.sha256(name.encode() + b"\n" + code).hexdigest().encode() + b"\n"
 
 
-def atomic_write(path: Path, content: bytes) -> None:
-    """A file that is either there as a whole or not at all, whoever else writes it and whenever the power goes."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, scratch = tempfile.mkstemp(dir=path.parent, prefix=".scratch-")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(scratch, path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(scratch)
-        raise
-
-
 _OLDEST_LLVM = 20
 _MATHEMATICS = {"Linux": "libm.so.6", "Darwin": "/usr/lib/libSystem.B.dylib", "Windows": "ucrtbase.dll"}
 
 
-class Store(Protocol):
-    """Where compiled code is kept from one process to the next."""
-
-    def read(self, name: str) -> bytes | None: ...
-    def write(self, name: str, code: bytes) -> None: ...
-
-
-class Machine:
+class LLVMCompiler:
     """This processor: its name and `features`, and how many float64 `lanes` its vectors have.
 
     LLVM is for one thread at a time, and a function must not be compiled twice: the code of the first would go while
@@ -119,7 +97,7 @@ class Machine:
     def key(self) -> tuple[str, str, str]:
         return self.cpu, self.features, self.version
 
-    def compile(self, text: str, store: Store | None = None) -> tuple[int, str]:
+    def compile(self, text: str, store: ObjectCache | None = None) -> tuple[int, str]:
         """The address of the function that `text` defines as @it, and a name for it that other texts may call."""
         name = self.name_of(text)
         with self.lock:
@@ -130,7 +108,7 @@ class Machine:
                 self._compiled[name] = address, keepers  # code lives as long as the process
             return self._compiled[name][0], name
 
-    def _engine(self, name: str, text: str, store: Store | None) -> tuple[Any, Any]:
+    def _engine(self, name: str, text: str, store: ObjectCache | None) -> tuple[Any, Any]:
         llvm = self.llvm
         module = llvm.parse_assembly(text)
         module.name = name

@@ -50,7 +50,7 @@ _MOVED = (
 )
 
 
-def handler_text(
+def wrapper_text(
     kernel: str, sizes: Sequence[int], where: Sequence[Sequence[bool]], n_out: int, bytes_of: Sequence[int]
 ) -> str:
     """The function that XLA calls: for every place in the outer dimensions, the kernel on the lanes of the last.

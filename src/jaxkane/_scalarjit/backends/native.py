@@ -14,8 +14,8 @@ import numpy as np
 from ..compat import ClosedJaxpr, types_of
 from ..graph import LIBRARY, NotScalarError, graph_of, symbol
 from . import probe
-from .compiler import Machine, Objects, cache_folder, without_llvm
-from .ffi import handler_text
+from .compiler import LLVMCompiler, ObjectCache, cache_folder, without_llvm
+from .ffi import wrapper_text
 from .llvm import Writer
 
 _ON, _OFF = ("", "1", "true", "yes", "on"), ("0", "false", "no", "off")
@@ -33,14 +33,14 @@ _lock = threading.RLock()
 _told: set[str] = set()
 
 
-def machine() -> Machine:
+def llvm_compiler() -> LLVMCompiler:
     with _lock:
-        return _machine()
+        return _llvm_compiler()
 
 
 @functools.cache
-def _machine() -> Machine:
-    return Machine()
+def _llvm_compiler() -> LLVMCompiler:
+    return LLVMCompiler()
 
 
 def use(native: bool) -> None:
@@ -93,7 +93,7 @@ def _refused() -> str | None:
 @functools.cache
 def _verdict() -> str | None:
     try:
-        return probe.verdict(machine())
+        return probe.verdict(llvm_compiler())
     except RuntimeError as error:  # as llvmlite says that LLVM does not know this processor
         return f"LLVM does not work here: {error}"
 
@@ -112,8 +112,8 @@ class Scalars:
 
     def __init__(self, program: ClosedJaxpr):
         self.graph, self.outputs = graph_of(program)
-        taken, given = types_of(program)
-        self.bytes_of = [a.size * a.dtype.itemsize for a in (*taken, *given)]
+        inputs, results = types_of(program)
+        self.bytes_of = [a.size * a.dtype.itemsize for a in (*inputs, *results)]
         self.functions = {
             symbol(node._replace(operation=FMOD) if node.operation == "rem" else node)
             for node in self.graph.nodes
@@ -123,7 +123,7 @@ class Scalars:
         self.target = functools.cache(self._target)
 
     def _kernel(self, groups: Groups, varies: tuple[bool, ...], lanes: int) -> str:
-        of_lanes = functools.partial(machine().of_lanes, lanes=lanes)
+        of_lanes = functools.partial(llvm_compiler().of_lanes, lanes=lanes)
         writer = Writer(self.graph.reading_groups(groups), varies, lanes, of_lanes)
         return _compiled(writer.text(len(varies), self.outputs))[1]
 
@@ -133,24 +133,24 @@ class Scalars:
 
         **Raises:** `NotScalarError` where this machine lacks a function, `RuntimeError` where LLVM fails.
         """
-        missing = sorted(f for f in self.functions if not machine().has(f))
+        missing = sorted(f for f in self.functions if not llvm_compiler().has(f))
         if missing:
             raise NotScalarError(f"{', '.join(missing)} (not in the mathematical library here)")
         bytes_of = [sum(self.bytes_of[i] for i in group) for group in groups] + self.bytes_of[len(where) :]
         where = tuple(where[group[0]] for group in groups)
         if all(all(w) or not any(w) for w in where):  # one long batch
             sizes, where = (int(np.prod(sizes)),) if sizes else (), tuple((any(w),) if sizes else () for w in where)
-        lanes = min(machine().lanes, 1 << (sizes[-1] - 1).bit_length()) if sizes else 1
-        with machine().lock:
+        lanes = min(llvm_compiler().lanes, 1 << (sizes[-1] - 1).bit_length()) if sizes else 1
+        with llvm_compiler().lock:
             kernel = self.kernel(groups, tuple(bool(w and w[-1]) for w in where), lanes)
-            address, name = _compiled(handler_text(kernel, sizes, where, len(self.outputs), bytes_of))
+            address, name = _compiled(wrapper_text(kernel, sizes, where, len(self.outputs), bytes_of))
             _register(address, name)
         return name
 
 
 def _compiled(text: str) -> tuple[int, str]:
     folder = cache_folder()
-    return machine().compile(text, Objects(folder) if folder else None)
+    return llvm_compiler().compile(text, ObjectCache(folder) if folder else None)
 
 
 @functools.cache

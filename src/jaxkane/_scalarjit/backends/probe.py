@@ -1,6 +1,6 @@
 """Whether XLA can call native kernels here: one is called in another process, before this one calls any.
 
-How XLA calls them is written down in `_handler` as numbers, and a jaxlib that has moved something would make wild
+How XLA calls them is written down in `ffi` as numbers, and a jaxlib that has moved something would make wild
 pointers of them. So the first kernel runs where it can do no harm. That takes about a second; the verdict is kept for
 the next processes, by the versions of jaxlib and LLVM, the processor and the text itself.
 """
@@ -20,9 +20,10 @@ from typing import Any
 import jaxlib
 import numpy as np
 
+from ..._common.files import atomic_write
 from ..graph import Graph
-from .compiler import Machine, atomic_write, cache_folder
-from .ffi import handler_text
+from .compiler import LLVMCompiler, cache_folder
+from .ffi import wrapper_text
 from .llvm import Writer
 
 _PATIENCE = 120.0  # [s], of a busy machine
@@ -34,11 +35,11 @@ _X = np.stack([np.linspace(-2.0, 2.0, _LANES), np.linspace(0.5, 3.0, _LANES)], a
 _A = 0.75
 
 
-def verdict(machine: Machine) -> str | None:
+def verdict(compiler: LLVMCompiler) -> str | None:
     """Why native kernels cannot be called here; None where they can."""
     key = hashlib.sha256(
         "\n".join(
-            [_handler("kernel"), *machine.key, jaxlib.__version__, sys.version, platform.system(), platform.machine()]
+            [_wrapper("kernel"), *compiler.key, jaxlib.__version__, sys.version, platform.system(), platform.machine()]
         ).encode()
     ).hexdigest()[:32]
     folders = _folders()
@@ -46,15 +47,17 @@ def verdict(machine: Machine) -> str | None:
         known = _read(folder / f"kernels-{key}.json")
         if known is not None:
             return known or None
-    found, is_final = _tried(machine)
+    refusal, is_final = _tried(compiler)
     if is_final:
         for folder in folders:
             try:
-                atomic_write(folder / f"kernels-{key}.json", json.dumps({"cannot": found or ""}).encode())
+                folder.mkdir(parents=True, exist_ok=True)
+                text = json.dumps({"cannot": refusal or ""}).encode()
+                atomic_write(folder / f"kernels-{key}.json", lambda file, text=text: file.write(text))
                 break
             except OSError:
                 continue  # where nothing can be written every process tries for itself
-    return found
+    return refusal
 
 
 def _folders() -> list[Path]:
@@ -74,11 +77,11 @@ def _read(path: Path) -> str | None:
     return known if isinstance(known, str) and not (known and is_old) else None
 
 
-def _handler(kernel: str) -> str:
-    return handler_text(kernel, (_LANES,), ((True,), (False,)), 3, [16, 8, 8, 8, 1])
+def _wrapper(kernel: str) -> str:
+    return wrapper_text(kernel, (_LANES,), ((True,), (False,)), 3, [16, 8, 8, 8, 1])
 
 
-def _kernel(machine: Machine) -> str:
+def _kernel(compiler: LLVMCompiler) -> str:
     """(x, y), a -> y sin(x) + a^601 + ... + a, atan2(y, x), x < y"""
     graph = Graph()
     double = lambda operation, *operands: graph.apply(operation, operands, "float64")  # noqa: E731
@@ -88,7 +91,7 @@ def _kernel(machine: Machine) -> str:
     for _ in range(_SHARED):
         total, power = double("add", total, power), double("mul", power, a)
     outputs = [total, double("atan2", y, x), graph.apply("lt", (x, y), "bool")]
-    writer = Writer(graph, (True, False), machine.lanes, lambda f, arity: machine.of_lanes(f, arity, machine.lanes))
+    writer = Writer(graph, (True, False), compiler.lanes, lambda f, arity: compiler.of_lanes(f, arity, compiler.lanes))
     return writer.text(2, [np.array([k]) for k in outputs])
 
 
@@ -97,14 +100,14 @@ def _expected() -> list[Any]:
     return [y * np.sin(x) + np.sum(_A ** np.arange(1, _SHARED + 1)), np.arctan2(y, x), x < y]
 
 
-def _tried(machine: Machine) -> tuple[str | None, bool]:
+def _tried(compiler: LLVMCompiler) -> tuple[str | None, bool]:
     """Why not, or None; and whether that is to be kept."""
     if getattr(sys, "frozen", False) or not sys.executable:
         return "there is no Python beside this program in which they could be tried", False
-    kernel = _kernel(machine)
-    asked = {
-        "texts": [kernel, _handler(machine.name_of(kernel))],
-        "key": machine.key,
+    kernel = _kernel(compiler)
+    request = {
+        "texts": [kernel, _wrapper(compiler.name_of(kernel))],
+        "key": compiler.key,
         "jaxlib": jaxlib.__version__,
         "arguments": [_X.tolist(), [_A]],
         "results": [([_LANES], "float64"), ([_LANES], "float64"), ([_LANES], "bool")],
@@ -116,7 +119,7 @@ def _tried(machine: Machine) -> tuple[str | None, bool]:
         run = subprocess.run(
             # -P: its folder, where files have names such as numpy.py, is no place to import from
             [sys.executable, "-P", str(Path(__file__).with_name("probe_worker.py"))],
-            input=json.dumps(asked),
+            input=json.dumps(request),
             env=environment,
             capture_output=True,
             text=True,
@@ -138,8 +141,8 @@ def _judged(run: subprocess.CompletedProcess[str]) -> str | None:
             f"was ended by signal {-run.returncode}" if run.returncode < 0 else f"failed: {last[:300]}"
         )
     try:
-        found = [np.array(x) for x in json.loads(run.stdout.splitlines()[-1])]
-        right = all(np.allclose(a, b, rtol=1e-12, atol=1e-12) for a, b in zip(found, _expected(), strict=True))
+        results = [np.array(x) for x in json.loads(run.stdout.splitlines()[-1])]
+        right = all(np.allclose(a, b, rtol=1e-12, atol=1e-12) for a, b in zip(results, _expected(), strict=True))
     except (ValueError, IndexError, TypeError):
         right = False
     return None if right else _FAILED.format("gave wrong numbers")

@@ -13,30 +13,30 @@ from pathlib import Path
 
 
 def main() -> None:
-    asked = json.load(sys.stdin)
+    request = json.load(sys.stdin)
     spec = importlib.util.spec_from_file_location("compiler", Path(__file__).with_name("compiler.py"))
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
-    machine = module.Machine()
-    if list(machine.key) != asked["key"]:
-        raise SystemExit(f"another LLVM or processor than asked for: {machine.key[0]}, {machine.key[2]}")
-    address, name = [machine.compile(text) for text in asked["texts"]][-1]
+    compiler = module.LLVMCompiler()
+    if list(compiler.key) != request["key"]:
+        raise SystemExit(f"another LLVM or processor than asked for: {compiler.key[0]}, {compiler.key[2]}")
+    address, name = [compiler.compile(text) for text in request["texts"]][-1]
 
     import jax
     import jaxlib
     import numpy as np
 
-    if jaxlib.__version__ != asked["jaxlib"]:
+    if jaxlib.__version__ != request["jaxlib"]:
         raise SystemExit(f"another jaxlib than asked for: {jaxlib.__version__}")
     jax.config.update("jax_enable_x64", True)
     handler = ctypes.CFUNCTYPE(ctypes.c_void_p)(address)
     jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(handler), platform="cpu")
-    results = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in asked["results"]]
+    results = [jax.ShapeDtypeStruct(shape, dtype) for shape, dtype in request["results"]]
     call = jax.ffi.ffi_call(name, results)
-    found = jax.jit(lambda *xs: call(*xs))(*[np.array(x, np.float64) for x in asked["arguments"]])
-    print(json.dumps([np.asarray(x).tolist() for x in found]))
+    outputs = jax.jit(lambda *xs: call(*xs))(*[np.array(x, np.float64) for x in request["arguments"]])
+    print(json.dumps([np.asarray(x).tolist() for x in outputs]))
 
 
 if __name__ == "__main__":

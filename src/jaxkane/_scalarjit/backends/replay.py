@@ -40,7 +40,7 @@ class Replay:
         return equations[::-1]
 
     def __call__(self, part: str, numbers: Sequence[Any], memory: dict[Any, Any]) -> Any:
-        jaxpr = self.program.jaxpr
+        jaxpr: Any = self.program.jaxpr
         values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*self.program.consts, *numbers), strict=True))
         for equation in self.needed(part):
             xs = [v.val if is_literal(v) else values[v] for v in equation.invars]

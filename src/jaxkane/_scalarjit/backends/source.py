@@ -22,28 +22,28 @@ Constant = Callable[[Any, str], Any]
 def as_objects(
     graph: Graph,
     nodes: Iterable[int],
-    given: Mapping[int, Any],
+    objects: Mapping[int, Any],
     table: Table,
     constant: Constant,
     language: str,
-    kept: Callable[[int, Any], Any] = lambda k, x: x,
+    named: Callable[[int, Any], Any] = lambda k, x: x,
 ) -> dict[int, Any]:
     """Nodes, each after those that it reads, as objects of a library.
 
-    `given`: the objects that stand for inputs, and for other nodes that are not to be opened. `kept` may put another
-    object, such as a name, in the place of the one that was made for a node.
+    `objects`: those of inputs, and of other nodes that are not to be opened. `named` may put another object, such as a
+    name, in the place of the one that was made for a node.
     """
-    found: dict[int, Any] = {}
+    made: dict[int, Any] = {}
     for k in nodes:
         node = graph.nodes[k]
-        if k in given:
-            found[k] = given[k]
+        if k in objects:
+            made[k] = objects[k]
         elif node.operation == "constant":
-            found[k] = constant(graph.value(k), node.dtype)
+            made[k] = constant(graph.value(k), node.dtype)
         else:
-            operands = [found[i] for i in node.operands]
-            found[k] = kept(k, operation_in(table, node, language)(*operands))
-    return found
+            operands = [made[i] for i in node.operands]
+            made[k] = named(k, operation_in(table, node, language)(*operands))
+    return made
 
 
 def operation_in(table: Mapping[str, Any], node: Node, language: str) -> Any:
@@ -118,33 +118,33 @@ _WIDE = 70  # characters that are still read at a glance
 
 
 def as_source(
-    graph: Graph, outputs: Sequence[np.ndarray], given: Mapping[int, str], language: Language, temporary: str = "x{}"
+    graph: Graph, outputs: Sequence[np.ndarray], names: Mapping[int, str], language: Language, temporary: str = "x{}"
 ) -> tuple[list[str], list[list[str]]]:
     """The lines before the outputs, and the outputs' elements as expressions.
 
-    What is read more than once, or would be long, has a line and a name of its own; `given` are the names of inputs.
+    What is read more than once, or would be long, has a line and a name of its own; `names` are those of inputs.
     """
     nodes = needed(graph.nodes, outputs)
     count = uses(graph, nodes, outputs)
     lines: list[str] = []
-    found: dict[int, tuple[str, int]] = {}
+    texts: dict[int, tuple[str, int]] = {}
     for k in nodes:
         node = graph.nodes[k]
         if node.operation == "input":
-            found[k] = given[k], TIGHT
+            texts[k] = names[k], TIGHT
         elif node.operation == "constant":
             text = language.constant(graph.value(k), node.dtype)
-            found[k] = text, SIGNED if text.startswith("-") else TIGHT
+            texts[k] = text, SIGNED if text.startswith("-") else TIGHT
         else:
             form = operation_in(language.forms, node, language.name)
             operands = [
                 text if binds >= needs else f"({text})"
-                for (text, binds), needs in zip((found[i] for i in node.operands), form.operands, strict=True)
+                for (text, binds), needs in zip((texts[i] for i in node.operands), form.operands, strict=True)
             ]
             text = form.text.format(*operands, s=language.suffix[node.dtype], type=language.types[node.dtype])
-            found[k] = text, form.binds
+            texts[k] = text, form.binds
             if count[k] > 1 or len(text) > _WIDE:
                 name = temporary.format(len(lines))
                 lines.append(language.declared(name, text, node.dtype))
-                found[k] = name, TIGHT
-    return lines, [[found[int(k)][0] for k in array.flat] for array in outputs]
+                texts[k] = name, TIGHT
+    return lines, [[texts[int(k)][0] for k in array.flat] for array in outputs]

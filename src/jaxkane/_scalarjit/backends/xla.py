@@ -22,7 +22,7 @@ _PIECE = 250
 
 def as_one_function(program: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
     """The results of a program, compiled as one function, or as several one after the other."""
-    jaxpr = program.jaxpr
+    jaxpr: Any = program.jaxpr
     if len(jaxpr.eqns) <= _WHOLE_UP_TO:
         return _called(jaxpr_as_fun(program), args)
     values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*program.consts, *args), strict=True))

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxkane._scalarjit import function as fuse
+from jaxkane._scalarjit import function
 from jaxkane._scalarjit.backends import xla
 from jaxkane._scalarjit.function import ScalarFunction
 from jaxkane._scalarjit.jaxpr import cse
@@ -140,8 +140,8 @@ def test_the_process_stays_alive():
 
 def test_a_batch_without_jit_is_compiled_once(monkeypatch):
     f = ScalarFunction(lambda x, a: jnp.sin(a * x))
-    lowered, lower = [], fuse.Program.target
-    monkeypatch.setattr(fuse.Program, "target", lambda self, *batch: lowered.append(batch) or lower(self, *batch))
+    lowered, lower = [], function.Program.target
+    monkeypatch.setattr(function.Program, "target", lambda self, *batch: lowered.append(batch) or lower(self, *batch))
     x = jnp.linspace(0.0, 1.0, 5)
     for a in (1.0, 2.0, 3.0):
         np.testing.assert_allclose(jax.vmap(f, (0, None))(x, a), np.sin(a * x), rtol=1e-14)
@@ -222,7 +222,7 @@ SLOW = {
 
 @pytest.mark.parametrize("name", SLOW)
 def test_what_cannot_be_one_function_is_told_once_by_name(name, monkeypatch):
-    monkeypatch.setattr(fuse, "_told", set())
+    monkeypatch.setattr(function, "_told", set())
     f = ScalarFunction(SLOW[name])
     ball, x = Ball(jnp.array(1.5)), jnp.array(0.4)
     with pytest.warns(UserWarning, match=rf"Ball: its description uses .*`{name}`.* cannot be part of one") as told:
@@ -254,7 +254,7 @@ def test_lapack_of_the_method_itself_is_not_told():
 
 @pytest.mark.usefixtures("native")
 def test_what_kernels_cannot_do_is_told_once_by_name(monkeypatch):
-    monkeypatch.setattr(fuse, "_told", set())
+    monkeypatch.setattr(function, "_told", set())
     f = ScalarFunction(lambda ball, x: ball.a * jnp.asarray(x).astype(jnp.int32).astype(float))
     match = "Ball: its description uses convert_element_type of float64, which native"
     with pytest.warns(UserWarning, match=match) as told:

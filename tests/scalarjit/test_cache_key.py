@@ -668,6 +668,28 @@ def test_threads_agree():
     assert len(set(found)) == 1
 
 
+def test_a_cache_is_bounded_and_keeps_no_failure():
+    cache = Cache(2)
+    for i in (0, 1, 0, 2):
+        assert cache.get(i, lambda i=i: [i]) == [i]
+    assert (cache.known(0), cache.known(1, None)) == ([0], None)
+    with pytest.raises(ZeroDivisionError):
+        cache.get(3, lambda: 1 / 0)
+    assert len(cache) == 2
+    jk.forget()
+    assert len(cache) == 0
+
+
+def test_a_function_that_is_gone_and_its_programs_are_not_kept():
+    f = ScalarFunction(lambda x: jnp.sin(x) * 2.5)
+    f(jnp.array(1.0))
+    f.numpy(np.array(1.0))
+    gone = weakref.ref(f)
+    del f
+    gc.collect()
+    assert gone() is None
+
+
 def test_threads_share_a_cache_that_is_full():
     cache, failed = Cache(1000), []
 
