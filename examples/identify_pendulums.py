@@ -111,8 +111,8 @@ def check(arms, told, fit, rms):
     """As well explained as elsewhere, and what cannot be told is named. No test fits these swings once more."""
     seen = fit.identifiability
     assert np.median(rms) < MEDIAN[arms] + 0.5e-4
-    assert (len(seen.names), seen.count) == TOLD[arms]
-    assert told.count == seen.count
+    assert (len(seen.names), seen.rank) == TOLD[arms]
+    assert told.count == seen.rank
     assert all(direction.singular_value == 0.0 and len(direction.parts) > 1 for direction in seen.undetermined)
     # With one arm's mass nothing of friction moves: the others' centres and inertias make up for it.
     assert any("viscous" not in direction.text for direction in seen.undetermined)

@@ -14,7 +14,7 @@ from ._bijections import Interval
 from ._parameters import Parameters
 from ._problem import refuse_other
 from ._result import Fit
-from ._tables import Rows, html_tables, text_tables
+from ._tables import Tables, html_tables, text_tables
 from ._trial import Trial
 from ._validate import validate
 
@@ -41,7 +41,7 @@ class Plausible:
         return violations
 
 
-def plausible_of(parameters: Parameters, given: Mapping[str, Any]) -> Plausible:
+def plausible_of(parameters: Parameters, plausible: Mapping[str, Any]) -> Plausible:
     """For every parameter the given range, (lower, upper) or a share of its start; else three deviations of its prior;
     else its bounds, of which it must stay away. Where a search starts says nothing."""
     ranges, first = {}, 0
@@ -49,8 +49,8 @@ def plausible_of(parameters: Parameters, given: Mapping[str, Any]) -> Plausible:
         for i in range(first, first + size):
             name, start = parameters.names[i], float(parameters.start[i])
             mean, deviation = float(parameters.prior_mean[i]), float(parameters.prior_deviation[i])
-            if name in given:
-                ranges[name] = checked_range(name, given[name], start)
+            if name in plausible:
+                ranges[name] = checked_range(name, plausible[name], start)
             elif math.isfinite(deviation):
                 ranges[name] = mean - DEVIATIONS * deviation, mean + DEVIATIONS * deviation
             elif isinstance(bijection, Interval) and all(bijection.bounded) and bijection.uniform:
@@ -60,22 +60,22 @@ def plausible_of(parameters: Parameters, given: Mapping[str, Any]) -> Plausible:
     return Plausible(ranges)
 
 
-def checked_range(name: str, given: Any, start: float) -> Range:
+def checked_range(name: str, value: Any, start: float) -> Range:
     """(lower, upper) of a pair, or of a share of the start.
 
     **Raises:** `ValueError` where it is neither.
     """
-    if isinstance(given, (int, float)):
-        share = float(given)
+    if isinstance(value, (int, float)):
+        share = float(value)
         if not (share > 0 and start):
             raise ValueError(
-                f"`plausible` of {name}: a share is positive, and of a start that is not zero; got {given}."
+                f"`plausible` of {name}: a share is positive, and of a start that is not zero; got {value}."
             )
         return start - share * abs(start), start + share * abs(start)
-    if not isinstance(given, (tuple, list)) or len(given) != 2:
-        raise ValueError(f"`plausible` of {name} is (lower, upper), or a share of its start; got {given!r}.")
-    low = -math.inf if given[0] is None else float(given[0])
-    high = math.inf if given[1] is None else float(given[1])
+    if not isinstance(value, (tuple, list)) or len(value) != 2:
+        raise ValueError(f"`plausible` of {name} is (lower, upper), or a share of its start; got {value!r}.")
+    low = -math.inf if value[0] is None else float(value[0])
+    high = math.inf if value[1] is None else float(value[1])
     if not low < high:
         raise ValueError(f"`plausible` of {name}: nothing lies between {low} and {high}.")
     return low, high
@@ -94,7 +94,7 @@ class Comparison:
     bound_violations: Mapping[str, tuple[str, ...]]
 
     @property
-    def tables(self) -> list[tuple[str, Rows]]:
+    def tables(self) -> Tables:
         """A heading and rows, of which the first is the head, for each."""
         tables = [("Parameters, with the errors of their intervals", self._parameters()), ("All", self._sums())]
         violations = [[name, violation] for name, of_fit in self.bound_violations.items() for violation in of_fit]

@@ -43,7 +43,7 @@ from ._statistics import (
     use_clusters,
     wald_test,
 )
-from ._tables import Rows, html_tables, text_tables
+from ._tables import Rows, Tables, html_tables, text_tables
 from ._validate import folds_of
 
 HEAD = ("candidate", "estimate", "std. error", "predicted cost", "cost", "p", "criterion", "held-out cost", "decision")
@@ -118,7 +118,7 @@ class ForwardSelection:
         return self.rounds[0][0] if self.selected else None
 
     @property
-    def tables(self) -> list[tuple[str, Rows]]:
+    def tables(self) -> Tables:
         """A heading and rows, of which the first is the head, of every round."""
         tables: list[tuple[str, Rows]] = []
         for i, extensions in enumerate(self.rounds):

@@ -74,7 +74,7 @@ class Identifiability:
         return not self.undetermined
 
     @property
-    def count(self) -> int:
+    def rank(self) -> int:
         """How many numbers the data determine: parameters, or combinations of them."""
         return len(self.names) - len(self.undetermined)
 
@@ -87,7 +87,7 @@ class Identifiability:
         """In words, where combinations are determined and not the parameters themselves; else ""."""
         if all(len(direction.parts) == 1 for direction in self.undetermined):
             return ""
-        return f"Of {len(self.names)} parameters {self.count} combinations are determined."
+        return f"Of {len(self.names)} parameters {self.rank} combinations are determined."
 
     @property
     def information(self) -> np.ndarray:
@@ -97,10 +97,8 @@ class Identifiability:
     @property
     def given_sigma_errors(self) -> np.ndarray:
         """Standard errors (p,) with `sigma` as it was given, whatever is left; infinite where nothing determines."""
-        known = self.singular_values > 0
-        parts = np.where(known[:, None], self.vectors / np.where(known, self.singular_values, 1.0)[:, None], 0.0)
-        errors = self.scales * np.linalg.norm(parts, axis=0)
-        return np.sqrt(infinite_along(np.diag(errors**2), self.vectors[~known]).diagonal())
+        s = self.singular_values
+        return np.sqrt(self.in_units(np.diag(s[s > 0] ** -2.0)).diagonal())
 
     def in_units(self, covariance: np.ndarray) -> np.ndarray:
         """The covariance (p, p) of the parameters from one (k, k) along the rows of `vectors` that are determined."""
@@ -125,14 +123,14 @@ def identifiability(problem: Problem, *, flat: float = 0.5, at: Unknowns | None 
 
         identifiability(Problem.of(system, trials, free, unknown=("roll",)))
 
-    The residuals' sensitivity to the scaled parameters, with the nuisance values eliminated, is taken apart by singular
-    values. A direction whose standard deviation exceeds `flat` of the parameters' scale is called undetermined.
+    The residuals' sensitivity to the scaled parameters, with the nuisance values eliminated, is decomposed by
+    singular values. A direction whose standard deviation exceeds `flat` of the parameters' scale is undetermined.
 
     **Arguments:**
 
     - `problem`: a `Problem`.
     - `flat`: where undetermined begins. `at`: a point of the problem; by default its start. The nuisance values are
-        found for it.
+        estimated for it.
 
     **Returns:** an `Identifiability`; print it for a table.
 
@@ -140,14 +138,14 @@ def identifiability(problem: Problem, *, flat: float = 0.5, at: Unknowns | None 
     """
     refuse_other(problem, Problem, "identifiability", "identifiability(fit.problem), or fit.identifiability")
     point, linearization = solve_nuisance(problem, problem.start if at is None else at)
-    return identifiability_at(problem, point, linearization, flat, given=True)
+    return identifiability_at(problem, point, linearization, flat, sigma="given")
 
 
 def identifiability_at(
-    problem: Problem, point: Unknowns, at: Linearization, flat: float = 0.5, given: bool = False
+    problem: Problem, point: Unknowns, at: Linearization, flat: float = 0.5, sigma: str = "estimated"
 ) -> Identifiability:
-    """Identifiability at a point where the problem has been linearized. `given`: the residuals' variance is one, as
-    `sigma` says, whatever is left there."""
+    """Identifiability at a point where the problem has been linearized. With `sigma` "given" the variance of a residual
+    is one, with "estimated" it is that of the residuals there."""
     parameters = problem.parameters
     names, p = parameters.names, len(parameters.names)
     to_values = np.asarray(parameters.slopes(point.x))
@@ -164,11 +162,10 @@ def identifiability_at(
     inverse = (V[s > 0].T / s[s > 0] ** 2) @ V[s > 0]
     priors = prior_information(problem, point, eliminated)
     of_priors = to_x.T @ priors.information @ to_x
-    degrees_of_freedom = (
-        problem.size[0] - priors.number - problem.size[1] + priors.determined + np.sum(inverse * of_priors)
-    )
+    n_data, n_unknown = problem.size[0] - priors.number, problem.size[1]
+    degrees_of_freedom = n_data - n_unknown + priors.determined + np.sum(inverse * of_priors)
     variance = 1.0
-    if not given and problem.model.noise is None:  # a likelihood knows how large residuals are
+    if sigma == "estimated" and problem.model.noise is None:  # a likelihood knows how large residuals are
         variance = (at.cost - priors.squares) / degrees_of_freedom if degrees_of_freedom > 1e-3 else np.nan
     # Without a degree of freedom nothing says that `sigma` is wrong.
     along = V @ formal_covariance(inverse, of_priors, 1.0 if np.isnan(variance) else variance) @ V.T
@@ -177,7 +174,7 @@ def identifiability_at(
     alone = np.count_nonzero(to_values, axis=1) <= 1
     at_bound = alone & (scales < 1e-3 * np.asarray(parameters.scale))
     named = lambda which: tuple(name for name, there in zip(names, which, strict=True) if there)  # noqa: E731
-    found = Identifiability(
+    result = Identifiability(
         names=names,
         units=parameters.units,
         scales=scales,
@@ -193,27 +190,27 @@ def identifiability_at(
         covariance_of_x=to_x @ inverse @ to_x.T,
         directions=to_x @ V[s > 0].T,
     )
-    return dataclasses.replace(found, undetermined=_undetermined(found, np.array(parameters.learned) == "", flat))
+    return dataclasses.replace(result, undetermined=_undetermined(result, np.array(parameters.learned) == "", flat))
 
 
-def _undetermined(found: Identifiability, physical: np.ndarray, flat: float) -> tuple[Direction, ...]:
+def _undetermined(result: Identifiability, physical: np.ndarray, flat: float) -> tuple[Direction, ...]:
     """Directions whose deviation exceeds `flat`, weakest first. `physical` (p,): which parameters are no numbers of a
     learned function, which need not be determined one by one."""
-    V, names = found.vectors, found.names
+    V, names = result.vectors, result.names
     weak = [
         i
         for i in reversed(range(len(names)))
-        if not found.deviations[i] <= flat and np.any(np.abs(V[i, physical]) > 0.1)
+        if not result.deviations[i] <= flat and np.any(np.abs(V[i, physical]) > 0.1)
     ]
     rows = V.copy()
     nothing = [
         i
         for i in weak
-        if found.singular_values[i] == 0 and names[int(np.abs(V[i]).argmax())] not in found.without_influence
+        if result.singular_values[i] == 0 and names[int(np.abs(V[i]).argmax())] not in result.without_influence
     ]
     if len(nothing) > 1 and physical.all():
         rows[nothing] = _with_fewest_parts(V[nothing])
-    return tuple(_direction(found, i, rows[i]) for i in weak)
+    return tuple(_direction(result, i, rows[i]) for i in weak)
 
 
 def _with_fewest_parts(V: np.ndarray, most: int = 20_000) -> np.ndarray:
@@ -241,34 +238,34 @@ def _by_singular_values(A: np.ndarray, no_influence: np.ndarray, rounding: float
     Values below `rounding` are zero: elimination leaves rounding errors of what it removed. Each parameter without
     influence is a direction of its own.
     """
-    p, seen = A.shape[1], np.flatnonzero(~no_influence)
+    p, sensitive = A.shape[1], np.flatnonzero(~no_influence)
     s, V = np.zeros(p), np.zeros((p, p))
-    if seen.size:
+    if sensitive.size:
         # Columns that belong to free numbers without influence are left out of the elimination: nothing is lost.
-        _, s[: seen.size], V[: seen.size, seen] = np.linalg.svd(A[:, seen], full_matrices=False)
-    V[np.arange(seen.size, p), np.flatnonzero(no_influence)] = 1.0
+        _, s[: sensitive.size], V[: sensitive.size, sensitive] = np.linalg.svd(A[:, sensitive], full_matrices=False)
+    V[np.arange(sensitive.size, p), np.flatnonzero(no_influence)] = 1.0
     return np.where(s <= rounding, 0.0, s), V * np.sign(V[np.arange(p), np.abs(V).argmax(axis=1)])[:, None]
 
 
-def _direction(seen: Identifiability, i: int, row: np.ndarray) -> Direction:
-    s, deviation = seen.singular_values[i], seen.deviations[i]
+def _direction(of: Identifiability, i: int, row: np.ndarray) -> Direction:
+    s, deviation = of.singular_values[i], of.deviations[i]
     order = [j for j in np.argsort(-np.abs(row), kind="stable") if abs(row[j]) > 0.1]
-    parts = tuple((seen.names[j], float(row[j])) for j in order)
+    parts = tuple((of.names[j], float(row[j])) for j in order)
     first = parts[0][0]
-    if len(parts) == 1 and first in seen.at_bound:
+    if len(parts) == 1 and first in of.at_bound:
         text = f"{first} has gone to its bound: the data want it beyond. It may be making up for what the model lacks."
-    elif len(parts) == 1 and first in seen.without_influence:
+    elif len(parts) == 1 and first in of.without_influence:
         text = f"{first} has no influence on these data; it stays at its start."
     elif len(parts) == 1 and s == 0:
         text = f"{first} cannot be distinguished from the unknown starts and biases."
     elif len(parts) == 1:
-        unit = f" {seen.units[order[0]]}" * bool(seen.units[order[0]])
-        error = deviation * seen.scales[order[0]]
+        unit = f" {of.units[order[0]]}" * bool(of.units[order[0]])
+        error = deviation * of.scales[order[0]]
         text = f"{first} is undetermined: its standard deviation is {error:.2g}{unit}, {deviation:.2g} of its scale."
     else:
         size = min(deviation, 1.0)
         together = ", ".join(
-            f"{name} by {share * size * seen.scales[j]:+.2g}{' ' * bool(seen.units[j])}{seen.units[j]}"
+            f"{name} by {share * size * of.scales[j]:+.2g}{' ' * bool(of.units[j])}{of.units[j]}"
             for j, (name, share) in zip(order, parts, strict=True)
         )
         how = "changes nothing" if s == 0 else f"changes the fit by {size / deviation:.2g} standard deviations"

@@ -297,24 +297,24 @@ class Fit:
     @functools.cached_property
     def notes(self) -> tuple[str, ...]:
         """What a reader should know, in words."""
-        problem, parameters, seen = self.problem, self.parameters, self.identifiability
+        problem, parameters, identifiability = self.problem, self.parameters, self.identifiability
         innovation = self.mean_normalized_innovation_squared
         return (
             *diagnostics.not_converged(self.status),
             *(f"{name} is left out: {why}." for name, why in self.failed.items()),
-            *filter(None, [seen.rank_message]),
-            *seen.messages,
+            *filter(None, [identifiability.rank_message]),
+            *identifiability.messages,
             *diagnostics.correlated_parameters(parameters, self.correlation),
             *diagnostics.outlier_trials(self.residuals),
             *diagnostics.autocorrelated_residuals(self.autocorrelation),
             *(diagnostics.wrong_noise(self.residuals, innovation) if problem.model.noise is not None else ()),
-            *diagnostics.wrong_sigma(problem, self.variance, seen.degrees_of_freedom),
+            *diagnostics.wrong_sigma(problem, self.variance, identifiability.degrees_of_freedom),
             *diagnostics.no_degrees_of_freedom(problem, self.variance),
             *self._coarse_steps,
             *diagnostics.infeasible_bodies(problem, self.point),
             *diagnostics.bodies_at_the_boundary(parameters, self.point.x),
             *diagnostics.far_from_start(parameters, self.start, self.estimates, self.standard_errors),
-            *diagnostics.known_by_prior(parameters, seen.given_sigma_errors),
+            *diagnostics.known_by_prior(parameters, identifiability.given_sigma_errors),
             *diagnostics.constant_records(problem),
             *diagnostics.suspicious_records(problem),
             *diagnostics.duplicate_trials(problem),
@@ -334,7 +334,7 @@ class Fit:
             **described(self.problem),
         }
         at, step = self.linearization, self.problem.windows.step
-        numbers = {"R": at.blocks.R, "seen": at.prediction, "step_errors": self.step_errors}
+        numbers = {"R": at.blocks.R, "prediction": at.prediction, "step_errors": self.step_errors}
         write_state(path, key, {"point": self.point, "step": step, "history": np.array(self.history), **numbers})
         return path
 
@@ -437,11 +437,11 @@ def load(path: str | os.PathLike[str], problem: Problem) -> Fit:
         raise ValueError(f"{path} is the fit of another problem. It differs in {wrong}. Pose the problem as it was.")
     of_filter = jnp.zeros(()) if problem.model.noise is not None else None
     prediction = Prediction(jnp.zeros(()), jnp.zeros(()), of_filter, of_filter, of_filter)
-    like = {"point": problem.start, "R": 0.0, "step_errors": 0.0, "history": 0.0, "seen": prediction}
+    like = {"point": problem.start, "R": 0.0, "step_errors": 0.0, "history": 0.0, "prediction": prediction}
     state: dict[str, Any] = {name: tree_of(path, arrays, name, tree) for name, tree in like.items()}
     point, n_z, n_b = state["point"], state["point"].z.shape[1], state["point"].b.shape[1]
     blocks = Blocks(state["R"], problem.by_trial, n_z, n_z if problem.model.nuisance.has_defects else 0, n_b)
-    at = Linearization(blocks, state["seen"])
+    at = Linearization(blocks, state["prediction"])
     if saved["program"] != key["program"]:
         now = problem.cost(point)
         if not abs(now - at.cost) <= SAME_COST * at.squares:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -110,7 +111,8 @@ def multi_start(
     if not 0 <= real_number(spread, "`spread`") < math.inf:
         raise ValueError(f"`spread` is how far guesses lie from the first, in scales, not negative; got {spread}.")
     optimizer = LeastSquares() if optimizer is None else optimizer
-    unit = qmc.LatinHypercube(len(problem.parameters.names), seed=seed).random(max(n, candidates or n))
+    options: Any = {"seed": seed}  # SciPy 1.15 and later call it rng, too
+    unit = qmc.LatinHypercube(len(problem.parameters.names), **options).random(max(n, candidates or n))
     drawn = spread * (2 * unit - 1)
     points = [eqx.tree_at(lambda q: q.x, problem.start, jnp.asarray(x, problem.windows.t.dtype)) for x in drawn]
     if len(points) > n:

@@ -304,7 +304,7 @@ class Twice(Cart):
 def test_of_what_changes_nothing_the_simplest_is_told(trials):
     free = ("stiffness", "more_damping", "damping", "more_stiffness")
     seen = identifiability(Problem.of(Twice(), trials, free, **UNKNOWN))
-    assert seen.count == 2
+    assert seen.rank == 2
     assert seen.rank_message == "Of 4 parameters 2 combinations are determined."
     pairs = {frozenset(name for name, _ in direction.parts) for direction in seen.undetermined}
     assert pairs == {frozenset({"stiffness", "more_stiffness"}), frozenset({"damping", "more_damping"})}
