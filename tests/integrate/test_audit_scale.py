@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._integrate import audit as balance
+from jaxkane._integrate.audit import _quantities
 from jaxkane._kane import kane as rates
 from jaxkane._scalarjit import linear
 from jaxkane._scalarjit.function import Program
@@ -68,7 +68,7 @@ def test_the_audit_costs_what_the_accelerations_cost(held):
     counts = {}
     for n in (4, 6, 8):
         system = TiltedChain(n=n, held=held)
-        counts[n], is_fusable = operations(balance._measured, system, jnp.ones(n - held))
+        counts[n], is_fusable = operations(_quantities, system, jnp.ones(n - held))
         assert is_fusable
     assert counts[6] < operations(rates._motion_rates, TiltedChain(n=6, held=held))[0]
     # Linear but for the weights and the columns of the constraint, which pass all frames: less than quadratic

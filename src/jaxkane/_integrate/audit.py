@@ -1,4 +1,4 @@
-"""Energy, work, momenta and residuals along a motion. Knows the method and trajectories; judges nothing."""
+"""The audit of a motion: energy balance, momenta, residuals of the constraints, conditioning."""
 
 from __future__ import annotations
 
@@ -24,23 +24,21 @@ from .._system.motion import Motion, kinetic_energy_of
 from .._system.system import System
 from .trajectory import Trajectory, reached_times
 
-ORDERS = (8, 6)  # points under the polynomials whose integrals are the work, and its estimated error
-
 
 @jit
-def measured_along(system, t, q, u, inputs):
-    def measured(t, q, u, inputs):
+def _quantities_along(system, t, q, u, inputs):
+    def quantities(t, q, u, inputs):
         u_dot, M = accelerations_and_mass_matrix(system, t, q, u, inputs)
-        return {**_measured(system, t, q, u, inputs, u_dot), "M": M}
+        return {**_quantities(system, t, q, u, inputs, u_dot), "M": M}
 
-    return jax.vmap(measured)(t, q, u, inputs)
+    return jax.vmap(quantities)(t, q, u, inputs)
 
 
 @ScalarFunction
-def _measured(system, t, q, u, inputs, u_dot):
-    now = Reactions(system, t, q, u, inputs, u_dot)
-    motion, places = now.description, _Places()
-    loads = now.loads(motion)
+def _quantities(system, t, q, u, inputs, u_dot):
+    equations = Reactions(system, t, q, u, inputs, u_dot)
+    motion, places = equations.description, _Places()
+    loads = equations.loads(motion)
     centers = [body.center for body in motion.bodies if body.center.has_position]
     at_centers = [load if isinstance(load, Force) and load.point in centers else None for load in loads]
     p, H = _momenta(motion, places)
@@ -49,31 +47,31 @@ def _measured(system, t, q, u, inputs, u_dot):
         "power": as_vector([load.vector.dot(load.velocity) for load in loads], q),
         "force": [load and as_vector(_in_N(load.vector), q) for load in at_centers],
         "place": [load and as_vector(places.of(load.point), q) for load in at_centers],
-        "prescribed": as_vector([now.power_of_prescribed_motions()], q)[0],
+        "prescribed": as_vector([equations.power_of_prescribed_motions()], q)[0],
         "p": as_vector(p, q),
         "H": as_vector(H, q),
         "h": configuration_residual(system, t, q),
-        "c": as_vector(now.residuals(now.t, now.q, now.u_all), q),
-        "C": stack([(*a, *b) for a, b in zip(now.C_ind, now.C_dep, strict=True)]).astype(q.dtype),
+        "c": as_vector(equations.residuals(equations.t, equations.q, equations.u_all), q),
+        "C": stack([(*a, *b) for a, b in zip(equations.C_ind, equations.C_dep, strict=True)]).astype(q.dtype),
     }
 
 
 @jit
-def powers_along(system, t, q, u, values, input_rates):
+def _powers_along(system, t, q, u, values, input_rates):
     """Powers of the loads and of prescribed motions (n_t, l + 1), and their time derivatives along the motion, whose
     inputs have these rates by name."""
 
     def powers(t, q, u, values):
         u_dot, _ = accelerations_and_mass_matrix(system, t, q, u, values)
-        measured = _measured(system, t, q, u, values, u_dot)
-        return jnp.concatenate([measured["power"], measured["prescribed"][None]])
+        quantities = _quantities(system, t, q, u, values, u_dot)
+        return jnp.concatenate([quantities["power"], quantities["prescribed"][None]])
 
-    def both(t, q, u, values, input_rates):
+    def powers_and_rates(t, q, u, values, input_rates):
         dot = rates(system, t, q, u, values)
         of_states = dict(zip(system.states, () if dot.x is None else dot.x, strict=True))
         return jax.jvp(powers, (t, q, u, values), (jnp.ones_like(t), dot.q, dot.u, {**input_rates, **of_states}))
 
-    return jax.vmap(both)(t, q, u, values, input_rates)
+    return jax.vmap(powers_and_rates)(t, q, u, values, input_rates)
 
 
 def _in_N(vector: Vector) -> Triple:
@@ -111,34 +109,35 @@ def _momenta(motion: Motion, places: _Places) -> tuple[Triple, Triple]:
     return p, H
 
 
-def work_of(t: np.ndarray, now: dict[str, Any], pieces: Pieces | None) -> tuple[np.ndarray, float]:
+def _work(t: np.ndarray, quantities: dict[str, Any], pieces: Pieces) -> tuple[np.ndarray, float]:
     """Work (n_t,) of all loads and prescribed motions, and an estimate of its error."""
-    work, counted = np.zeros_like(t), np.ones(len(now["force"]) + 1)
-    for i, (F, r) in enumerate(zip(now["force"], now["place"], strict=True)):
+    work, integrated = np.zeros_like(t), np.ones(len(quantities["force"]) + 1)
+    for i, (F, r) in enumerate(zip(quantities["force"], quantities["place"], strict=True)):
         if F is not None and np.ptp(F, axis=0).max() <= 1e-14 * np.abs(F).max():
             work += (r - r[0]) @ F[0]
-            counted[i] = 0.0
-    if pieces is not None:
-        power, rate = (x @ counted for x in pieces.powers)
-        fine, coarse = (pieces.integral(t, power, rate, spared) for spared in (0, 1))
-    else:
-        power = np.column_stack([now["power"], now["prescribed"]]) @ counted
-        best, worse = ORDERS
-        fine, coarse = (_cumulative_integral(t, power, order) for order in (best, min(worse, len(t) - 1)))
-        # Two orders agree where both jump across the same place; half of the times then does not.
-        sparse = _cumulative_integral(t[::2], power[::2], best) - fine[::2]
-        return work + fine, float(max(np.abs(fine - coarse).max(), np.abs(sparse).max() / 16))
-    return work + fine, float(np.abs(fine - coarse).max())
+            integrated[i] = 0.0
+    if pieces.powers is not None:
+        power, rate = (x @ integrated for x in pieces.powers)
+        fine, coarse = (pieces.integral(t, power, 4, rate, spared) for spared in (0, 1))
+        return work + fine, float(np.abs(fine - coarse).max())
+    power = np.column_stack([quantities["power"], quantities["prescribed"]]) @ integrated
+    fine, coarse = (pieces.integral(t, power, points) for points in (8, min(6, len(t) - 1)))
+    # Two orders agree where both jump across the same place; half of the times then does not.
+    sparse = Pieces(t[::2]).integral(t[::2], power[::2], 8) - fine[::2]
+    return work + fine, float(max(np.abs(fine - coarse).max(), np.abs(sparse).max() / 16))
+
+
+_NONE = np.zeros(0)
 
 
 class Pieces:
     """The pieces of a motion between kinks and jumps of its inputs. A time (n_t,) at which one stands belongs to two
     pieces, with the inputs on its two sides: arrays of the pieces are (n,), in their order.
 
-    `powers`: those of `powers_along` at the times of the pieces.
+    `powers`: those of `_powers_along` at the times of the pieces, where there are kinks.
     """
 
-    def __init__(self, t: np.ndarray, kinks: np.ndarray, near: float):
+    def __init__(self, t: np.ndarray, kinks: np.ndarray = _NONE, near: float = 0.0):
         """`near`: how far from a kink a time may be by rounding errors [s]."""
         self.inner = kinks = np.unique(kinks[(kinks > t[0] + near) & (kinks < t[-1] - near)])
         before, after = np.searchsorted(kinks, t - near), np.searchsorted(kinks, t + near)
@@ -164,18 +163,23 @@ class Pieces:
                 rate[some] = np.sum(weights * x[nearest], axis=1) / scale
         return rate
 
-    def integral(self, t: np.ndarray, x: np.ndarray, rate: np.ndarray, spared: int) -> np.ndarray:
-        """The integral (n_t,) from t[0] of values and rates (n,), by polynomials that meet both at four times of their
-        piece, where it has so many; at the farthest `spared` of them the values alone."""
+    def integral(
+        self, t: np.ndarray, x: np.ndarray, points: int, rate: np.ndarray | None = None, spared: int = 0
+    ) -> np.ndarray:
+        """The integral (n_t,) from t[0] of values (n,), by polynomials through so many nearest points of their piece;
+        they meet the rates (n,) too, where these are given, but at the farthest `spared` points."""
         ends = np.unique(np.concatenate([t, self.inner]))
         middle, half = 0.5 * (ends[1:] + ends[:-1]), 0.5 * np.diff(ends)
         # In a piece without any of the times nothing is known, but what stands beside it: it may be off by all of that.
         gained = 2 * half * (np.interp(middle, self.t, x) + spared * np.ptp(x))
-        for some, nearest in self._nearest(middle, np.searchsorted(self.inner, middle), 4):
+        for some, nearest in self._nearest(middle, np.searchsorted(self.inner, middle), points):
             apart, m = self.t[nearest] - middle[some, None], nearest.shape[1]
+            n_rates = 0 if rate is None else m - spared
             scale = np.maximum(np.abs(apart).max(axis=1), half[some])
-            weights = _weights(apart / scale[:, None], _moments(2 * m - spared, half[some] / scale), m - spared)
-            values = np.concatenate([x[nearest], scale[:, None] * rate[nearest[:, : m - spared]]], axis=1)
+            weights = _weights(apart / scale[:, None], _moments(m + n_rates, half[some] / scale), n_rates)
+            values = x[nearest]
+            if rate is not None:
+                values = np.concatenate([values, scale[:, None] * rate[nearest[:, :n_rates]]], axis=1)
             gained[some] = scale * np.sum(weights * values, axis=1)
         return np.append(0.0, np.cumsum(gained))[np.searchsorted(ends, t)]
 
@@ -201,26 +205,13 @@ def _weights(s: np.ndarray, moments: np.ndarray, rates: int = 0) -> np.ndarray:
     return np.linalg.solve(np.concatenate(powers, axis=2), moments[..., None])[..., 0]
 
 
-def _moments(n: int, x: Any) -> np.ndarray:
-    """The integrals (..., n) of the powers of s from -x to x."""
+def _moments(n: int, x: np.ndarray) -> np.ndarray:
+    """The integrals (k, n) of the powers of s from -x to x (k,)."""
     j = np.arange(n)
-    return np.where(j % 2 == 0, 2 * np.asarray(x)[..., None] ** (j + 1) / (j + 1), 0.0)
+    return np.where(j % 2 == 0, 2 * x[:, None] ** (j + 1) / (j + 1), 0.0)
 
 
-def _cumulative_integral(t: np.ndarray, x: np.ndarray, points: int) -> np.ndarray:
-    """The integral (n,) of samples x (n,) from t[0], by a polynomial through the nearest `points` of each interval."""
-    n = len(t)
-    if n == 1:
-        return np.zeros(1)
-    m = min(points, n)
-    first = np.clip(np.arange(n - 1) - (m - 2) // 2, 0, n - m)
-    places = first[:, None] + np.arange(m)  # (n-1, m)
-    middle, half = 0.5 * (t[1:] + t[:-1]), 0.5 * np.diff(t)
-    weights = _weights((t[places] - middle[:, None]) / half[:, None], _moments(m, 1.0))
-    return np.concatenate([[0.0], np.cumsum(half * np.sum(weights * x[places], axis=1))])
-
-
-def condition_of_masses(M: np.ndarray) -> np.ndarray:
+def _condition_of_masses(M: np.ndarray) -> np.ndarray:
     """Condition numbers (n_t,) of mass matrices (n_t, n, n), each speed in units in which it moves a mass of one: that
     metres stand beside radians, as of a satellite, makes nothing badly conditioned."""
     diagonal = np.sqrt(np.diagonal(M, axis1=-2, axis2=-1))
@@ -232,7 +223,8 @@ LOOK, BAD = "look", "bad"
 
 
 class Audit(eqx.Module):
-    """What was kept along a motion, at the n_t times that it reached. `print(audit)` says it, `audit.plot()` draws it.
+    """What was kept along a motion, at the n_t times that it reached. `print(audit)` shows a table,
+    `jk.plot.audit(audit)` draws it.
 
     Attributes, NumPy arrays:
 
@@ -315,37 +307,6 @@ class Audit(eqx.Module):
 
     __repr__ = __str__
 
-    def plot(self, axes: Any = None) -> Any:
-        """Energies, energy error, residuals and conditioning, each in one of four matplotlib `axes`, which return."""
-        if axes is None:
-            import matplotlib.pyplot as plt
-
-            _, axes = plt.subplots(2, 2, sharex=True, figsize=(9.5, 5.5), layout="constrained")
-        energies, errors, residuals, conditions = np.ravel(axes)
-        energies.plot(self.t, self.kinetic_energy, label="kinetic energy")
-        energies.plot(self.t, self.work, label="work of the loads")
-        energies.set(ylabel="[J]")
-        errors.plot(self.t, self.energy_error, color="C3", label="kinetic energy gained, less work")
-        errors.set(ylabel="[J]")
-        for values, label in (
-            (self.configuration_residuals, "configuration constraints"),
-            (self.velocity_residuals, "velocity constraints"),
-        ):
-            if values.size:
-                residuals.semilogy(self.t, np.maximum(np.abs(values).max(1), 1e-17), label=label)
-        if not residuals.lines:
-            residuals.text(0.5, 0.5, "no constraints", ha="center", transform=residuals.transAxes, color="0.5")
-        conditions.semilogy(self.t, self.condition_M, label="condition of M")
-        if self.velocity_residuals.size:
-            conditions.semilogy(self.t, self.condition_C_dep, label="condition of C_dep")
-        for panel in (energies, errors, residuals, conditions):
-            panel.grid(alpha=0.25)
-            if panel.lines:
-                panel.legend(frameon=False, fontsize="small")
-        for panel in (residuals, conditions):
-            panel.set(xlabel="time [s]")
-        return axes
-
 
 def audit(system: System, trajectory: Trajectory) -> Audit:
     """Whether a motion kept what it should: energy, momentum, constraints; and how well its equations were conditioned.
@@ -359,47 +320,45 @@ def audit(system: System, trajectory: Trajectory) -> Audit:
     **Raises:** `ValueError` for a batch, for the motion of another system, and for one that reached fewer than two
     of its times.
     """
-    name = type(system).__name__
     reached = reached_times("audit", system, trajectory)
     t, q, u = (x[reached] for x in (trajectory.t, trajectory.q, trajectory.u))
     inputs = {key: x[reached] for key, x in trajectory.values.items()}
-    now = jax.tree.map(lambda x: np.asarray(x, dtype=float), measured_along(system, t, q, u, inputs))
-    ts = np.asarray(t, dtype=float)
-    work, work_error = work_of(ts, now, _pieces(system, trajectory, reached))
+    quantities = _quantities_along(system, t, q, u, inputs)
+    quantities = jax.tree.map(lambda x: np.asarray(x, dtype=float), quantities)
+    ts, C, independent = np.asarray(t, dtype=float), quantities["C"], len(system.speeds)
+    work, work_error = _work(ts, quantities, _pieces(system, trajectory, reached))
     return Audit(
         t=ts,
-        kinetic_energy=now["T"],
+        kinetic_energy=quantities["T"],
         work=work,
         work_error=work_error,
-        linear_momentum=now["p"],
-        angular_momentum=now["H"],
-        configuration_residuals=now["h"],
-        velocity_residuals=now["c"],
-        condition_M=condition_of_masses(now["M"]),
-        condition_C_dep=relative_condition(now["C"], range(len(system.speeds), now["C"].shape[-1]))
-        if now["c"].size
-        else np.ones_like(ts),
-        name=name,
+        linear_momentum=quantities["p"],
+        angular_momentum=quantities["H"],
+        configuration_residuals=quantities["h"],
+        velocity_residuals=quantities["c"],
+        condition_M=_condition_of_masses(quantities["M"]),
+        condition_C_dep=relative_condition(C, range(independent, C.shape[-1])) if C.size else np.ones_like(ts),
+        name=type(system).__name__,
         reason=trajectory.reason,
     )
 
 
-def _pieces(system: System, trajectory: Trajectory, reached: np.ndarray) -> Pieces | None:
-    """The motion between kinks and jumps of its inputs, where it has any."""
+def _pieces(system: System, trajectory: Trajectory, reached: np.ndarray) -> Pieces:
+    """The motion between kinks and jumps of its inputs."""
     kinks = trajectory.discontinuities
-    if kinks is None:
-        return None
     t, q, u = (np.asarray(x)[reached] for x in (trajectory.t, trajectory.q, trajectory.u))
+    if kinks is None:
+        return Pieces(np.asarray(t, float))
     near = 64 * np.finfo(t.dtype).eps * np.abs(t).max()
     pieces = Pieces(np.asarray(t, float), np.asarray(kinks.times, float), near)
     if not pieces.inner.size:
-        return None
+        return pieces
     values = {name: np.asarray(x)[reached][pieces.places] for name, x in trajectory.values.items()}
     if kinks.inputs:
         before, after = ({name: np.asarray(x)[reached] for name, x in inputs.items()} for inputs in kinks.inputs)
         values |= {name: pieces.of(before[name], after[name]) for name in before}
     input_rates = {name: pieces.rate(values[name]) for name in trajectory.inputs}
-    powers = powers_along(system, *(x[pieces.places] for x in (t, q, u)), values, input_rates)
+    powers = _powers_along(system, *(x[pieces.places] for x in (t, q, u)), values, input_rates)
     pieces.powers = tuple(np.asarray(x, float) for x in powers)
     return pieces
 

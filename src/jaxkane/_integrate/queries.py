@@ -1,7 +1,4 @@
-"""Where the parts of a mechanism are, how they move and what holds them, at one time or along a trajectory.
-
-Reads a description; knows no mechanism and solves nothing but Kane's equations for the accelerations.
-"""
+"""Positions, velocities, orientations, forces of constraint and outputs, at one time or along a trajectory."""
 
 from __future__ import annotations
 
@@ -20,7 +17,7 @@ from .._scalarjit.cache_key import jit
 from .._scalarjit.function import ScalarFunction
 from .._scalarjit.linear import as_vector
 from .._scalarjit.nan import nan_where
-from .._system.kinematics import Frame, Point
+from .._system.kinematics import Point
 from .._system.system import System
 from .trajectory import Trajectory, refuse_other_system
 
@@ -41,17 +38,17 @@ def along(f: Callable[..., Any], system: System, t: Any, q: Any, u: Any, inputs:
         raise TypeError("A Trajectory holds coordinates, speeds and inputs already: give the system and it alone.")
     refuse_other_system(type(system).__name__, system, t)
 
-    def at(system: System, now: Any, start: Any) -> Any:
-        reached = jnp.all(jnp.isfinite(jnp.concatenate([now[1], now[2]])))
-        safe = jax.tree.map(lambda x, x0: jnp.where(reached, x, jnp.where(jnp.isfinite(x0), x0, 1.0)), now, start)
-        return nan_where(~reached, f(system, *safe), (system, now))
+    def at(system: System, sample: Any, first: Any) -> Any:
+        reached = jnp.all(jnp.isfinite(jnp.concatenate([sample[1], sample[2]])))
+        first = jax.tree.map(lambda x: jnp.where(jnp.isfinite(x), x, 1.0), first)
+        valid = jax.tree.map(lambda x, x0: jnp.where(reached, x, x0), sample, first)
+        return nan_where(~reached, f(system, *valid), (system, sample))
 
     over_times = jax.vmap(at, in_axes=(None, 0, None))
     for _ in range(t.t.ndim - 1):
         over_times = jax.vmap(over_times, in_axes=(None, 0, 0))
-    n_axes = t.t.ndim
-    motion = (t.t, t.q, t.u, t.values)
-    return over_times(system, motion, jax.tree.map(lambda x: x[(slice(None),) * (n_axes - 1) + (0,)], motion))
+    samples = (t.t, t.q, t.u, t.values)
+    return over_times(system, samples, jax.tree.map(lambda x: jnp.moveaxis(x, t.t.ndim - 1, 0)[0], samples))
 
 
 def positions(
@@ -67,14 +64,14 @@ def positions(
     **Returns:** by name (3,), or (*batch, n_t, 3) along a trajectory, NaN after its end; differentiable in the system
     and in the trajectory.
     """
-    return along(_compiled_positions, system, t, q, u, inputs)
+    return along(_positions, system, t, q, u, inputs)
 
 
 def velocities(
     system: System, t: Any, q: Any = None, u: Any = None, inputs: InputValues = None
 ) -> dict[str, Float[Array, "*n_t 3"]]:
     """How fast the bodies' mass centres and the named points move [m/s], components in N. As `positions`."""
-    return along(_compiled_velocities, system, t, q, u, inputs)
+    return along(_velocities, system, t, q, u, inputs)
 
 
 def orientations(
@@ -85,7 +82,7 @@ def orientations(
     Their rows are the frame's unit vectors in N. The names are those of the bodies and of `Motion(frames=...)`; all
     else as `positions`.
     """
-    return along(_compiled_orientations, system, t, q, u, inputs)
+    return along(_orientations, system, t, q, u, inputs)
 
 
 def speed_rates(
@@ -95,7 +92,7 @@ def speed_rates(
 
     Those of `accelerations` and `dependent_accelerations`. Arguments as `positions`, and `inputs` as `accelerations`.
     """
-    return along(_compiled_speed_rates, system, t, q, u, inputs)
+    return along(_speed_rates, system, t, q, u, inputs)
 
 
 def outputs(
@@ -106,7 +103,7 @@ def outputs(
     A trajectory holds them already: `ride["imu.ay"]`. Arguments as `positions`; `inputs` as `accelerations`, in which
     states of the first order are given too.
     """
-    return along(_compiled_outputs, system, t, q, u, inputs)
+    return along(_outputs, system, t, q, u, inputs)
 
 
 def state_rates(
@@ -116,7 +113,7 @@ def state_rates(
 
     Arguments as `outputs`.
     """
-    return along(_compiled_state_rates, system, t, q, u, inputs)
+    return along(_state_rates, system, t, q, u, inputs)
 
 
 def constraint_forces(
@@ -163,52 +160,47 @@ def constraint_multipliers(
     return along(multipliers_now, system, t, q, u, inputs)
 
 
-def _points(now: KaneEquations) -> dict[str, Point]:
-    motion = now.motion(now.t, now.q, now.u_all)
-    return {body.name: body.center for body in motion.bodies} | motion.points
-
-
-def _frames(now: KaneEquations) -> dict[str, Frame]:
-    motion = now.motion(now.t, now.q, now.u_all)
-    return {body.name: body.frame for body in motion.bodies} | motion.frames
-
-
-@ScalarFunction
-def _positions(system, t, q, u, inputs):
-    points = _points(KaneEquations(system, t, q, u, inputs))
-    found = {name: point.position for name, point in points.items() if point.has_position}
-    return {name: as_vector(r.components_in(r.frame.root), q) for name, r in found.items()}
-
-
-@ScalarFunction
-def _velocities(system, t, q, u, inputs):
-    found = {name: point.velocity for name, point in _points(KaneEquations(system, t, q, u, inputs)).items()}
-    return {name: as_vector(v.components_in(v.frame.root), q) for name, v in found.items()}
-
-
-@ScalarFunction
-def _orientations(system, t, q, u, inputs):
-    frames = _frames(KaneEquations(system, t, q, u, inputs))
-    return {name: frame.matrix(frame.root).astype(q.dtype) for name, frame in frames.items()}
-
-
-_compiled_positions = jit(_positions)
-_compiled_velocities = jit(_velocities)
-_compiled_orientations = jit(_orientations)
-
-
-_compiled_outputs = jit(outputs_at)
+_outputs = jit(outputs_at)
 
 
 @jit
-def _compiled_state_rates(system, t, q, u, inputs):
-    at_zero = dict.fromkeys(system.states, jnp.zeros((), q.dtype))  # those that are left out
-    x_dot = rates(system, t, q, u, at_zero | inputs).x
+@ScalarFunction
+def _positions(system, t, q, u, inputs):
+    points = _points(KaneEquations(system, t, q, u, inputs))
+    positions = {name: point.position for name, point in points.items() if point.has_position}
+    return {name: as_vector(r.components_in(r.frame.root), q) for name, r in positions.items()}
+
+
+@jit
+@ScalarFunction
+def _velocities(system, t, q, u, inputs):
+    velocities = {name: point.velocity for name, point in _points(KaneEquations(system, t, q, u, inputs)).items()}
+    return {name: as_vector(v.components_in(v.frame.root), q) for name, v in velocities.items()}
+
+
+def _points(equations: KaneEquations) -> dict[str, Point]:
+    motion = equations.motion(equations.t, equations.q, equations.u_all)
+    return {body.name: body.center for body in motion.bodies} | motion.points
+
+
+@jit
+@ScalarFunction
+def _orientations(system, t, q, u, inputs):
+    equations = KaneEquations(system, t, q, u, inputs)
+    motion = equations.motion(equations.t, equations.q, equations.u_all)
+    frames = {body.name: body.frame for body in motion.bodies} | motion.frames
+    return {name: frame.matrix(frame.root).astype(q.dtype) for name, frame in frames.items()}
+
+
+@jit
+def _state_rates(system, t, q, u, inputs):
+    zeros = dict.fromkeys(system.states, jnp.zeros((), q.dtype))  # for states that are left out
+    x_dot = rates(system, t, q, u, zeros | inputs).x
     return {} if x_dot is None else dict(zip(system.states, x_dot, strict=True))
 
 
 @jit
-def _compiled_speed_rates(system, t, q, u, inputs):
+def _speed_rates(system, t, q, u, inputs):
     u_dot = motion_rates(system, t, q, u, inputs)[1]
     u_dep_dot = _dependent_accelerations(system, t, q, u, inputs, u_dot)
     return dict(zip((*system.speeds, *system.dependent_speeds), (*u_dot, *u_dep_dot), strict=True))

@@ -149,7 +149,29 @@ def audit(audit: Audit, *, axes: Any = None) -> np.ndarray:
     if not isinstance(audit, Audit):
         raise TypeError(f"plot.audit draws an Audit, jk.audit(system, ride); got a {type(audit).__name__}.")
     panel_axes = panels(axes, 2, 2, size=(4.75, 2.75), sharex=True)
-    audit.plot(panel_axes)
+    energies, errors, residuals, conditions = np.ravel(panel_axes)
+    energies.plot(audit.t, audit.kinetic_energy, label="kinetic energy")
+    energies.plot(audit.t, audit.work, label="work of the loads")
+    energies.set(ylabel="[J]")
+    errors.plot(audit.t, audit.energy_error, color="C3", label="kinetic energy gained, less work")
+    errors.set(ylabel="[J]")
+    for values, label in (
+        (audit.configuration_residuals, "configuration constraints"),
+        (audit.velocity_residuals, "velocity constraints"),
+    ):
+        if values.size:
+            residuals.semilogy(audit.t, np.maximum(np.abs(values).max(1), 1e-17), label=label)
+    if not residuals.lines:
+        residuals.text(0.5, 0.5, "no constraints", ha="center", transform=residuals.transAxes, color="0.5")
+    conditions.semilogy(audit.t, audit.condition_M, label="condition of M")
+    if audit.velocity_residuals.size:
+        conditions.semilogy(audit.t, audit.condition_C_dep, label="condition of C_dep")
+    for panel in (energies, errors, residuals, conditions):
+        panel.grid(alpha=0.25)
+        if panel.lines:
+            panel.legend(frameon=False, fontsize="small")
+    for panel in (residuals, conditions):
+        panel.set(xlabel="time [s]")
     return panel_axes
 
 

@@ -126,9 +126,6 @@ def _refuse(name: str, values: Any) -> Any:
     raise ValueError(f"{name!r} must hold a row of numbers (or of labels), got {type(values).__name__} {values!r:.60}.")
 
 
-Tree = Any
-
-
 class Row(Mapping[str, Any]):
     """One member's numbers by name, for the functions that a user gives; it records which names were read."""
 
@@ -173,7 +170,7 @@ class _Leaf:
         self.x = x
 
 
-def members_of(system: Any, state: Any, inputs: Inputs, table: Table | None, ts: Any) -> tuple[Tree, Tree, int]:
+def members_of(system: Any, state: Any, inputs: Inputs, table: Table | None, ts: Any) -> tuple[Any, Any, int]:
     """What differs from member to member (b, ...), what is shared, and how many members there are.
 
     **Raises:** `ValueError` when nothing is a batch, when batches differ in length, or for a column that nothing reads.
@@ -207,7 +204,7 @@ def members_of(system: Any, state: Any, inputs: Inputs, table: Table | None, ts:
     return members, shared, next(iter(lengths.values()))
 
 
-def system_and_signals(own: Tree, shared: Tree) -> tuple[System, Any]:
+def system_and_signals(own: Any, shared: Any) -> tuple[System, Any]:
     """System and signals of one member."""
     system, _, signals, columns = eqx.combine(own, shared)
     system, _ = _system(system, Row(columns))
@@ -216,7 +213,7 @@ def system_and_signals(own: Tree, shared: Tree) -> tuple[System, Any]:
     return system, signals
 
 
-def start_of(own: Tree, shared: Tree, t: Any) -> State:
+def start_of(own: Any, shared: Any, t: Any) -> State:
     """The first state of one member, at the time t."""
     system, state, _, columns = eqx.combine(own, shared)
     return _start(system, state, Row(columns), t)
@@ -227,8 +224,8 @@ def _system(system: Any, row: Row) -> tuple[System, dict[str, Any]]:
     read: set[str] = set()
     if not isinstance(system, System):
         system, read = row.given_to(system)
-    given = row.of((name for name, _, _ in parameters_in(system)), but=read)
-    return with_parameters(system, given), given
+    parameters = row.of((name for name, _, _ in parameters_in(system)), but=read)
+    return with_parameters(system, parameters), parameters
 
 
 def _start(system: Any, state: Any, row: Row, t: Any) -> State:
@@ -240,19 +237,19 @@ def _start(system: Any, state: Any, row: Row, t: Any) -> State:
     groups = (system.coordinates, system.speeds, system.states)
     q, u, x = (row.of(names, but=read) for names in groups)
     parts = zip((state.q, state.u, state.x), (q, u, x), groups, strict=True)
-    state = State(*(_set(values, given, names) for values, given, names in parts))
+    state = State(*(_with_columns(values, columns, names) for values, columns, names in parts))
     if system.dependent_coordinates and (q or parameters):  # they follow from the others
         state = assemble(system, state.q, state.u, state.x, t=t)
     return state
 
 
-def _set(values: Any, given: dict[str, Any], names: tuple[str, ...]) -> Any:
-    for name, value in given.items():
+def _with_columns(values: Any, columns: dict[str, Any], names: tuple[str, ...]) -> Any:
+    for name, value in columns.items():
         values = values.at[names.index(name)].set(value)
     return values
 
 
-def _check(members: Tree, shared: Tree, t: Any, table: Table | None) -> None:
+def _check(members: Any, shared: Any, t: Any, table: Table | None) -> None:
     """Make one member in the abstract, and refuse what does not fit."""
 
     def trial(own):
@@ -304,7 +301,7 @@ def _check(members: Tree, shared: Tree, t: Any, table: Table | None) -> None:
         )
 
 
-def _check_description(members: Tree, shared: Tree, t: Any) -> None:
+def _check_description(members: Any, shared: Any, t: Any) -> None:
     """Refuse a description that contradicts itself, by the first member; a bad body is its member's own."""
     if any(x.shape[0] == 0 for x in jax.tree.leaves(members)):
         return
@@ -351,25 +348,21 @@ def _refuse_twice(columns: dict[str, Any], system: Any, inputs: Inputs) -> None:
         raise ValueError(f"sweep: given twice: {listed}. Leave one of them out.")
 
 
-def _batches(places: Tree) -> dict[_Leaf, str]:
+def _batches(places: Any) -> dict[_Leaf, str]:
     """The leaves that have a leading axis of members, with their names."""
     system, state, signals, columns = places
-    found = {column: name for name, column in columns.items()}
+    batches = {column: name for name, column in columns.items()}
     if isinstance(system, System):
         for name, leaf, info in parameters_in(system):
             if isinstance(leaf, _Leaf) and np.ndim(leaf.x) == len(info.shape) + 1:
-                found[leaf] = name
+                batches[leaf] = name
     if isinstance(state, State):
-        for name, leaf in (("q", state.q), ("u", state.u), ("x", state.x)):
+        for name, leaf in vars(state).items():
             if isinstance(leaf, _Leaf) and np.ndim(leaf.x) == 2:
-                found[leaf] = f"state.{name}"
+                batches[leaf] = f"state.{name}"
     if isinstance(signals, dict):
         for name, signal in signals.items():
-            leaf = signal.values if isinstance(signal, Samples) else signal
-            if (
-                isinstance(leaf, _Leaf)
-                and isinstance(leaf.x, jax.Array)
-                and leaf.x.ndim == (2 if isinstance(signal, Samples) else 1)
-            ):
-                found[leaf] = name
-    return found
+            leaf, axes = (signal.values, 2) if isinstance(signal, Samples) else (signal, 1)
+            if isinstance(leaf, _Leaf) and isinstance(leaf.x, jax.Array) and leaf.x.ndim == axes:
+                batches[leaf] = name
+    return batches
