@@ -184,25 +184,25 @@ def inertia_of(system: System, body: str, **more: Any) -> Inertia:
     **Raises:** `KeyError` for a name that is no body's; `ValueError` for moments of inertia that are no parameters of
     their own, as those of a rod by its mass and length, or of a body in a plane, which has one: free these by name.
     """
-    names = _bodies(system)
-    if body not in names:
-        raise not_there(body, names, f"{type(system).__name__}, among its bodies with a mass and a frame")
+    bodies = _bodies(system)
+    if body not in bodies:
+        raise not_there(body, bodies, f"{type(system).__name__}, among its bodies with a mass and a frame")
     with_path, _ = jax.tree_util.tree_flatten_with_path(system)
-    values, slopes = _values_and_slopes(system, names.index(body))
+    values, slopes = _values_and_slopes(system, bodies.index(body))
     owners = [_owner(values[i], slopes, i, with_path) for i in range(10)]
-    found = [None if owner is None or owner[1] else owner[0] for owner in owners]
-    kept: dict[str, Any] = {"mass": found[0], "center": tuple(found[1:4])}
+    parameters = [None if owner is None or owner[1] else owner[0] for owner in owners]
+    kept: dict[str, Any] = {"mass": parameters[0], "center": tuple(parameters[1:4])}
     matrices = {owner[0] if owner and owner[1] == (3, 3) else "" for owner in owners[4:]}
     if len(matrices) == 1 and "" not in matrices:
         return Inertia(matrix=matrices.pop(), **kept, **more)
-    missing = [name for name, owner in zip(_NAMES[4:7], found[4:7], strict=True) if owner is None]
-    lost = [name for i, name in enumerate(_NAMES) if i > 6 and found[i] is None and values[i] != 0.0]
+    missing = [name for name, owner in zip(_NAMES[4:7], parameters[4:7], strict=True) if owner is None]
+    lost = [name for i, name in enumerate(_NAMES) if i > 6 and parameters[i] is None and values[i] != 0.0]
     if missing or lost:
         raise ValueError(
             f"{type(system).__name__}: {', '.join(missing + lost)} of {body!r} are no parameters of their own, each of "
             "one component, so that they cannot move as those of a body. Free what they follow from by name."
         )
-    return Inertia(moments=tuple(found[4:7]), products=tuple(found[7:]), **kept, **more)  # type: ignore[arg-type]
+    return Inertia(moments=tuple(parameters[4:7]), products=tuple(parameters[7:]), **kept, **more)  # type: ignore[arg-type]
 
 
 def _numbers(system: System) -> list[tuple[str, Any]]:
@@ -211,7 +211,7 @@ def _numbers(system: System) -> list[tuple[str, Any]]:
     n_u = len(system.speeds) + len(system.dependent_speeds)
     q = tuple(zero + 0.3 for _ in system.coordinates)
     motion = DescriptionEvaluator(system).motion(zero + 0.2, q, (zero,) * n_u)
-    found = []
+    rows = []
     for body in motion.bodies:
         if body.is_particle:
             continue
@@ -219,8 +219,8 @@ def _numbers(system: System) -> list[tuple[str, Any]]:
         r = (0.0, 0.0, 0.0) if step is None else step.components_in(body.frame)
         I = body.inertia
         row = [body.mass, *r, I[0][0], I[1][1], I[2][2], I[0][1], I[0][2], I[1][2]]
-        found.append((body.name, jnp.stack([jnp.asarray(x, zero.dtype) for x in row])))
-    return found
+        rows.append((body.name, jnp.stack([jnp.asarray(x, zero.dtype) for x in row])))
+    return rows
 
 
 def _bodies(system: System) -> list[str]:

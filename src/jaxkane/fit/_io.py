@@ -82,8 +82,8 @@ class Checkpoint:
         """
         if self.path is None or not self.path.exists():
             return None
-        there, arrays = read_state(self.path)
-        wrong = differences(there, self.key)
+        saved_key, arrays = read_state(self.path)
+        wrong = differences(saved_key, self.key)
         if wrong:
             raise ValueError(
                 f"{self.path} is the state of another fit. It differs in {wrong}. Name another file, or delete this "

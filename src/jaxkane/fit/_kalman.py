@@ -48,12 +48,12 @@ class Update(NamedTuple):
 
 
 def update(
-    error: Float[Array, " n_c"], F: Float[Array, "n_c n"], sigma: Float[Array, " n_c"], seen: Bool[Array, " n_c"]
+    error: Float[Array, " n_c"], F: Float[Array, "n_c n"], sigma: Float[Array, " n_c"], measured: Bool[Array, " n_c"]
 ) -> Update:
     """Measurements with independent errors, one after the other.
 
     `error`: measured less predicted at m; `F`: its sensitivity to x; `sigma`: the measurements' standard deviations;
-    `seen`: which there are.
+    `measured`: which there are.
 
         s^2 = f f^T + sigma^2,   S+ = S (1 - f f^T / (s (s + sigma)))
 
@@ -63,11 +63,11 @@ def update(
     shift, left = jnp.zeros(n, F.dtype), jnp.eye(n, dtype=F.dtype)
     innovations, deviations, known = [], [], []
     for c in range(F.shape[0]):
-        there = seen[c]
-        f = jnp.where(there, left.T @ F[c], 0.0)
-        r = jnp.where(there, sigma[c], 1.0)
+        is_measured = measured[c]
+        f = jnp.where(is_measured, left.T @ F[c], 0.0)
+        r = jnp.where(is_measured, sigma[c], 1.0)
         known.append(F[c] @ shift)
-        e = jnp.where(there, error[c] - known[-1], 0.0)
+        e = jnp.where(is_measured, error[c] - known[-1], 0.0)
         s = jnp.sqrt(f @ f + r**2)
         moved = left @ f
         shift = shift + moved * e / s**2
@@ -91,7 +91,7 @@ class Step(NamedTuple):
     back: Float[Array, "n n"]
 
 
-def smoothed(steps: Step) -> tuple[Float[Array, "n_t n"], Float[Array, "n_t n n"]]:
+def smoothed_moments(steps: Step) -> tuple[Float[Array, "n_t n"], Float[Array, "n_t n n"]]:
     """Mean and a root of the covariance of every instant, all measurements known; `steps` has a leading axis (n_t).
 
     The smoother of Bryson and Frazier in the coordinates x, where the adjoint variable a and 1 - its matrix, here G,
@@ -105,11 +105,10 @@ def smoothed(steps: Step) -> tuple[Float[Array, "n_t n"], Float[Array, "n_t n n"
     def go_back(after: Any, step: Step) -> tuple[Any, Any]:
         a, G = after
         a, G = step.left @ a - step.shift, step.left @ G @ step.left.T
-        found = step.mean - step.S @ a, step.S @ _symmetric_root(G)
-        return (step.back @ a, one - step.back @ (one - G) @ step.back.T), found
+        moments = step.mean - step.S @ a, step.S @ _symmetric_root(G)
+        return (step.back @ a, one - step.back @ (one - G) @ step.back.T), moments
 
-    _, found = jax.lax.scan(go_back, (jnp.zeros(n, one.dtype), one), steps, reverse=True)
-    return found
+    return jax.lax.scan(go_back, (jnp.zeros(n, one.dtype), one), steps, reverse=True)[1]
 
 
 def _symmetric_root(G: Array) -> Array:
@@ -153,17 +152,17 @@ def filtered(model: Any, window: Windows, start: Array, b: Array, x: Array, begi
     def go_on(known: tuple[Array, Array], now: Any) -> tuple[Any, Any]:
         before, t, y, weight = now
         v, S, h, F, back, status = _predicted(model, system, calibration, window, known, before, t)
-        seen = weight > 0
-        sigma = factor / jnp.where(seen, weight, 1.0)
-        new = update(jnp.where(seen, y - h, 0.0), F, sigma, seen)
+        measured = weight > 0
+        sigma = factor / jnp.where(measured, weight, 1.0)
+        new = update(jnp.where(measured, y - h, 0.0), F, sigma, measured)
         mean, after = brought_back(system, t, v + S @ new.shift, S @ new.left)
         step = Step(v, S, new.shift, new.left, back)
         return (mean, after), (new.innovation, new.deviation, h + new.known, status, step)
 
-    began = (jnp.concatenate([start, _fixed(model, b)]), S)
+    carry = (jnp.concatenate([start, _fixed(model, b)]), S)
     # The first sample is met where the motion begins, after no time at all.
     times = (jnp.concatenate([t[:1], t[:-1]]), t)
-    (mean, _), (e, s, predicted, status, steps) = jax.lax.scan(go_on, began, (*times, y, weight))
+    (mean, _), (e, s, predicted, status, steps) = jax.lax.scan(go_on, carry, (*times, y, weight))
     return Filtered(e.T, s.T, predicted.T, mean[start.shape[0] :], jnp.max(status), steps)
 
 
@@ -185,14 +184,14 @@ def _predicted(model: Any, system: System, calibration: Any, window: Windows, kn
     xi_directions = xi_directions.at[places, places // max(n_w, 1)].set(of_noise)
     xi_directions = jnp.concatenate([jnp.zeros((n, MODES, n_w), dtype), xi_directions])
 
-    def piece(i: Array, so_far: Any) -> Any:
-        v, S, _, _, back, status = so_far
+    def piece(i: Array, carry: Any) -> Any:
+        v, S, _, _, back, status = carry
         i = i.astype(dtype)
-        begun = t0 + i * length
-        ended = jnp.where(moving & (i + 1 >= number), t1, begun + length)
+        t_start = t0 + i * length
+        t_end = jnp.where(moving & (i + 1 >= number), t1, t_start + length)
 
         def flow(v: Array, xi: Array) -> Any:
-            return _flow(model, system, calibration, window, v, Disturbance(begun, ended, xi, noise.names, *named))
+            return _flow(model, system, calibration, window, v, Disturbance(t_start, t_end, xi, noise.names, *named))
 
         v_directions = jnp.concatenate([S.T, jnp.zeros((MODES * n_w, n), dtype)])
         along = lambda *direction: jax.jvp(flow, (v, jnp.zeros((MODES, n_w), dtype)), direction, has_aux=True)  # noqa: E731
@@ -267,26 +266,26 @@ def information_of(model: Any, window: Windows, start: Array, start_dot: Array, 
 
     def along(*direction):
         def of(start, b, x):
-            found = filtered(model, window, start, b, x)
-            return (found.innovation, found.deviation), found
+            result = filtered(model, window, start, b, x)
+            return (result.innovation, result.deviation), result
 
         return jax.jvp(of, (start, b, x), direction, has_aux=True)
 
-    (e, s), dots, found = jax.vmap(along, out_axes=(None, -1, None))(*directions)
+    (e, s), dots, result = jax.vmap(along, out_axes=(None, -1, None))(*directions)
     priors = model.priors(window, z, b, x)
     priors_dot = jnp.concatenate(jax.jacfwd(model.priors, argnums=(1, 2, 3))(window, z, b, x), axis=1)
-    seen = (window.weight > 0).ravel()
+    measured = (window.weight > 0).ravel()
     e, s = e.ravel(), s.ravel()
-    dots = (jnp.where(seen[:, None], d.reshape(e.size, -1), 0.0) for d in dots)
+    dots = (jnp.where(measured[:, None], d.reshape(e.size, -1), 0.0) for d in dots)
     e_dot, s_dot = (jnp.zeros((e.size, k), e.dtype).at[:, moves].set(d) for d in dots)
-    r = jnp.where(seen, e / s, 0.0)
-    of_size = jnp.where(seen, (1 - r**2) / 2**0.5, 0.0)
+    r = jnp.where(measured, e / s, 0.0)
+    of_size = jnp.where(measured, (1 - r**2) / 2**0.5, 0.0)
     J = jnp.concatenate([e_dot / s[:, None], 2**0.5 * s_dot / s[:, None], priors_dot])
-    value = minus_twice_log_likelihood(found, window) + jnp.sum(priors**2)
-    return J, jnp.concatenate([r, of_size, priors]), value, found
+    value = minus_twice_log_likelihood(result, window) + jnp.sum(priors**2)
+    return J, jnp.concatenate([r, of_size, priors]), value, result
 
 
-def minus_twice_log_likelihood(found: Filtered, window: Windows) -> Array:
+def minus_twice_log_likelihood(result: Filtered, window: Windows) -> Array:
     """Of the measurements of one trial."""
-    seen, s = window.weight > 0, found.deviation
-    return jnp.sum(jnp.where(seen, (found.innovation / s) ** 2 + 2 * jnp.log(s) + LOG_2PI, 0.0))
+    measured, s = window.weight > 0, result.deviation
+    return jnp.sum(jnp.where(measured, (result.innovation / s) ** 2 + 2 * jnp.log(s) + LOG_2PI, 0.0))

@@ -130,15 +130,15 @@ class LeastSquares(Optimizer):
         if gain <= 0:  # all that a damped step promises is lost in rounding
             return "stuck"
         tried = moved(now.point, x, eliminated)
-        there = problem.linearize(tried)
-        if there is not None and usable(there) and there.cost >= at.cost:
+        at_tried = problem.linearize(tried)
+        if at_tried is not None and usable(at_tried) and at_tried.cost >= at.cost:
             # Often only the nuisance values, which went along a straight line, are not yet where they belong.
-            tried, there = refined(problem, tried, there, 3, self.rtol, enough=at.cost - 0.5 * gain)
-        if there is not None and usable(there) and there.cost < at.cost:
-            ratio = (at.cost - there.cost) / gain
+            tried, at_tried = refined(problem, tried, at_tried, 3, self.rtol, enough=at.cost - 0.5 * gain)
+        if at_tried is not None and usable(at_tried) and at_tried.cost < at.cost:
+            ratio = (at.cost - at_tried.cost) / gain
             # Nielsen's rule: trust more where the promise was kept.
             damping *= max(0.1, 1 - (2 * ratio - 1) ** 3)
-            return Iterate(tried, there.cost, there, jnp.asarray(damping, x.dtype))
+            return Iterate(tried, at_tried.cost, at_tried, jnp.asarray(damping, x.dtype))
         if _is_refined(problem, at):
             return "converged"
         damping = max(5 * damping, 1e-3)
@@ -228,11 +228,11 @@ class GradientDescent(Optimizer):
             directions = _directions(eliminated, at.squares / problem.size[0] if self.refresh else None)
         unit = unit if unit > 0 else jnp.linalg.norm(directions.T @ gradient)
         step, y, of_optax = _descend(self.transform)(directions, unit, gradient, state.of_optax, state.y)
-        after = _guarded(problem, now.point, at, step, eliminated)
-        if after is None:
+        new = _guarded(problem, now.point, at, step, eliminated)
+        if new is None:
             return "stuck"
-        point, there = after
-        return Iterate(point, there.cost, there, DescentState(y, directions, unit, of_optax))
+        point, at_new = new
+        return Iterate(point, at_new.cost, at_new, DescentState(y, directions, unit, of_optax))
 
     def finish(self, problem: Problem, best: Iterate, status: str) -> tuple[Iterate, str]:
         point, at = solve_nuisance(problem, best.point, steps=3, rtol=1e-9)
@@ -279,9 +279,9 @@ def _guarded(problem: Problem, point: Unknowns, at: Linearization, step: Array, 
     """Where a step leads, halved until it can be simulated; None where even a thousandth cannot."""
     for _ in range(12):
         tried = moved(point, step, eliminated)
-        there = problem.linearize(tried)
-        if there is not None and usable(there) and there.cost <= at.cost + 3 * at.squares:
-            return tried, there
+        at_tried = problem.linearize(tried)
+        if at_tried is not None and usable(at_tried) and at_tried.cost <= at.cost + 3 * at.squares:
+            return tried, at_tried
         step = step / 2
         # The nuisance values' own step may be what fails.
         eliminated = eliminate(at.blocks, 1e-2)

@@ -413,11 +413,11 @@ def _scalar(
     start = real_number(start, f"{name}: `start`")
     if not math.isfinite(start):
         raise ValueError(f"{name} starts at {start}.")
-    given = _checked_bounds(name, item.bounds)
-    lower, upper = given
-    if item.bounds is None or given != (-math.inf, math.inf):  # (None, None) asks for a search without bounds
+    stated = _checked_bounds(name, item.bounds)
+    lower, upper = stated
+    if item.bounds is None or stated != (-math.inf, math.inf):  # (None, None) asks for a search without bounds
         limits = [_limits(what, factor) for what, factor in ((info, 1.0), *tied)]
-        lower, upper = max(lower, *(least for least, _ in limits)), min(upper, *(most for _, most in limits))
+        lower, upper = max(lower, *(low for low, _ in limits)), min(upper, *(high for _, high in limits))
     prior = checked_prior(name, item.prior) if item.prior is not None else None
     scale = abs(start) or (prior[1] if prior is not None and math.isfinite(prior[1]) else 1.0)
     if item.scale is not None:
@@ -434,17 +434,17 @@ def _scalar(
         )
     numbers = [jnp.asarray(float(x), jnp.result_type(float)) for x in (begin, lower, upper, scale)]
     bounded = (lower > -math.inf, upper < math.inf)
-    bijection = Interval(*numbers, bounded=bounded, uniform=bool(np.all(np.isfinite(given))))
+    bijection = Interval(*numbers, bounded=bounded, uniform=bool(np.all(np.isfinite(stated))))
     return [entry], bijection, [start], [scale], [prior]
 
 
 def _limits(info: ParameterInfo, factor: float) -> tuple[float, float]:
     """Between which numbers x the parameter factor * x can be."""
-    least, most = info.within
-    least = max(least, 0.0) if info.positive else least
+    low, high = info.within
+    low = max(low, 0.0) if info.positive else low
     if not factor:
         return -math.inf, math.inf
-    ends = least / factor, most / factor
+    ends = low / factor, high / factor
     return min(ends), max(ends)
 
 
@@ -484,8 +484,8 @@ def _of_body(system: System, item: Inertia):
         spots += [(leaf, tuple({3 * a + b, 3 * b + a})) for a, b in pairs]
     else:
         moments = item.moments or ("", "", "")
-        given = sum(name is not None for name in item.products)
-        if given == 2 or (given and len(set(moments)) < 3):
+        number = sum(name is not None for name in item.products)
+        if number == 2 or (number and len(set(moments)) < 3):
             raise ValueError(
                 "Inertia: name all three `products`, or the one that a plane of symmetry leaves, or none where the "
                 "axes are principal, as a wheel's are."

@@ -96,13 +96,13 @@ def with_options(function: F) -> F:
     return function
 
 
-def refuse_other(given: Any, wanted: type, name: str, instead: str) -> None:
+def refuse_other(value: Any, wanted: type, name: str, instead: str) -> None:
     """Functions before a fit take a `Problem`, those after it a `Fit`.
 
     **Raises:** `TypeError` for anything else.
     """
-    if not isinstance(given, wanted):
-        raise TypeError(f"{name} takes a {wanted.__name__}, as in {instead}; got {type(given).__name__}.")
+    if not isinstance(value, wanted):
+        raise TypeError(f"{name} takes a {wanted.__name__}, as in {instead}; got {type(value).__name__}.")
 
 
 def checked_trials(system: System, trials: Sequence[Trial]) -> tuple[str, ...]:
@@ -110,31 +110,31 @@ def checked_trials(system: System, trials: Sequence[Trial]) -> tuple[str, ...]:
     title = type(system).__name__
     named = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.states, *output_names(system))
     for trial in trials:
-        for what, given, known in (
+        for what, names, known in (
             ("channel", trial.measured, named),
             ("input", trial.inputs, system.inputs),
             ("coordinate, independent speed or state", trial.initial, state_names(system)),
         ):
-            refuse_unknown(given, known, f"{trial.name}: {title} has no {what}")
+            refuse_unknown(names, known, f"{trial.name}: {title} has no {what}")
     return tuple(dict.fromkeys(channel for trial in trials for channel in trial.measured))
 
 
-def deviations_by_name(given: Names) -> dict[str, float | None]:
+def deviations_by_name(names: Names) -> dict[str, float | None]:
     """Each name with its standard deviation, or None."""
-    return dict(given) if isinstance(given, Mapping) else dict.fromkeys(as_names(given))
+    return dict(names) if isinstance(names, Mapping) else dict.fromkeys(as_names(names))
 
 
-def checked_names(system: System, what: str, given: Any, known: Sequence[str]) -> dict[str, float]:
+def checked_names(system: System, what: str, names: Any, known: Sequence[str]) -> dict[str, float]:
     """Names with the deviations of their priors."""
-    given = deviations_by_name(given)
-    wrong = [name for name in given if name not in known]
+    names = deviations_by_name(names)
+    wrong = [name for name in names if name not in known]
     if wrong:
         raise ValueError(
             f"{type(system).__name__}: `{what}` names {', '.join(wrong)}; {hint(wrong, known, 'it may name')}"
             + (" Dependent coordinates and speeds follow from the others." if what == "unknown" else "")
         )
     numbers = {}
-    for name, deviation in given.items():
+    for name, deviation in names.items():
         label = f"`{what}`: the standard deviation of {name}"
         numbers[name] = float("inf") if deviation is None else real_number(deviation, label)
         if not numbers[name] > 0:
@@ -372,15 +372,15 @@ class Problem:
     @property
     def size(self) -> tuple[int, int]:
         """Numbers of residuals, priors and links among them, and of unknowns."""
-        n, seen, T = self.model.nuisance, self.active_windows, self.clusters
+        n, active, T = self.model.nuisance, self.active_windows, self.clusters
         finite = lambda x: int(np.isfinite(np.asarray(x)).sum())  # noqa: E731
         residuals = int(jnp.sum(self.windows.weight > 0)) + finite(self.parameters.prior_deviation)
-        residuals += (T if n.has_defects else int(seen.sum())) * finite(n.start_deviation) + T * finite(
+        residuals += (T if n.has_defects else int(active.sum())) * finite(n.start_deviation) + T * finite(
             n.trial_deviation
         )
-        residuals += int(np.asarray(self.windows.linked)[seen].sum()) * finite(n.defect_std)
-        residuals += int(seen.sum()) * len(self.model.norms)
-        unknowns = len(self.parameters.entries) + T * len(n.trial) + int(seen.sum()) * len(n.start)
+        residuals += int(np.asarray(self.windows.linked)[active].sum()) * finite(n.defect_std)
+        residuals += int(active.sum()) * len(self.model.norms)
+        unknowns = len(self.parameters.entries) + T * len(n.trial) + int(active.sum()) * len(n.start)
         return residuals, unknowns
 
     def linearize(self, point: Unknowns) -> Linearization | None:

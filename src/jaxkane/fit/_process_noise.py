@@ -41,8 +41,8 @@ class Noise(eqx.Module):
     def spectral_densities(self, calibration: Mapping[tuple[str, str], Array]) -> Array:
         """(n_w,), those that are free by ("spectral density", name)."""
         pairs = zip(self.names, self.spectral_density, strict=True)
-        found = [calibration.get(("spectral density", name), x) for name, x in pairs]
-        return jnp.stack(found) if found else self.spectral_density
+        densities = [calibration.get(("spectral density", name), x) for name, x in pairs]
+        return jnp.stack(densities) if densities else self.spectral_density
 
 
 class Disturbance(eqx.Module):
@@ -69,27 +69,27 @@ class Disturbance(eqx.Module):
         return disturbed, State(jnp.zeros_like(state.q), row(self.speeds), x)
 
 
-def noise_of(system: System, given: Any, deviations: Array, window: float | None) -> Noise:
+def noise_of(system: System, noise: Any, deviations: Array, window: float | None) -> Noise:
     """Process noise by name, checked. `deviations` (n_z + n_b,): of a trial's unknowns."""
-    if not isinstance(given, Mapping):
+    if not isinstance(noise, Mapping):
         example = f"{{{system.speeds[0]!r}: 0.1}}"
-        raise TypeError(f"`noise` is a dict of spectral densities by name, {example}; got {given!r}.")
+        raise TypeError(f"`noise` is a dict of spectral densities by name, {example}; got {noise!r}.")
     if window is not None:
         raise ValueError(
             "`noise` and `window` are two ways to follow a motion that one start does not determine: a filter, which "
             "goes on from every measurement, and windows, each with a start of its own. Give one of them."
         )
     known = (*system.speeds, *system.states, *system.inputs)
-    for name, density in given.items():
+    for name, density in noise.items():
         if name not in known:
-            more = (
+            advice = (
                 " A dependent speed is disturbed by what disturbs the independent ones."
                 if name in system.dependent_speeds
                 else " A coordinate follows from the speeds: noise in its rate would break q_dot = q_dot(q, u)."
                 if name in system.coordinates
                 else ""
             )
-            raise ValueError(f"`noise` names {name}; {hint(name, known, 'it may name')}{more}")
+            raise ValueError(f"`noise` names {name}; {hint(name, known, 'it may name')}{advice}")
         if not 0 <= real_number(density, f"`noise`: the spectral density of {name}") < math.inf:
             raise ValueError(
                 f"`noise`: the spectral density of {name} is not negative, and finite; got {density!r}. "
@@ -97,4 +97,4 @@ def noise_of(system: System, given: Any, deviations: Array, window: float | None
             )
     dtype = jnp.result_type(float)
     random = tuple(bool(x) for x in np.isfinite(np.asarray(deviations)))
-    return Noise(tuple(given), jnp.asarray([float(x) for x in given.values()], dtype), random)
+    return Noise(tuple(noise), jnp.asarray([float(x) for x in noise.values()], dtype), random)

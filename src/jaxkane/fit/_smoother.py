@@ -15,8 +15,7 @@ from .._common.lookup import not_there
 from .._kane.equations import _dependent_speeds
 from .._scalarjit.cache_key import jit
 from .._system.system import unpacked
-from . import _kalman as kalman
-from ._kalman import brought_back, filtered
+from ._kalman import brought_back, filtered, smoothed_moments
 from ._linearize import map_windows, starts_of
 from ._model import Model, Unknowns
 from ._problem import refuse_other
@@ -96,12 +95,12 @@ def smoothed(fit: Fit) -> dict[str, Smoothed]:
     mean, root = np.array(mean, float), np.asarray(root, float)
     factors = [1.0 if kind.startswith("gain") else 0.0 for kind, _ in problem.model.nuisance.trial]
     mean[:, :, len(names) - len(unknowns) :] += np.array(factors)
-    found = {}
+    motions = {}
     for k, name in enumerate(fit.trial_names):
         n, S = len(problem.trials[k].t), root[k]
         covariance = np.einsum("tik,tjk->tij", S[:n], S[:n])
-        found[name] = Smoothed(problem.trials[k].t, names, mean[k, :n], covariance)
-    return found
+        motions[name] = Smoothed(problem.trials[k].t, names, mean[k, :n], covariance)
+    return motions
 
 
 def _beginnings(fit: Fit) -> Array:
@@ -111,8 +110,8 @@ def _beginnings(fit: Fit) -> Array:
     R, n_z, n_b = np.asarray(blocks.R, float), blocks.n_z, blocks.n_b
     information = np.linalg.norm(R[:, :, : n_z + n_b], axis=1)  # (W, n_z + n_b)
     wide = DIFFUSE / np.where(information > 0, information, 1.0)
-    given = np.concatenate([np.asarray(nuisance.start_deviation), np.asarray(nuisance.trial_deviation)])
-    deviations = np.where(np.isfinite(given), given, wide)
+    stated = np.concatenate([np.asarray(nuisance.start_deviation), np.asarray(nuisance.trial_deviation)])
+    deviations = np.where(np.isfinite(stated), stated, wide)
     begin = np.zeros((R.shape[0], n + n_b))
     begin[:, problem.model.unknown_places] = deviations[:, :n_z]
     begin[:, n:] = deviations[:, n_z:]
@@ -127,8 +126,8 @@ def _smoothed(model: Model, windows: Any, point: Unknowns, starts: Array, begin:
     def of_trial(arguments: Any) -> tuple[Array, Array]:
         window, b, start, begin = arguments
         system, _ = model.parameters.apply(model.system, point.x)
-        found = filtered(model, window, start, b, point.x, begin)
-        v, S = kalman.smoothed(found.steps)
+        result = filtered(model, window, start, b, point.x, begin)
+        v, S = smoothed_moments(result.steps)
         v, S = jax.vmap(lambda t, v, S: brought_back(system, t, v, S))(window.t, v, S)
 
         def whole(t: Array, v: Array) -> Array:

@@ -125,17 +125,17 @@ class Trial:
         return array
 
     def _sigmas(self, sigma: Any) -> dict[str, np.ndarray]:
-        given = sigma if isinstance(sigma, Mapping) else dict.fromkeys(self.measured, sigma)
-        missing = [key for key in self.measured if key not in given]
+        by_channel = sigma if isinstance(sigma, Mapping) else dict.fromkeys(self.measured, sigma)
+        missing = [key for key in self.measured if key not in by_channel]
         if missing:
             raise ValueError(
                 f"{self.name}: `sigma` lacks {', '.join(missing)}: give the standard deviation of the measurement."
             )
-        found = {key: self._samples("sigma", key, given[key], number=True, gaps=False) for key in self.measured}
-        for key, value in found.items():
+        sigmas = {key: self._samples("sigma", key, by_channel[key], number=True, gaps=False) for key in self.measured}
+        for key, value in sigmas.items():
             if not np.all(value > 0):
                 raise ValueError(f"{self.name}: sigma[{key!r}] must be positive.")
-        return found
+        return sigmas
 
     def between(self, start: float, stop: float) -> Trial:
         """The stretch with start <= t <= stop [s]."""
@@ -165,12 +165,12 @@ class Trial:
         return f"Trial({self.name!r}, {span}: {', '.join(self.measured)})"
 
 
-def as_trials(given: Sequence[Trial] | Trial) -> tuple[Trial, ...]:
+def as_trials(trials: Sequence[Trial] | Trial) -> tuple[Trial, ...]:
     """Trials, of which one alone may be given.
 
     **Raises:** `TypeError` for what are none, `ValueError` where there is none.
     """
-    trials = (given,) if isinstance(given, Trial) else tuple(given) if isinstance(given, Iterable) else (given,)
+    trials = (trials,) if isinstance(trials, Trial) else tuple(trials) if isinstance(trials, Iterable) else (trials,)
     for trial in trials:
         if not isinstance(trial, Trial):
             raise TypeError(f"`trials` holds jaxkane.fit.Trial, got {type(trial).__name__}.")
@@ -242,7 +242,7 @@ def _tables(path: Path, columns: list[str], by: str | None) -> dict[str, dict[st
         if twice:
             raise ValueError(f"{path}: more than one column is called {', '.join(twice)}: which is meant? Rename one.")
         places = [header.index(c) for c in columns]
-        found: dict[str, list[list[float]]] = {}
+        samples: dict[str, list[list[float]]] = {}
         for line in lines:
             if not any(cell.strip() for cell in line):
                 continue
@@ -250,10 +250,10 @@ def _tables(path: Path, columns: list[str], by: str | None) -> dict[str, dict[st
                 raise ValueError(f"{path}, line {lines.line_num}: {len(line)} cells, the header has {len(header)}.")
             key = line[header.index(by)].strip() if by else ""
             numbers = [_number(line[i], path, lines.line_num, c) for i, c in zip(places, columns, strict=True)]
-            found.setdefault(key, []).append(numbers)
-    if not found:
+            samples.setdefault(key, []).append(numbers)
+    if not samples:
         raise ValueError(f"{path}: there is no line of data.")
-    return {key: dict(zip(columns, np.array(rows).T, strict=True)) for key, rows in found.items()}
+    return {key: dict(zip(columns, np.array(rows).T, strict=True)) for key, rows in samples.items()}
 
 
 def _number(cell: str, path: Path, line: int, column: str) -> float:

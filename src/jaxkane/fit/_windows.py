@@ -91,37 +91,37 @@ def cut(
     linked = [
         has_defects and place[0] == after[0] for place, after in zip(places, [*places[1:], (-1, 0, 0)], strict=True)
     ]
-    n_t = max(n + more for (_, _, n), more in zip(places, linked, strict=True))
-    found: dict[str, list[np.ndarray]] = {key: [] for key in ("t", "measured", "weight", "t_input", "inputs", "step")}
-    kept: list[tuple[int, int]] = []  # the first sample of the inputs, and the one behind the last
-    for (k, i, n), more in zip(places, linked, strict=True):
-        trial, last = trials[k], i + n - 1 + more
-        found["t"].append(trial.t[np.minimum(np.arange(i, i + n_t), last)])
+    n_t = max(n + extra for (_, _, n), extra in zip(places, linked, strict=True))
+    columns: dict[str, list[np.ndarray]] = {key: [] for key in ("t", "measured", "weight", "t_input", "inputs", "step")}
+    spans: list[tuple[int, int]] = []  # the first sample of the inputs, and the one behind the last
+    for (k, i, n), extra in zip(places, linked, strict=True):
+        trial, last = trials[k], i + n - 1 + extra
+        columns["t"].append(trial.t[np.minimum(np.arange(i, i + n_t), last)])
         between, lasts = np.median(np.diff(trial.t[i : last + 1])), trial.t[last] - trial.t[i]
-        found["step"].append(between if step is None else min(step, lasts))  # no longer, so that it can be halved
-        kept.append((i, last + 1) if reach is None else _reached(trial.t, i, last, reach, float(found["step"][-1])))
+        columns["step"].append(between if step is None else min(step, lasts))  # no longer, so that it can be halved
+        spans.append((i, last + 1) if reach is None else _reached(trial.t, i, last, reach, float(columns["step"][-1])))
         y = np.stack([_take(trials, (k, i, n), c) for c in channels])  # (n_c, n)
         sigma = np.stack([trial.sigma.get(c, np.ones_like(trial.t))[i : i + n] for c in channels])
-        seen = np.isfinite(y)
-        found["measured"].append(_fill(np.where(seen, y, 0.0), n_t))
-        found["weight"].append(_fill(np.where(seen, 1.0 / sigma, 0.0), n_t))
-    n_in = max(stop - begin for begin, stop in kept)
-    for (k, _, _), (begin, _), h in zip(places, kept, found["step"], strict=True):
+        finite = np.isfinite(y)
+        columns["measured"].append(_fill(np.where(finite, y, 0.0), n_t))
+        columns["weight"].append(_fill(np.where(finite, 1.0 / sigma, 0.0), n_t))
+    n_in = max(stop - begin for begin, stop in spans)
+    for (k, _, _), (begin, _), h in zip(places, spans, columns["step"], strict=True):
         trial, wanted = trials[k], np.arange(begin, begin + n_in)
-        there = np.minimum(wanted, len(trial.t) - 1)
-        found["t_input"].append(trial.t[there] + h * (wanted - there))  # what lies outside takes the last sample
-        rows = [trial.inputs.get(name, np.zeros_like(trial.t))[there] for name in system.inputs]
-        found["inputs"].append(np.array(rows).reshape(len(system.inputs), n_in))
+        inside = np.minimum(wanted, len(trial.t) - 1)
+        columns["t_input"].append(trial.t[inside] + h * (wanted - inside))  # what lies outside takes the last sample
+        rows = [trial.inputs.get(name, np.zeros_like(trial.t))[inside] for name in system.inputs]
+        columns["inputs"].append(np.array(rows).reshape(len(system.inputs), n_in))
     names = state_names(system)
     guesses = [(guess or {}).get(name, 0.0) for name in names]
     pairs = tuple(zip(names, guesses, strict=True))
     start = np.array([[_start(trials[k], i, n, *pair) for pair in pairs] for k, i, n in places])
     owner = np.array([k for k, _, _ in places])
-    span = np.ptp(found["t"], axis=1) + 2 * np.array(found["step"])
+    span = np.ptp(columns["t"], axis=1) + 2 * np.array(columns["step"])
     longest = {k: span[owner == k].max() for k in owner.tolist()}
     array = lambda x: jnp.asarray(np.array(x), dtype=jnp.result_type(float))  # noqa: E731
     windows = Windows(
-        **{key: array(value) for key, value in found.items()},
+        **{key: array(value) for key, value in columns.items()},
         start=array(start),
         next_start=array(np.append(start[1:], start[-1:], axis=0)),
         linked=array(np.array(linked, float)),
@@ -197,8 +197,8 @@ def _start(trial: Trial, i: int, n: int, name: str, guess: float) -> float:
     if name in trial.initial:
         return float(trial.initial[name][i])
     if name in trial.measured:
-        seen = trial.measured[name][i : i + n]
-        seen = seen[np.isfinite(seen)]
-        if seen.size:
-            return float(seen[0])
+        samples = trial.measured[name][i : i + n]
+        samples = samples[np.isfinite(samples)]
+        if samples.size:
+            return float(samples[0])
     return guess
