@@ -16,7 +16,7 @@ from ._bijections import Interval
 from ._covariance import parameter_values
 from ._declarations import CalibrationTerm, Delay, Free
 from ._model import Simulation, Unknowns
-from ._parameters import ParameterSubset, as_items, parameters_of
+from ._parameters import as_items, parameters_of
 from ._problem import Names, Problem, ProblemSpec, deviations_by_name
 from ._result import Fit
 
@@ -260,12 +260,12 @@ class AugmentedProblem:
         deviations `fixed`. Any candidates with as many free parameters run the same compiled program.
         """
         (free_x, free_b), model = self.places(candidate), self.problem.model
-        part = ParameterSubset(model.parameters, jnp.asarray(free_x, dtype=jnp.int32), self.point.x)
+        subset = model.parameters.subset(free_x, self.point.x)
         deviation = np.array(fixed)
         deviation[free_b] = np.asarray(model.nuisance.trial_deviation)[free_b]
         where = lambda m: (m.parameters, m.nuisance.trial_deviation)  # noqa: E731
-        model = eqx.tree_at(where, model, (part, jnp.asarray(deviation, self.point.x.dtype)))
-        point = eqx.tree_at(lambda p: p.x, self.point, self.point.x[part.places])
+        model = eqx.tree_at(where, model, (subset, jnp.asarray(deviation, self.point.x.dtype)))
+        point = eqx.tree_at(lambda p: p.x, self.point, self.point.x[subset.places])
         return dataclasses.replace(self.problem, model=model), point
 
 

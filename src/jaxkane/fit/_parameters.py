@@ -78,18 +78,32 @@ class Entry:
 
 class Parameters(eqx.Module):
     """The free parameters of a fit: x (p,), zero where the search begins and about one where much has changed, to
-    values (p,). `start` are the values that were given; of one on its bound the search begins inside (see `Free`).
+    values (p,). `start` are the initial guesses; of one on its bound the search begins inside (see `Free`).
 
-    The maps are bijections, each from its own part of x to as many values: see `Interval` and `PossibleBody`.
+    The maps are bijections, each from its own part of all x to as many values: see `Interval` and `PossibleBody`. Of a
+    `subset` only those at `places` (p,) are free, and `rest` is the x of all. The places are data: every choice of as
+    many runs the same compiled program.
     """
 
-    entries: tuple[Entry, ...] = eqx.field(static=True)
+    all_entries: tuple[Entry, ...] = eqx.field(static=True)
     bijections: tuple[Interval | PossibleBody, ...]
     sizes: tuple[int, ...] = eqx.field(static=True)
     start: Float[Array, " p"]
     scale: Float[Array, " p"]
     prior_mean: Float[Array, " p"]
     prior_deviation: Float[Array, " p"]
+    places: Int[Array, " p"]
+    rest: Float[Array, " all"]
+
+    def subset(self, places: Sequence[int], x: Float[Array, " p"]) -> Parameters:
+        """Those at `places`; all others keep their values at x."""
+        at = jnp.asarray(places, dtype=jnp.int32)
+        new = [v[at] for v in (self.start, self.scale, self.prior_mean, self.prior_deviation)]
+        return Parameters(self.all_entries, self.bijections, self.sizes, *new, self.places[at], self._all(x))
+
+    @property
+    def entries(self) -> tuple[Entry, ...]:
+        return tuple(self.all_entries[i] for i in np.asarray(self.places).tolist())
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -111,12 +125,12 @@ class Parameters(eqx.Module):
 
     def values(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
         """Parameters in their own units."""
-        return jnp.concatenate([f(part) for f, part in zip(self.bijections, self._parts(x), strict=True)])
+        return self._all_values(x)[self.places]
 
     def inverse(self, values: Float[Array, " p"]) -> Float[Array, " p"]:
         """The x (p,) of parameters in their own units; NaN outside their bounds."""
-        parts = self._parts(values)
-        return jnp.concatenate([f.inverse(part) for f, part in zip(self.bijections, parts, strict=True)])
+        parts = self._parts(self._all_values(self.rest[self.places]).at[self.places].set(values))
+        return jnp.concatenate([f.inverse(part) for f, part in zip(self.bijections, parts, strict=True)])[self.places]
 
     def slopes(self, x: Float[Array, " p"]) -> Float[Array, "p p"]:
         """d values / d x."""
@@ -124,8 +138,14 @@ class Parameters(eqx.Module):
 
     def log_determinant(self, x: Float[Array, " p"]) -> Array:
         """log |det d values / d x|: what a density over the values is multiplied by to be one over x."""
-        pairs = zip(self.bijections, self._parts(x), strict=True)
+        pairs = zip(self.bijections, self._parts(self._all(x)), strict=True)
         return sum((jnp.linalg.slogdet(jax.jacfwd(f)(part))[1] for f, part in pairs), jnp.zeros((), x.dtype))
+
+    def _all(self, x: Float[Array, " p"]) -> Float[Array, " all"]:
+        return self.rest.at[self.places].set(x)
+
+    def _all_values(self, x: Float[Array, " p"]) -> Float[Array, " all"]:
+        return jnp.concatenate([f(part) for f, part in zip(self.bijections, self._parts(self._all(x)), strict=True)])
 
     def _parts(self, x: Any) -> list[Any]:
         split = np.split if isinstance(x, np.ndarray) else jnp.split
@@ -135,8 +155,8 @@ class Parameters(eqx.Module):
         """The system with these parameters; gains, offsets, delays and the noise's by ("gain of input", name)."""
         leaves, structure = jax.tree.flatten(system)
         calibration = {}
-        values = self.values(x)
-        for i, entry in enumerate(self.entries):
+        values = self._all_values(x)
+        for i, entry in enumerate(self.all_entries):
             value = values[i]
             if entry.role is not None:
                 calibration[entry.role] = value
@@ -176,63 +196,6 @@ def checked_prior(name: str, prior: Any) -> Prior:
     if not (math.isfinite(mean) and deviation > 0):
         raise ValueError(f"{name}: a prior is (mean, standard deviation > 0), got {prior!r}.")
     return mean, deviation
-
-
-class ParameterSubset(eqx.Module):
-    """The `Parameters` at `places` (k,) of the `whole`, for a `Model`; all others keep the values of `rest` (p,).
-
-    The places are data: every choice of k parameters runs the same compiled program.
-    """
-
-    whole: Parameters
-    places: Int[Array, " k"]
-    rest: Float[Array, " p"]
-
-    @property
-    def _chosen(self) -> list[int]:
-        return np.asarray(self.places).tolist()
-
-    @property
-    def entries(self) -> tuple[Any, ...]:
-        return tuple(self.whole.entries[i] for i in self._chosen)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        return tuple(self.whole.names[i] for i in self._chosen)
-
-    @property
-    def start(self) -> Float[Array, " k"]:
-        return self.whole.start[self.places]
-
-    @property
-    def scale(self) -> Float[Array, " k"]:
-        return self.whole.scale[self.places]
-
-    @property
-    def prior_mean(self) -> Float[Array, " k"]:
-        return self.whole.prior_mean[self.places]
-
-    @property
-    def prior_deviation(self) -> Float[Array, " k"]:
-        return self.whole.prior_deviation[self.places]
-
-    def values(self, x: Float[Array, " k"]) -> Float[Array, " k"]:
-        return self.whole.values(self._all(x))[self.places]
-
-    def slopes(self, x: Float[Array, " k"]) -> Float[Array, "k k"]:
-        return jax.jacfwd(self.values)(x)
-
-    def apply(self, system: Any, x: Float[Array, " k"]) -> Any:
-        return self.whole.apply(system, self._all(x))
-
-    def prior_residuals(self, x: Float[Array, " k"]) -> Float[Array, " k"]:
-        return self.whole.prior_residuals(self._all(x))[self.places]
-
-    def with_priors(self, priors: Mapping[str, Prior]) -> ParameterSubset:
-        return dataclasses.replace(self, whole=self.whole.with_priors(priors))
-
-    def _all(self, x: Array) -> Array:
-        return self.rest.at[self.places].set(x)
 
 
 START_INSIDE = 0.1
@@ -293,13 +256,15 @@ def parameters_of(
     priors = [prior if prior else (0.0, math.inf) for part in parts for prior in part[4]]
     array = lambda numbers: jnp.asarray(np.array(numbers, float), jnp.result_type(float))  # noqa: E731
     return Parameters(
-        entries=tuple(entries),
+        all_entries=tuple(entries),
         bijections=tuple(part[1] for part in parts),
         sizes=tuple(len(part[0]) for part in parts),
         start=array([s for part in parts for s in part[2]]),
         scale=array([s for part in parts for s in part[3]]),
         prior_mean=array([mean for mean, _ in priors]),
         prior_deviation=array([deviation for _, deviation in priors]),
+        places=jnp.arange(len(entries), dtype=jnp.int32),
+        rest=jnp.zeros(len(entries), jnp.result_type(float)),
     )
 
 
