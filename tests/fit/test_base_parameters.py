@@ -1,0 +1,251 @@
+"""Which sums of parameters motions determine, and their values by least squares."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from swings import ARMS, FREE, FRICTION, Swing, random_samples, swings
+
+import jaxkane as jk
+from jaxkane.fit import KinematicSamples, Trial, base_parameters, kinematic_samples, regressor
+from jaxkane.fit._base_parameters import random_states
+from jaxkane.joints import Actuator, Link, Loop, Site, hinge, mechanism
+
+
+def test_double_pendulum_as_in_textbooks():
+    """Khalil and Dombre: ZZ1 + L^2 M2, MX1 + L M2, MY1, ZZ2, MX2, MY2; with a free swing only their ratios."""
+    found = base_parameters(Swing())
+    assert found.texts == (
+        "link1.Izz + L1^2 link2.m", "link1.mx", "link1.my + L1 link2.m", "link2.Izz", "link2.mx", "link2.my",
+    )  # fmt: skip
+    assert not found.ratios_only
+    assert found.count == 6
+    assert "link1.m" in found.without_influence
+    assert "of 20 parameters 6 sums can be determined" in str(found)
+    _truth, _ = swings()
+    np.testing.assert_allclose(found.of(found.values)[0], 4e-4 + 0.1 * 0.11**2 + 0.14 * 0.172719204**2)
+
+
+def arm(n, gravity=(0.0, -9.81, 0.0)):
+    """n hinges about parallel axes, with friction; the mass centres of the links are on their lines."""
+    links = [
+        Link(
+            f"L{i}",
+            f"L{i - 1}" if i else None,
+            joints=hinge(f"q{i}", (0, 0, 1), damping=0.1),
+            position=(0.3 * (i > 0), 0, 0),
+            mass=1.0 + i,
+            center=(0.1, 0, 0),
+            inertia=(0.0, 0.0, 0.02),
+        )
+        for i in range(n)
+    ]
+    return mechanism(links, gravity=gravity)
+
+
+@pytest.mark.parametrize(
+    ("n", "numbers"), [pytest.param(1, 2, marks=pytest.mark.slow), (2, 5), pytest.param(3, 8, marks=pytest.mark.slow)]
+)
+def test_free_swings_with_friction(n, numbers):
+    """The data's README: 2 numbers of a single pendulum, 5 of a double one, 8 of a triple one with known lengths."""
+    system = arm(n)
+    bodies = {f"L{i}": ("m", "mx", "Izz") for i in range(n)}
+    found = base_parameters(system, bodies=bodies, parameters=[f"damping.q{i}" for i in range(n)])
+    assert found.ratios_only
+    assert found.count == numbers
+    assert len(found.places) == numbers + 1
+
+
+@pytest.mark.slow
+def test_a_vertical_axis_tells_one_number_and_a_horizontal_one_three():
+    whole = {"center": (0.1, 0.02, 0.03), "inertia": ((0.02, 0.001, 0.002), (0.001, 0.03, 0.003), (0.002, 0.003, 0.04))}
+    for axis, expected in (((0, 0, 1), ("Izz",)), ((0, 1, 0), ("mx", "mz", "Iyy"))):
+        one = mechanism([Link("bob", joints=hinge("q", axis), mass=1.0, **whole)], actuators=[Actuator("tau", "q")])
+        found = base_parameters(one)
+        assert {one.rpartition(".")[2] for one in found.texts} == set(expected)
+        assert found.count == len(expected)
+
+
+@pytest.mark.slow
+def test_a_puma_has_36():
+    """Mayeda, Yoshida and Osuka, Base parameters of manipulator dynamic models, 1990; the sums are Khalil's."""
+    quarter = np.pi / 2
+    turns = (0.0, -quarter, 0.0, -quarter, quarter, -quarter)
+    places = ((0, 0, 0), (0, 0, 0), (0.4318, 0, 0.15), (0.02, 0.4318, 0), (0, 0, 0), (0, 0, 0))
+    whole = {"center": (0.1, 0.02, 0.03), "inertia": ((0.02, 0.001, 0.002), (0.001, 0.03, 0.003), (0.002, 0.003, 0.04))}
+    links = [
+        Link(f"L{i}", f"L{i - 1}" if i else None, hinge(f"q{i}", (0, 0, 1)), places[i], ("1", (turns[i],)), 1.0 + i,
+             **whole)
+        for i in range(6)
+    ]  # fmt: skip
+    found = base_parameters(mechanism(links, actuators=[Actuator(f"tau{i}", f"q{i}") for i in range(6)]))
+    assert len(found.places) == found.count == 36
+    assert "L3.Ixx - L3.Iyy + L4.Iyy" in found.texts
+    assert "L5.Ixx - L5.Iyy" in found.texts
+    assert found.texts[0].startswith("L0.Izz + L1.Iyy + ")
+    assert "2 position.L2.z L2.mz" in found.texts[0]
+
+
+def test_estimates_from_exact_data_are_exact():
+    tolerance = 1e-9
+    truth, at = swings()
+    found = base_parameters(Swing(), at, parameters=FRICTION)
+    expected = found.of(regressor(truth, 0.0, at.q[0], at.u[0], at.u_dot[0], parameters=FRICTION).values)
+    np.testing.assert_allclose(found.estimates, expected, rtol=tolerance, atol=tolerance)
+    assert found.count == 8
+    assert found.unexplained < 1e-12
+    assert "8 numbers by these data" in str(found)
+
+
+def test_a_regressor_of_many_instants_is_enough():
+    truth, at = swings()
+    rows = jax.vmap(lambda q, u, a: regressor(truth, 0.0, q, u, a, parameters=FRICTION))(
+        *(jnp.asarray(x) for x in (at.q, at.u, at.u_dot))
+    )
+    found = base_parameters(rows)
+    assert len(found.places) == 8
+    assert found.texts[0] == f"link1.Izz + {0.172719204**2:.4g} link2.m"
+    with pytest.raises(ValueError, match="many instants"):
+        base_parameters(jax.tree.map(lambda x: x[0], rows))
+
+
+@pytest.mark.slow
+def test_deviations_cover_the_truth():
+    """Of 25 data sets with noisy torques, each base parameter; with a known sigma, and with an estimated one."""
+    truth, at = swings()
+    expected = None
+    for sigma in (None, {"rate1": 0.002, "rate2": 0.002}):
+        z = []
+        for seed in range(25):
+            torque = at.inputs["torque1"] + np.random.default_rng(seed).normal(0.0, 0.002, len(at))
+            noisy = dataclasses.replace(at, inputs={"torque1": torque})
+            found = base_parameters(truth, noisy, bodies=ARMS, parameters=FRICTION, sigma=sigma)
+            expected = found.of(found.values) if expected is None else expected
+            z.append((found.estimates - expected) / found.deviations)
+        assert 0.6 < np.std(z) < 1.3
+        assert np.all(np.abs(np.mean(z, axis=0)) < 0.7)
+
+
+@pytest.mark.slow
+def test_what_data_do_not_tell_is_named_and_stays():
+    """The second arm hangs still: its inertia is told by nothing."""
+    truth, at = swings()
+    rng = np.random.default_rng(1)
+    q, u, u_dot = (np.array(x) for x in (at.q, at.u, at.u_dot))
+    q[:, 1] = np.pi
+    u[:, 0], u_dot[:, 0] = u[:, 0], u_dot[:, 0]
+    u[:, 1] = u_dot[:, 1] = 0.0
+    torque = {"torque1": rng.normal(0.0, 0.3, len(at))}
+    still = KinematicSamples(at.t, q, u, u_dot, torque)
+    found = base_parameters(truth, still, bodies=ARMS, parameters=FRICTION, sigma={"rate1": 0.01, "rate2": 0.01})
+    assert "not determined by these data" in str(found)
+    assert any("link2.Izz" in text for text in found.undetermined)
+    assert found.estimates[list(found.texts).index("link2.Izz")] == pytest.approx(2e-3 + 0.1 * 0.15**2)
+    assert np.isinf(found.deviations[list(found.texts).index("link2.Izz")])
+
+
+def test_bad_data_are_refused_by_name():
+    truth, at = swings()
+    first = lambda n: KinematicSamples(at.t[:n], at.q[:n], at.u[:n], at.u_dot[:n])  # noqa: E731
+    with pytest.raises(ValueError, match="not how large their errors are"):
+        base_parameters(truth, first(1), bodies=ARMS, parameters=FRICTION)
+    gaps = np.array(at.u_dot)
+    gaps[5:] = np.nan
+    assert len(KinematicSamples(at.t, at.q, at.u, gaps)) == 5
+    with pytest.raises(ValueError, match="no instant at which all numbers are finite"):
+        KinematicSamples(at.t, at.q, at.u, np.nan * at.u_dot)
+    with pytest.raises(ValueError, match=r"`u` \(60,\)"):
+        KinematicSamples(at.t, at.q, at.u[:, 0], at.u_dot)
+    with pytest.raises(ValueError, match="has 2 coordinates and 2 independent speeds; the samples have 1"):
+        base_parameters(truth, KinematicSamples(at.t, at.q[:, :1], at.u, at.u_dot))
+    with pytest.raises(ValueError, match="no input or state named torque3"):
+        base_parameters(truth, KinematicSamples(at.t, at.q, at.u, at.u_dot, {"torque3": 0.0}))
+    with pytest.raises(ValueError, match="look at rate2"):
+        base_parameters(truth, at, sigma={"rate1": 0.1})
+    nothing = np.zeros((60, 2))
+    with pytest.raises(ValueError, match="Nothing moves and nothing acts"):
+        base_parameters(truth, KinematicSamples(at.t, nothing, nothing, nothing), bodies=ARMS)
+    t = np.linspace(0.0, 1.0, 101)
+    with pytest.raises(ValueError, match="angle2 was not measured"):
+        kinematic_samples(truth, Trial(t, {"angle1": t}, sigma=0.1))
+    turns = Trial(t, {"angle1": (30 * t + 1) % (2 * np.pi), "angle2": t}, sigma=0.1)
+    with pytest.raises(ValueError, match=r"angle1 jumps by a whole turn at t = 0\.\d+ s: make it one curve"):
+        kinematic_samples(truth, turns)
+    with pytest.raises(ValueError, match="has 10 samples"):
+        kinematic_samples(truth, Trial(t[:10], {"angle1": t[:10], "angle2": t[:10]}, sigma=0.1))
+    with pytest.raises(ValueError, match="There is no motion"):
+        kinematic_samples(truth, [])
+
+
+class Lagging(Swing):
+    """The torque is that of a motor that lags: a state of the first order."""
+
+    states = ("motor",)
+
+    def loads(self, t, q, u, motion, inputs):
+        return self.weights(motion), jk.Torque(inputs["motor"] * motion.N.z, motion["link1"])
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return [(now["torque1"] - x["motor"]) / 0.1]
+
+
+@pytest.mark.slow
+def test_states_of_the_first_order_act_from_the_right_side():
+    truth, _ = swings()
+    system = Lagging(**{name: getattr(truth, name) for name in FREE if name[0] != "k"})
+    at = random_samples(system, 20)
+    found = base_parameters(Lagging(), at, bodies=ARMS)
+    expected = found.of(regressor(system, 0.0, at.q[0], at.u[0], at.u_dot[0], bodies=ARMS).values)
+    np.testing.assert_allclose(found.estimates, expected, rtol=1e-9)
+    with pytest.raises(ValueError, match="loads may follow motor"):
+        base_parameters(Lagging(), KinematicSamples(at.t, at.q, at.u, at.u_dot))
+
+
+@pytest.mark.slow
+def test_a_simulated_motion_tells_of_the_system_that_made_it():
+    truth, at = swings()
+    torque = {"torque1": lambda t, state: 0.3 * jnp.cos(9 * t)}
+    ride = jk.simulate(truth, jk.State([0.5, -0.4], [1.0, 2.0]), jnp.linspace(0.0, 2.0, 401), inputs=torque)
+    found = base_parameters(Swing(), ride, bodies=ARMS, parameters=FRICTION)
+    i = (0.0, at.q[0], at.u[0], at.u_dot[0])
+    expected = found.of(regressor(truth, *i, bodies=ARMS, parameters=FRICTION).values)
+    np.testing.assert_allclose(found.estimates, expected, rtol=1e-3)
+    with pytest.raises(ValueError, match="A trajectory of 11 times"):
+        kinematic_samples(truth, jax.tree.map(lambda x: x[::40] if x.shape[:1] == (401,) else x, ride))
+
+
+@pytest.mark.slow
+def test_a_closed_loop():
+    """A four-bar linkage tells 8 sums; those of another one with the same lengths, from its motion, exactly."""
+
+    def link(name, parent, position, mass=1.0, y=0.03):
+        at = {"center": (0.2, y, 0), "inertia": (0, 0, 0.02)}
+        return Link(name, parent, hinge(f"q{name}", (0, 0, 1)), position, mass=mass, **at)
+
+    def four_bar(**b):
+        links = [link("a", None, (0, 0, 0)), link("b", "a", (0.4, 0, 0), **b), link("c", "b", (0.9, 0, 0))]
+        sites = [Site("end", "c", (0.6, 0, 0)), Site("ground", None, (0.8, 0, 0))]
+        closed = [Loop("end", "ground")]
+        down = (0, -9.81, 0)
+        return mechanism(links, gravity=down, sites=sites, loops=closed, actuators=[Actuator("tau", "qa")])
+
+    guess, truth = four_bar(), four_bar(mass=1.7, y=0.05)
+    states = random_states(truth, 60)
+    u_dot = jax.jit(jax.vmap(lambda t, q, u, now: jk.accelerations(truth, t, q, u, now)))(
+        *(jnp.asarray(x) for x in (states.t, states.q, states.u)), {"tau": jnp.asarray(states.inputs["tau"])}
+    )
+    found = base_parameters(guess, dataclasses.replace(states, u_dot=u_dot))
+    assert len(found.places) == found.count == 8
+    i = (0.0, states.q[0], states.u[0], states.u_dot[0])
+    np.testing.assert_allclose(found.estimates, found.of(regressor(truth, *i).values), atol=1e-7)
+
+
+@pytest.mark.slow
+def test_a_bicycle_tells_twenty():
+    """Of frame, fork and wheels; the whole mass, the height and place of its centre, and both wheels' spin moments."""
+    found = base_parameters(jk.catalog.WhippleBicycle.benchmark(), parameters="steer_damping")
+    assert len(found.places) == 20
+    assert "rear wheel.m + rear frame.m + fork.m + front wheel.m" in found.texts
+    assert {"rear wheel.Iyy", "front wheel.Iyy", "steer_damping"} <= set(found.texts)

@@ -1,0 +1,185 @@
+"""Accelerations from measurements, and first estimates of bodies by linear least squares."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from swings import FREE, Swing, random_samples, swings
+
+import jaxkane as jk
+from jaxkane.fit import Inertia, Trial, first_estimate, inertia_of, kinematic_samples, regressor
+from jaxkane.fit._diagnostics import describe_bodies
+from jaxkane.fit._kinematics import max_spacing
+from jaxkane.fit._parameters import parameters_of
+from jaxkane.joints import Actuator, Link, hinge, mechanism
+
+
+def test_accelerations_of_noisy_samples():
+    """Of sin 3t with noise: the smoothest spline within sigma. Gaps, and a spacing around them, are left out."""
+    t, rng = np.linspace(0.0, 4.0, 401), np.random.default_rng(0)
+    y = np.sin(3 * t) + 1e-3 * rng.standard_normal(401)
+    y[100:140] = np.nan
+    trial = Trial(t, {"angle1": y, "angle2": np.cos(t)}, {"torque1": t}, sigma=1e-3)
+    assert 0.2 < float(max_spacing(trial, trial.measured)) < 0.6
+    found = kinematic_samples(Swing(), trial, spacing=0.3)
+    inside = (found.t > 0.5) & (found.t < 3.5)
+    assert np.max(np.abs(found.u_dot[inside, 0] + 9 * np.sin(3 * found.t[inside]))) < 0.6  # of 9
+    assert np.max(np.abs(found.u[inside, 0] - 3 * np.cos(3 * found.t[inside]))) < 0.02
+    assert not np.any((found.t > 0.70) & (found.t < 1.69))
+    assert len(found) > 150
+    np.testing.assert_allclose(found.inputs["torque1"], found.t, atol=1e-9)
+    two = kinematic_samples(Swing(), [trial, trial], spacing=0.2)
+    assert set(two.trial) == {0, 1}
+
+
+@pytest.mark.slow
+def test_first_guess_of_a_measured_double_pendulum():
+    """Free swings: ratios of four base parameters of its makers' estimates within 3 %; friction has its sign."""
+    recording = jk.data.multi_arm_pendulum(2)
+    authors = recording.parameters
+    guess = first_estimate(Swing(I2=3e-3), recording.trials[:8], FREE, spacing=0.025)
+    assert guess.ok
+    assert guess.base.ratios_only
+    assert guess.base.count == 5
+    ratios = guess.base.estimates[:4] / guess.base.estimates[0]
+    m1, a1, I1, m2, a2, I2, L1 = (authors[name] for name in ("m1", "a1", "I1", "m2", "a2", "I2", "L1"))
+    expected = np.array([I1 + m1 * a1**2 + m2 * L1**2, m1 * a1 + m2 * L1, I2 + m2 * a2**2, m2 * a2])
+    np.testing.assert_allclose(ratios, expected / expected[0], rtol=0.03)
+    assert guess.system.k1 > 0
+    assert guess.system.k2 > 0
+    assert guess.values["I2"] == guess.system.I2
+    np.testing.assert_allclose(guess.feasible, guess.base.estimates, rtol=1e-3)
+    assert "standard deviations from these" in str(guess)
+
+
+@pytest.mark.slow
+def test_bodies_that_can_be():
+    """Torques that ask for a negative moment of inertia: what is returned has a positive pseudo-inertia."""
+    ball = mechanism(
+        [
+            Link("base", joints=hinge("q0", (1, 0, 0)), mass=1.0, inertia=(0.02, 0.02, 0.02)),
+            Link("bob", "base", hinge("q1", (0, 0, 1)), mass=1.0, center=(0.1, 0.02, 0.03),
+                 inertia=((0.02, 0.001, 0.002), (0.001, 0.025, 0.003), (0.002, 0.003, 0.03))),
+        ],
+        actuators=[Actuator("tau0", "q0"), Actuator("tau1", "q1")],
+    )  # fmt: skip
+    exact = random_samples(ball, 40)
+    body = inertia_of(ball, "bob")
+    assert (body.mass, body.center[0], body.moments[2]) == ("mass.bob", "center.bob.x", "inertia.bob.zz")
+    same = first_estimate(ball, exact, body)
+    assert same.ok
+    assert same.values["inertia.bob.zz"] == pytest.approx(0.03, rel=1e-6)
+    column = jax.jit(jax.vmap(lambda *x: regressor(ball, 0.0, *x, bodies={"bob": "Izz"}).matrix[:, 0]))(
+        *map(jnp.asarray, (exact.q, exact.u, exact.u_dot))
+    )
+    asked = {name: x - 0.06 * column[:, i] for i, (name, x) in enumerate(exact.inputs.items())}
+    guess = first_estimate(ball, dataclasses.replace(exact, inputs=asked), body)
+    assert guess.base.estimates[list(guess.base.texts).index("bob.Izz")] == pytest.approx(0.0404 - 0.06)
+    xx, yy, zz, xy, xz, yz = (guess.values[f"inertia.bob.{ij}"] for ij in ("xx", "yy", "zz", "xy", "xz", "yz"))
+    moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+    assert 0 < moments[0] < moments[2] < moments[0] + moments[1]
+    assert not guess.ok
+    assert guess.distance > 3
+    assert not guess.infeasibility
+    assert "kg, centre at (" in guess.bodies[0]
+    assert f"principal moments {moments[0]:.5g}, {moments[1]:.5g}, {moments[2]:.5g} kg m^2, along (" in str(guess)
+    jk.accelerations(guess.system, 0.0, exact.q[0], exact.u[0])  # which refuses bodies that cannot be
+
+
+@pytest.mark.slow
+def test_a_first_guess_may_start_with_a_centre_at_the_joint():
+    """There the moment of inertia about the joint does not change with it, and elsewhere it does."""
+    truth, at = swings()
+    start = dataclasses.replace(truth, a2=0.0)
+    guess = first_estimate(start, at, ("a2", "k2"))
+    assert guess.values["a2"] == pytest.approx(float(truth.a2), rel=1e-6)
+    assert guess.ok
+
+
+def test_what_a_first_guess_refuses():
+    _, at = swings()
+    for free, said in (
+        ("L1", "L1 changes lengths"),
+        (jk.fit.Gain("torque1"), "gain of torque1"),
+        ("k9", "no parameter"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            first_estimate(Swing(), at, free)
+
+
+def test_inertia_of_a_body_by_its_name():
+    found = inertia_of(jk.catalog.WhippleBicycle.benchmark(), "front wheel", fixed=("mF",))
+    assert found == Inertia(moments=("IFxx", "IFyy", "IFxx"), mass="mF", fixed=("mF",))
+    with pytest.raises(ValueError, match="Ixx, Iyy, Izz of 'link1' are no parameters of their own"):
+        inertia_of(jk.catalog.DoublePendulum(), "link1")
+    with pytest.raises(KeyError, match="link1"):
+        inertia_of(jk.catalog.DoublePendulum(), "link7")
+
+
+def test_what_was_freed_as_an_inertia_is_told_as_a_whole():
+    bicycle = jk.catalog.WhippleBicycle.benchmark()
+    parameters = parameters_of(bicycle, (jk.fit.frame_inertia("H"), "mB", jk.fit.frame_inertia("F", fixed=())))
+    fork, wheel = describe_bodies(parameters, parameters.start * 0.0)
+    xx, zz, xz = (float(getattr(bicycle, name)) for name in ("IHxx", "IHzz", "IHxz"))
+    small, large = np.linalg.eigvalsh([[xx, xz], [xz, zz]])
+    assert f"principal moments {small:.5g}, 0.06, {large:.5g} kg m^2, along (" in fork
+    assert fork.startswith("body of xH, zH, IHxx, IHyy, IHzz, IHxz: centre at (0.9, 0, -0.7) m")
+    assert wheel == "body of mF, IFxx, IFyy: 3 kg, principal moments 0.1405, 0.1405, 0.28 kg m^2"
+
+
+class Driven(jk.System):
+    """A double pendulum with geared motors, as its makers describe it; see `jaxkane.data`."""
+
+    m1: jk.Scalar = jk.parameter(0.5, positive=True)
+    r1: jk.Scalar = jk.parameter(0.2)
+    I1: jk.Scalar = jk.parameter(0.01, positive=True)
+    m2: jk.Scalar = jk.parameter(0.5, positive=True)
+    r2: jk.Scalar = jk.parameter(0.3)
+    I2: jk.Scalar = jk.parameter(0.01, positive=True)
+    Ir: jk.Scalar = jk.parameter(1e-4, positive=True)
+    b1: jk.Scalar = jk.parameter(0.01, positive=True)
+    b2: jk.Scalar = jk.parameter(0.01, positive=True)
+    c1: jk.Scalar = jk.parameter(0.05, positive=True)
+    c2: jk.Scalar = jk.parameter(0.05, positive=True)
+
+    coordinates, speeds, inputs = ("angle1", "angle2"), ("rate1", "rate2"), ("torque1", "torque2")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, q[0], u[0])
+        B = A.rotate(3, q[1], u[1])
+        P = O.fixed(-0.2 * A.y)
+        rotor = (0.0, 0.0, self.Ir)
+        upper = jk.Body(self.m1, (0.0, 0.0, self.I1), O.fixed(-self.r1 * A.y), A, name="upper")
+        lower = jk.Body(self.m2, (0.0, 0.0, self.I2), P.fixed(-self.r2 * B.y), B, name="lower")
+        shoulder = jk.Body(0.0, rotor, O, N, 6 * u[0] * N.z, name="shoulder motor")
+        elbow = jk.Body(0.0, rotor, P, A, (u[0] - 6 * u[1]) * N.z, name="elbow motor")
+        return jk.Motion([upper, lower, shoulder, elbow])
+
+    def loads(self, t, q, u, motion, inputs):
+        upper, lower, k = motion["upper"], motion["lower"], motion.N.z
+        drags = [b * w + c * jnp.arctan(100 * w) for b, c, w in zip((self.b1, self.b2), (self.c1, self.c2), u)]
+        return (
+            jk.weight(motion, -9.81 * motion.N.y),
+            jk.Torque((inputs["torque1"] - drags[0]) * k, upper),
+            jk.Torque((inputs["torque2"] - drags[1]) * k, lower, reaction_on=upper),
+        )
+
+
+@pytest.mark.slow
+def test_first_guess_of_a_driven_double_pendulum():
+    """Nine numbers, with rotors and friction, within a third of what fits by simulation find; the rotors' inertia is
+    small beside the links', and drawn towards zero by noise."""
+    free = ("m1", "r1", "I1", "m2", "r2", "I2", "Ir", "b1", "b2", "c1", "c2")
+    trials = [trial for trial in jk.data.driven_double_pendulum().trials if not trial.name.endswith("sysid_00")]
+    guess = first_estimate(Driven(), trials, free)
+    assert guess.base.count == 9
+    assert guess.distance < 3
+    assert guess.base.unexplained < 0.1
+    # m1r1 0.134, I1 0.0244, m2r2 0.193, m2 0.475, I2 0.0577 about the joints: a fit of ten parameters by others
+    expected = [0.0244 + 0.475 * 0.04, -(0.134 + 0.475 * 0.2), 0.0577, -0.193]
+    np.testing.assert_allclose(guess.base.estimates[:4], expected, rtol=0.33)
+    assert 2e-5 < guess.system.Ir < 2e-4
+    assert all(0.02 < guess.values[name] < 0.1 for name in ("c1", "c2"))
