@@ -115,11 +115,11 @@ class Bicycle(WhippleBicycle):
         """A copy with other parts by the names of the fields, or with other parameters by their names, those of a part
         too: `with_parts(**{"extra[0].mass": 4.0})`."""
         fields = [field.name for field in dataclasses.fields(self)]
-        made = dataclasses.replace(self, **{name: part for name, part in parts.items() if name in fields})
+        changed = dataclasses.replace(self, **{name: part for name, part in parts.items() if name in fields})
         rest = {name: value for name, value in parts.items() if name not in fields}
-        names = [name for name, _, _ in parameters_in(made)]
+        names = [name for name, _, _ in parameters_in(changed)]
         refuse_unknown(rest, [*fields, *names], f"{type(self).__name__} has no field")
-        return with_parameters(made, rest)
+        return with_parameters(changed, rest)
 
     @classmethod
     def from_file(cls, path: str | os.PathLike[str]) -> Self:

@@ -116,10 +116,10 @@ class ScheduledGains(Part):
 
 def _at(passed: list[Component], values: Any) -> Component:
     """x_0 + sum of passed_i (x_i+1 - x_i)."""
-    found = values[0]
+    value = values[0]
     for i, share in enumerate(passed):
-        found = found + share * (values[i + 1] - values[i])
-    return found
+        value = value + share * (values[i + 1] - values[i])
+    return value
 
 
 def _state(name: str, bicycle: Bicycle, q: Any, u: Any, values: Any) -> Component:
@@ -294,10 +294,10 @@ class SequentialLoopRider(Part):
     units = {"desired_roll": "rad", "rider_torque": "N m", "rider_torque_rate": "N m/s"}
 
     @classmethod
-    def benchmark(cls, speed: float, **more: Any) -> Self:
+    def benchmark(cls, speed: float, **fields: Any) -> Self:
         """With the gains for the benchmark bicycle at a speed from 2.5 to 12 m/s, between those that its authors found.
 
-        **Arguments:** `more`: fields of the rider, as `path`.
+        **Arguments:** `fields`: fields of the rider, as `path`.
 
         **Raises:** `ValueError` for a speed outside.
         """
@@ -307,7 +307,7 @@ class SequentialLoopRider(Part):
             known = f"{speeds[0]:g} to {speeds[-1]:g} m/s"
             raise ValueError(f"SequentialLoopRider.benchmark: gains are known from {known}, not at {speed} m/s.")
         gains: list[Any] = [np.interp(speed, speeds, column) for column in columns]
-        return cls(*gains, **more)
+        return cls(*gains, **fields)
 
     def commands(self, bicycle, t, q, u, motion, values):
         return {self.command: values["rider_torque"]}
@@ -323,6 +323,6 @@ class SequentialLoopRider(Part):
     def state_rates(self, bicycle, t, q, u, x, motion, now):
         roll_rate = self.roll * (self.wanted_roll(q, motion, now) - q["roll"])
         steer = self.roll_rate * (roll_rate - u["roll_rate"])
-        asked = self.steer * (steer - q["steer"])
+        commanded = self.steer * (steer - q["steer"])
         torque, slope = now["rider_torque"], now["rider_torque_rate"]
-        return slope, self.frequency**2 * (asked - torque) - 2.0 * self.damping * self.frequency * slope
+        return slope, self.frequency**2 * (commanded - torque) - 2.0 * self.damping * self.frequency * slope

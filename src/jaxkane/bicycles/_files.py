@@ -64,14 +64,14 @@ def read_yaml(path: str | os.PathLike[str]) -> tuple[str, Values]:
             lines[name], values[name] = number, value
     if faults:
         raise ValueError(f"{os.fspath(path)}: " + "; ".join(faults) + ".")
-    return _set_of(os.fspath(path), header.get("parameterization", ""), values), values
+    return _parameterization(os.fspath(path), header.get("parameterization", ""), values), values
 
 
-def _set_of(path: str, given: str, values: Values) -> str:
-    kind = _CALLED.get(given, given) or next((kind for kind, name in _SETS.items() if name in values), "")
+def _parameterization(path: str, name: str, values: Values) -> str:
+    kind = _CALLED.get(name, name) or next((kind for kind, own in _SETS.items() if own in values), "")
     if kind not in _SETS:
-        said = f"the parameterization {given!r}" if given else "no parameterization, and no names of one,"
-        raise ValueError(f"{path}: {said} cannot be read; {hint([given], list(_SETS), 'those that can')}")
+        fault = f"the parameterization {name!r}" if name else "no parameterization, and no names of one,"
+        raise ValueError(f"{path}: {fault} cannot be read; {hint([name], list(_SETS), 'those that can')}")
     return kind
 
 
@@ -81,99 +81,98 @@ def as_meijaard(kind: str, values: Mapping[str, float]) -> tuple[Values, Values 
 
     **Raises:** `ValueError` that names what is missing and what is unknown.
     """
-    found = _Read(kind, values)
-    found.pop("v", 0.0)
-    converted = _CONVERSIONS[kind](found)
-    found.refuse_rest()
+    parameters = _Parameters(kind, values)
+    parameters.pop("v", 0.0)
+    converted = _CONVERSIONS[kind](parameters)
+    parameters.refuse_rest()
     return converted
 
 
-class _Read(dict[str, float]):
-    """Parameters by name that are taken out one by one, so that all that is missing or left over is reported
-    together."""
+class _Parameters(dict[str, float]):
+    """Parameters by name that are popped, so that all that is missing or left over is reported together."""
 
     def __init__(self, kind: str, values: Mapping[str, float]):
         super().__init__(values)
         self.kind = kind
         self.missing: list[str] = []
 
-    def take(self, *names: str) -> list[float]:
+    def pop_values(self, *names: str) -> list[float]:
         self.missing += [name for name in names if name not in self]
         return [self.pop(name, math.nan) for name in names]
 
     def named(self, *names: str) -> Values:
-        return dict(zip(names, self.take(*names), strict=True))
+        return dict(zip(names, self.pop_values(*names), strict=True))
 
     def refuse_rest(self) -> None:
-        faults = [f"missing: {', '.join(self.missing)}"] * bool(self.missing) + [f"unknown: {', '.join(self)}"] * bool(
-            self
-        )
+        names = {"missing": self.missing, "unknown": [*self]}
+        faults = [f"{fault}: {', '.join(wrong)}" for fault, wrong in names.items() if wrong]
         if faults:
             raise ValueError(f"the parameters of {self.kind}: {'; '.join(faults)}.")
 
 
-def _meijaard(p: _Read) -> tuple[Values, None]:
+def _meijaard(p: _Parameters) -> tuple[Values, None]:
     values = dict(p)  # whose names `WhippleBicycle.from_parameters` looks at
     p.clear()
     return values, None
 
 
-def _principal(p: _Read) -> tuple[Values, Values]:
+def _principal(p: _Parameters) -> tuple[Values, Values]:
     """Moore and Hubbard (2019): radii of gyration k about principal axes a and b, a turned by alpha about y."""
-    found = p.named("w", "c", "lam", "g", "rR", "rF", "mR", "mF", "mH", "xH", "zH")
+    parameters = p.named("w", "c", "lam", "g", "rR", "rF", "mR", "mF", "mH", "xH", "zH")
     implied = {}  # what follows from the rest, or is zero by symmetry, and may be written out
     for wheel in "RF":
-        implied[f"k{wheel}bb"], about_axle = p.take(f"k{wheel}aa", f"k{wheel}yy")
-        found[f"I{wheel}xx"] = found[f"m{wheel}"] * implied[f"k{wheel}bb"] ** 2
-        found[f"I{wheel}yy"] = found[f"m{wheel}"] * about_axle**2
-    found |= _named(_of_radii(p, "H", found["mH"]), "IH")
+        implied[f"k{wheel}bb"], about_axle = p.pop_values(f"k{wheel}aa", f"k{wheel}yy")
+        parameters[f"I{wheel}xx"] = parameters[f"m{wheel}"] * implied[f"k{wheel}bb"] ** 2
+        parameters[f"I{wheel}yy"] = parameters[f"m{wheel}"] * about_axle**2
+    parameters |= _named(_of_radii(p, "H", parameters["mH"]), "IH")
     frame = p.named("mD", "xD", "zD")
-    found |= {f"{name[0]}B": value for name, value in frame.items()}
-    found |= _named(_of_radii(p, "D", found["mB"]), "IB")
-    mass, x, z = p.take("mP", "xP", "zP")
+    parameters |= {f"{name[0]}B": value for name, value in frame.items()}
+    parameters |= _named(_of_radii(p, "D", parameters["mB"]), "IB")
+    mass, x, z = p.pop_values("mP", "xP", "zP")
     rider = {"mass": mass, "x": x, "z": z} | _named(_of_radii(p, "P", mass), "I")
-    p.take("lP", "wP")  # length and width of the rider's outline
-    implied |= {"xR": 0.0, "xF": found["w"], "zR": -found["rR"], "zF": -found["rF"], "alphaR": 0.0, "alphaF": 0.0}
-    implied |= dict.fromkeys(("yD", "yF", "yH", "yP", "yR"), 0.0)
+    p.pop_values("lP", "wP")  # length and width of the rider's outline
+    implied |= {"xF": parameters["w"], "zR": -parameters["rR"], "zF": -parameters["rF"]}
+    implied |= dict.fromkeys(("xR", "alphaR", "alphaF", "yD", "yF", "yH", "yP", "yR"), 0.0)
     for name, value in implied.items():
         if abs(p.pop(name, value) - value) > 1e-9 * max(1.0, abs(value)):
             raise ValueError(f"the parameters of {p.kind}: the model has {name} = {value:.6g}.")
-    return found, rider
+    return parameters, rider
 
 
-def _moore(p: _Read) -> tuple[Values, None]:
+def _moore(p: _Parameters) -> tuple[Values, None]:
     """Moore (2012): places and inertias of rear and front frame in axes of which the third is the steer axis."""
-    d1, d2, d3, rR, rF = p.take("d1", "d2", "d3", "rr", "rf")
+    d1, d2, d3, rR, rF = p.pop_values("d1", "d2", "d3", "rr", "rf")
     # The wheels stand on one level: (d1 + d3) sin(lam) - d2 cos(lam) = rF - rR.
     apart = math.hypot(d1 + d3, d2)
     if abs(rF - rR) >= apart:
         raise ValueError(f"the parameters of {p.kind}: the wheels are too near to each other to stand on the ground.")
     lam = math.atan2(d2, d1 + d3) + math.asin((rF - rR) / apart)
-    found = {"lam": lam, "rR": rR, "rF": rF, "g": p.take("g")[0]}
-    found["w"], _ = _level(lam, d1 + d3, d2)
-    found["c"] = (rF * math.sin(lam) - d3) / math.cos(lam)
+    parameters = {"lam": lam, "rR": rR, "rF": rF, "g": p.pop_values("g")[0]}
+    parameters["w"], _ = _level(lam, d1 + d3, d2)
+    parameters["c"] = (rF * math.sin(lam) - d3) / math.cos(lam)
     # C is measured from the rear wheel's centre, E from the front wheel's.
-    frames = (("c", "B", ("l1", "l2"), 0.0, -rR), ("e", "H", ("l3", "l4"), found["w"], -rF))
+    frames = (("c", "B", ("l1", "l2"), 0.0, -rR), ("e", "H", ("l3", "l4"), parameters["w"], -rF))
     for body, letter, along, from_x, from_z in frames:
-        x, z = _level(lam, *p.take(*along))
-        found |= {f"x{letter}": from_x + x, f"z{letter}": from_z + z, f"m{letter}": p.take(f"m{body}")[0]}
-        moments = p.take(*(f"i{body}{axes}" for axes in ("11", "22", "33", "31")))
-        found |= _named(_turned(lam, *moments), f"I{letter}")
+        x, z = _level(lam, *p.pop_values(*along))
+        parameters |= {f"x{letter}": from_x + x, f"z{letter}": from_z + z, f"m{letter}": p.pop_values(f"m{body}")[0]}
+        moments = p.pop_values(*(f"i{body}{axes}" for axes in ("11", "22", "33", "31")))
+        parameters |= _named(_turned(lam, *moments), f"I{letter}")
     for body, letter in (("d", "R"), ("f", "F")):
-        taken = p.take(f"m{body}", f"i{body}11", f"i{body}22")
-        found |= dict(zip((f"m{letter}", f"I{letter}xx", f"I{letter}yy"), taken, strict=True))
-    return found, None
+        wheel = p.pop_values(f"m{body}", f"i{body}11", f"i{body}22")
+        parameters |= dict(zip((f"m{letter}", f"I{letter}xx", f"I{letter}yy"), wheel, strict=True))
+    return parameters, None
 
 
-def _moore_lean(p: _Read) -> tuple[Values, Values]:
+def _moore_lean(p: _Parameters) -> tuple[Values, Values]:
     """The same with an upper body G: its hinge is level, `d4` below the rear wheel's centre; its mass centre is `l5`
     before that centre and `l6` below the hinge."""
-    found, _ = _moore(p)
-    d4, l5, l6 = p.take("d4", "l5", "l6")
-    hinge = d4 - found["rR"]
+    parameters, _ = _moore(p)
+    d4, l5, l6 = p.pop_values("d4", "l5", "l6")
+    hinge = d4 - parameters["rR"]
     rider = {"x": l5, "z": hinge + l6, "hinge_x": 0.0, "hinge_z": hinge}
-    taken = p.take("mg", "ig11", "ig22", "ig33", "ig31", "k9", "c9")
-    return found, rider | dict(zip(("mass", "Ixx", "Iyy", "Izz", "Ixz", "stiffness", "damping"), taken, strict=True))
+    names = ("mass", "Ixx", "Iyy", "Izz", "Ixz", "stiffness", "damping")
+    values = p.pop_values("mg", "ig11", "ig22", "ig33", "ig31", "k9", "c9")
+    return parameters, rider | dict(zip(names, values, strict=True))
 
 
 def _level(lam: float, x: float, z: float) -> tuple[float, float]:
@@ -190,8 +189,8 @@ def _turned(lam: float, Ixx: float, Iyy: float, Izz: float, Ixz: float) -> tuple
     return xx, Iyy, zz, cos * sin * (Izz - Ixx) + (cos * cos - sin * sin) * Ixz
 
 
-def _of_radii(p: _Read, body: str, mass: float) -> tuple[float, float, float, float]:
-    aa, bb, yy, alpha = p.take(f"k{body}aa", f"k{body}bb", f"k{body}yy", f"alpha{body}")
+def _of_radii(p: _Parameters, body: str, mass: float) -> tuple[float, float, float, float]:
+    aa, bb, yy, alpha = p.pop_values(f"k{body}aa", f"k{body}bb", f"k{body}yy", f"alpha{body}")
     return _turned(alpha, mass * aa**2, mass * yy**2, mass * bb**2, 0.0)
 
 

@@ -35,9 +35,9 @@ def browser_jason(stiffness: float = 0.0, damping: float = 0.0) -> Bicycle:
 
     **Arguments:** `stiffness` [N m/rad] and `damping` [N m s/rad] at the rider's hinge, both zero in the source.
     """
-    found, rider = as_meijaard("MooreRiderLean2012", {**_BROWSER_JASON, "k9": stiffness, "c9": damping})
+    parameters, rider = as_meijaard("MooreRiderLean2012", {**_BROWSER_JASON, "k9": stiffness, "c9": damping})
     assert rider is not None  # the set of names holds one
-    return Bicycle.from_parameters({**found, "rider": rider_of(rider)})
+    return Bicycle.from_parameters({**parameters, "rider": rider_of(rider)})
 
 
 def toroidal(rear_crown: float = 0.02, front_crown: float = 0.02) -> Bicycle:

@@ -18,10 +18,10 @@ NAMES = ("coordinates", "speeds", "dependent_speeds", "dependent_coordinates", "
 
 def check_parameters(part: Any) -> None:
     """Refuse numbers that no parameter can be; None stands for one that may be left out by default."""
-    made = {field.name: field.default_factory for field in dataclasses.fields(part)}
+    factories = {field.name: field.default_factory for field in dataclasses.fields(part)}
     infos = parameter_info(part)
     for name in sorted(infos, key=lambda name: getattr(part, name) is not None):  # what is left out is told first
-        default, info = made[name], infos[name]
+        default, info = factories[name], infos[name]
         if getattr(part, name) is None and default is not dataclasses.MISSING and default() is None:
             continue
         check_parameter(f"{type(part).__name__}.{name}", getattr(part, name), info)

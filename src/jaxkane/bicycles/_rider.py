@@ -47,10 +47,10 @@ class Rider(Part):
         return getattr(self, "shoulder", None)
 
     @classmethod
-    def from_file(cls, path: str | os.PathLike[str], **more: Any) -> Self:
+    def from_file(cls, path: str | os.PathLike[str], **parameters: Any) -> Self:
         """A rider whose body is that of a rider's text file of BicycleParameters (`mB = value`, to `IBxz`).
 
-        **Arguments:** `more`: the other parameters, as the hinge of one who leans.
+        **Arguments:** `parameters`: the other parameters, as the hinge of one who leans.
 
         **Raises:** `ValueError` that names the lines that are unknown, repeated or malformed, and what is missing.
         """
@@ -59,7 +59,7 @@ class Rider(Part):
         if missing or abs(values.get("yB", 0.0)) > 1e-3:
             why = f"missing: {', '.join(missing)}" if missing else f"the rider sits aside, yB = {values['yB']:.4g} m"
             raise ValueError(f"{os.fspath(path)}: {why}.")
-        return cls(**{_IN_A_FILE[name]: values[name] for name in _IN_A_FILE}, **more)
+        return cls(**{_IN_A_FILE[name]: values[name] for name in _IN_A_FILE}, **parameters)
 
     @abc.abstractmethod
     def carried(self, bicycle: Any, motion: Any, q: Any, u: Any) -> tuple[Frame, Point, Scalar, Scalar]:
@@ -162,9 +162,9 @@ def separate_rider(bicycle: Any, rider: Rider) -> Any:
     m = bicycle.mB - rider.mass
     x = (bicycle.mB * bicycle.xB - rider.mass * rider.x) / m
     z = (bicycle.mB * bicycle.zB - rider.mass * rider.z) / m
-    left = _about(bicycle.mB, bicycle.xB, bicycle.zB, bicycle.IBxx, bicycle.IByy, bicycle.IBzz, bicycle.IBxz)
-    taken = _about(rider.mass, rider.x, rider.z, rider.Ixx, rider.Iyy, rider.Izz, rider.Ixz)
-    rest = [a - b for a, b in zip(left, taken, strict=True)]  # about the rear contact
+    of_frame = _about(bicycle.mB, bicycle.xB, bicycle.zB, bicycle.IBxx, bicycle.IByy, bicycle.IBzz, bicycle.IBxz)
+    of_rider = _about(rider.mass, rider.x, rider.z, rider.Ixx, rider.Iyy, rider.Izz, rider.Ixz)
+    rest = [a - b for a, b in zip(of_frame, of_rider, strict=True)]  # about the rear contact
     Ixx, Iyy, Izz, Ixz = (a - b for a, b in zip(rest, _about(m, x, z, 0.0, 0.0, 0.0, 0.0), strict=True))
     if is_concrete(bicycle, rider) and not (in_batches(bicycle) or in_batches(rider)):
         if not m > 0:
@@ -192,8 +192,6 @@ _JOINTS = ("shoulder_flexion", "shoulder_rotation", "elbow")
 
 
 class _Arm(NamedTuple):
-    """One arm as it moves: upper arm and forearm, and where they end."""
-
     bodies: tuple[Body, Body]
     elbow: Point
     hand: Point
@@ -256,7 +254,7 @@ class Arms(Part):
             )
         if not is_concrete(self, rider) or in_batches(self) or in_batches(rider):
             return  # members that cannot be have NaN
-        reach, longest = self._reach(rider.right_shoulder), self.upper_length + self.fore_length
+        reach, longest = self.grip - rider.right_shoulder, self.upper_length + self.fore_length
         distance, shortest = jnp.sqrt(reach @ reach), abs(self.upper_length - self.fore_length)
         if not shortest < distance < longest:
             raise ValueError(
@@ -269,30 +267,28 @@ class Arms(Part):
                 "`shoulder` closer to each other across the bicycle, or lengthen the forearm."
             )
 
-    def _reach(self, shoulder: Any) -> Any:
-        return self.grip - shoulder
-
     @classmethod
-    def of_person(cls, mass: float, height: float, grip: Any, **more: Any) -> Self:
+    def of_person(cls, mass: float, height: float, grip: Any, **parameters: Any) -> Self:
         """The arms of a person of this mass [kg] and height [m], by the means of Winter (2009), *Biomechanics and Motor
         Control of Human Movement*, Table 4.1 and Figure 4.1: lengths in parts of the height, masses of the mass.
 
         The hand is counted to the forearm and holds the grip in its middle. About its length a part has a tenth of the
-        moment of inertia across it, which has little effect. `more`: stiffness and damping.
+        moment of inertia across it, which has little effect. `parameters`: stiffness and damping.
         """
         upper, fore, hand = 0.186 * height, 0.146 * height, 0.108 * height
         across = {"upper": 0.028 * mass * (0.322 * upper) ** 2, "fore": 0.022 * mass * (0.468 * fore) ** 2}
         inertia = {f"{name}_inertia": [moment, moment, 0.1 * moment] for name, moment in across.items()}
         lengths = {"upper_length": upper, "fore_length": fore + 0.5 * hand}
         centers = {"upper_center": 0.436 * upper, "fore_center": 0.682 * fore}
-        return cls(grip=grip, upper_mass=0.028 * mass, fore_mass=0.022 * mass, **lengths, **centers, **inertia, **more)
+        masses = {"upper_mass": 0.028 * mass, "fore_mass": 0.022 * mass}
+        return cls(grip=grip, **masses, **lengths, **centers, **inertia, **parameters)
 
     def posture(self, shoulder: Any) -> tuple[Component, Component, Component]:
         """Flexion and rotation of the shoulder, and flexion of the elbow [rad]: from an arm that hangs down to one
         whose hand is at the grip of the upright bicycle. NaN where it does not reach it. `shoulder` (3,) [m]: right.
         """
         upper, fore = self.upper_length, self.fore_length
-        reach = self._reach(shoulder)
+        reach = self.grip - shoulder
         forwards, aside, down = (reach[i] for i in range(3))
         # |reach|^2 = upper^2 + fore^2 + 2 upper fore cos(elbow)
         cos_elbow = (forwards**2 + aside**2 + down**2 - upper**2 - fore**2) / (2.0 * upper * fore)
@@ -323,14 +319,10 @@ class Arms(Part):
         moments = [inertia[i] for i in range(3)]
         return Body(mass, moments, begin.fixed(center * A.z), A, name=f"{side} {name}")
 
-    def _grip(self, bicycle: Any, motion: Any, side: str) -> Point:
-        x, y, z = (self.grip[i] for i in range(3))
-        return bicycle.on_fork(motion, x, _SIDES[side] * y, z)
-
     def motion(self, bicycle, motion, t, q, u):
         bodies, residuals, points = [], [], {}
         for side, arm in self._arms(bicycle, motion, q, u):
-            grip = self._grip(bicycle, motion, side)
+            grip = bicycle.on_fork(motion, self.grip[0], _SIDES[side] * self.grip[1], self.grip[2])
             bodies += arm.bodies
             residuals.append(arm.hand.velocity - grip.velocity)
             points |= {f"{side}_elbow": arm.elbow, f"{side}_hand": arm.hand, f"{side}_grip": grip}
@@ -341,18 +333,18 @@ class Arms(Part):
         return [x for r in apart for x in r.components_in(motion["H"])]
 
     def loads(self, bicycle, t, q, u, motion, values):
-        found = []
+        torques = []
         for side, sign in _SIDES.items():
             upper, fore = motion[f"{side} upper arm"].frame, motion[f"{side} forearm"].frame
             bend = self._torque(f"{side}_elbow", self.elbow_stiffness, self.elbow_damping, q, u)
             bend = add(bend, values[f"{side}_elbow_torque"])
-            found.append(Torque(bend * upper.y, fore, reaction_on=upper))
+            torques.append(Torque(bend * upper.y, fore, reaction_on=upper))
             if self.shoulder_stiffness is not None or self.shoulder_damping is not None:
                 shoulder, law = upper.parent, (self.shoulder_stiffness, self.shoulder_damping, q, u)
                 flex, turn = (self._torque(f"{side}_{joint}", *law) for joint in _JOINTS[:2])
-                found.append(Torque(flex * shoulder.y, shoulder, reaction_on=motion["U"]))
-                found.append(Torque(sign * turn * upper.z, upper, reaction_on=shoulder))
-        return found
+                torques.append(Torque(flex * shoulder.y, shoulder, reaction_on=motion["U"]))
+                torques.append(Torque(sign * turn * upper.z, upper, reaction_on=shoulder))
+        return torques
 
     def _torque(self, name: str, stiffness: Scalar | None, damping: Scalar | None, q: Any, u: Any) -> Component:
         torque: Component = 0.0

@@ -113,14 +113,14 @@ class SteeringMotor(Part):
         return motion.extended([rotor(self.rotor_inertia, head.z, spinning, head, motion["S"], name="steering motor")])
 
     def commands(self, bicycle, t, q, u, motion, values):
-        return {"steer_torque": self._asked(values) if self.lag is None else values["steer_motor_torque"]}
+        return {"steer_torque": self._limited_command(values) if self.lag is None else values["steer_motor_torque"]}
 
-    def _asked(self, values) -> Component:
+    def _limited_command(self, values) -> Component:
         """The command [N m], delayed and limited."""
-        asked = values["steer_command"]
+        command = values["steer_command"]
         if self.delay is not None:
-            asked = values["steer_delayed"] - values["steer_delayed_slope"] / 3.0
-        return asked if self.limit is None else self.limit * jnp.tanh(asked / self.limit)
+            command = values["steer_delayed"] - values["steer_delayed_slope"] / 3.0
+        return command if self.limit is None else self.limit * jnp.tanh(command / self.limit)
 
     def state_rates(self, bicycle, t, q, u, x, motion, now):
         rates = []
@@ -128,7 +128,7 @@ class SteeringMotor(Part):
             w, slope = now["steer_delayed"], now["steer_delayed_slope"]
             rates += [slope / self.delay, (6.0 * (now["steer_command"] - w) - 4.0 * slope) / self.delay]
         if self.lag is not None:
-            rates.append((self._asked(now) - now["steer_motor_torque"]) / self.lag)
+            rates.append((self._limited_command(now) - now["steer_motor_torque"]) / self.lag)
         return rates
 
 

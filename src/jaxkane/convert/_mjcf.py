@@ -7,6 +7,7 @@ import re
 import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Sequence
+from pathlib import Path as FilePath
 from typing import Any
 
 import numpy as np
@@ -63,12 +64,14 @@ def from_urdf(
     other arguments and the errors are those of `from_mjcf`.
     """
     mujoco = _mujoco()
-    text = _text(model)
-    couplings = _mimics(text)
+    text = str(model) if _is_text(model) else FilePath(model).read_text(encoding="utf-8")
+    robot = _robot_of(text)
+    couplings = _mimics(robot)
+    has_friction = any(float(dynamics.get("friction", 0.0)) for dynamics in robot.findall("joint/dynamics"))
     compiled = _compiled(mujoco, _for_mujoco(text, floating))
-    reader = _ModelReader(mujoco, compiled, name or _robot_of(text).get("name"))
+    reader = _ModelReader(mujoco, compiled, name or robot.get("name"))
     reader.gravity = gravity
-    reader.left_out += ["friction of joints"] * _has_friction(text)
+    reader.left_out += ["friction of joints"] * has_friction
     reader.loops += couplings
     return reader.mechanism(strict, dependent)
 
@@ -87,22 +90,16 @@ def _is_text(model: Path) -> bool:
     return isinstance(model, str) and model.lstrip().startswith("<")
 
 
-def _text(model: Path) -> str:
-    if _is_text(model):
-        return str(model)
-    with open(model, encoding="utf-8") as file:
-        return file.read()
-
-
 def _compiled(mujoco: Any, model: Path) -> Any:
-    if not _is_text(model) and not os.path.exists(model):
+    is_text = _is_text(model)
+    if not is_text and not os.path.exists(model):
         raise FileNotFoundError(f"There is no file {os.fspath(model)!r}. The text of a model begins with '<'.")
     try:
-        spec = mujoco.MjSpec.from_string(model) if _is_text(model) else mujoco.MjSpec.from_file(os.fspath(model))
+        spec = mujoco.MjSpec.from_string(model) if is_text else mujoco.MjSpec.from_file(os.fspath(model))
         spec.compiler.fusestatic = False
         return spec.compile()
     except ValueError as error:
-        where = "the text" if _is_text(model) else repr(os.fspath(model))
+        where = "the text" if is_text else repr(os.fspath(model))
         raise ValueError(f"MuJoCo does not read {where}: {error}") from error
 
 
@@ -164,23 +161,19 @@ def _turn_back(inertial: ElementTree.Element) -> None:
     origin.set("rpy", "0 0 0")
 
 
-def _has_friction(text: str) -> bool:
-    return any(float(dynamics.get("friction", 0.0)) for dynamics in _robot_of(text).findall("joint/dynamics"))
-
-
-def _mimics(text: str) -> list[Loop | Coupling]:
-    found: list[Loop | Coupling] = []
-    for joint in _robot_of(text).findall("joint"):
+def _mimics(robot: ElementTree.Element) -> list[Loop | Coupling]:
+    couplings: list[Loop | Coupling] = []
+    for joint in robot.findall("joint"):
         mimic = joint.find("mimic")
         if mimic is not None:
             numbers = float(mimic.get("offset", 0.0)), float(mimic.get("multiplier", 1.0))
             names = [str(x).replace(".", "_") for x in (joint.get("name"), mimic.get("joint"))]
-            found.append(Coupling(names[0], names[1], numbers))
-    return found
+            couplings.append(Coupling(names[0], names[1], numbers))
+    return couplings
 
 
 class _ModelReader:
-    """What a compiled model says, as parts of a mechanism."""
+    """Reads a compiled model into links, sites, actuators and loops of a mechanism, and lists what is left out."""
 
     def __init__(self, mujoco: Any, model: Any, name: str | None):
         self.m, self.kinds = model, mujoco
@@ -214,7 +207,7 @@ class _ModelReader:
                 )
         for i, name in enumerate(names):
             if not name:
-                names[i] = _other(f"{kind}{i}", names, "_")
+                names[i] = _unused_name(f"{kind}{i}", names, "_")
         return names
 
     def mechanism(self, strict: bool, dependent: Sequence[str] | None) -> Mechanism:
@@ -222,14 +215,14 @@ class _ModelReader:
         if not m.nv:
             raise ValueError(f"{self.name}: the file has no joint, so that nothing moves.")
         links = [self._link(i) for i in range(1, m.nbody)]
-        taken = {*self.bodies, *(f"{j} joint" for j in self.joints)}
-        for i, name in enumerate(_others(self._names("site", m.nsite), taken, "_site")):
+        used = {*self.bodies, *(f"{j} joint" for j in self.joints)}
+        for i, name in enumerate(_unused_names(self._names("site", m.nsite), used, "_site")):
             self.sites.append(
                 Site(name, self._carrier(m.site_bodyid[i]), _floats(m.site_pos[i]), _euler(m.site_quat[i]))
             )
-        self._read_equalities({*taken, *(site.name for site in self.sites)})
+        self._read_equalities({*used, *(site.name for site in self.sites)})
         actuators = list(self._actuators())
-        self.left_out += self._not_taken()
+        self.left_out += self._left_out_effects()
         left_out = tuple(dict.fromkeys(self.left_out))
         if left_out:
             listed = "; ".join(left_out)
@@ -297,12 +290,12 @@ class _ModelReader:
 
     def _actuators(self) -> Iterator[Actuator]:
         m, kinds = self.m, self.kinds
-        taken = {*self.joints}
+        used = {*self.joints}
         for j, name in enumerate(self.joints):
             if m.jnt_type[j] in (int(kinds.mjtJoint.mjJNT_HINGE), int(kinds.mjtJoint.mjJNT_SLIDE)):
-                taken.add(f"{name}_rate")
+                used.add(f"{name}_rate")
         names = self._names("actuator", int(m.nu))
-        for i, name in enumerate([] if self._is_off("ACTUATION") else _others(names, taken, "_input")):
+        for i, name in enumerate([] if self._is_off("ACTUATION") else _unused_names(names, used, "_input")):
             group = int(m.actuator_group[i])
             if 0 <= group <= 30 and int(m.opt.disableactuator) >> group & 1:
                 continue
@@ -345,12 +338,12 @@ class _ModelReader:
         affine = m.actuator_biastype[i] == int(kinds.mjtBias.mjBIAS_AFFINE)
         if of_ball and affine and m.actuator_biasprm[i, 1]:
             return "which feeds back the rotation of a ball joint"
-        more = [getattr(m, f"actuator_{what}", None) for what in ("damping", "dampingpoly", "armature", "delay")]
-        if any(x is not None and np.any(x[i]) for x in more):
+        own_terms = [getattr(m, f"actuator_{what}", None) for what in ("damping", "dampingpoly", "armature", "delay")]
+        if any(x is not None and np.any(x[i]) for x in own_terms):
             return "which has damping, armature or delay of its own"
         return ""
 
-    def _read_equalities(self, taken: set[str]) -> None:
+    def _read_equalities(self, used: set[str]) -> None:
         m, kinds = self.m, self.kinds.mjtEq
         for i in range(0 if self._is_off("EQUALITY", "CONSTRAINT") else m.neq):
             kind, data = m.eq_type[i], m.eq_data[i]
@@ -373,8 +366,8 @@ class _ModelReader:
             turned = (_euler(data[6:10]), None) if rigid else (None, None)
             names = []
             for k, (body, place, orientation) in enumerate(zip((first, second), ends, turned, strict=True)):
-                end = _other(f"{name}_{k + 1}", taken, "_end")
-                taken.add(end)
+                end = _unused_name(f"{name}_{k + 1}", used, "_end")
+                used.add(end)
                 names.append(end)
                 self.sites.append(Site(end, self._carrier(body), _floats(place), orientation))
             self.loops.append(Loop(names[0], names[1], rigid))
@@ -389,13 +382,12 @@ class _ModelReader:
         coefficients = polynomial.coef + np.eye(1, len(polynomial.coef))[0] * zero(first)
         return Coupling(self.joints[first], self.joints[second], _floats(coefficients))
 
-    def _not_taken(self) -> Iterator[str]:
-        """What else is in the model and changes its motion."""
+    def _left_out_effects(self) -> Iterator[str]:
         m = self.m
         collides = np.any(m.geom_contype != 0) and np.any(m.geom_conaffinity != 0)
         off = lambda flag: self._is_off(flag, "CONSTRAINT")  # noqa: E731
         has = lambda name: bool(np.any(getattr(m, name, 0)))  # noqa: E731 (older versions lack some)
-        found = {
+        effects = {
             "contacts": (collides or m.npair > 0) and not off("CONTACT"),
             "limits of joints": has("jnt_limited") and not off("LIMIT"),
             "friction of joints": has("dof_frictionloss") and not off("FRICTIONLOSS"),
@@ -409,7 +401,7 @@ class _ModelReader:
             "plugins": m.nplugin > 0,
             "bodies moved by hand (mocap), which rest": m.nmocap > 0,
         }
-        return (what for what, there in found.items() if there)
+        return (effect for effect, is_present in effects.items() if is_present)
 
 
 def _model_name(model: Any) -> str:
@@ -417,15 +409,15 @@ def _model_name(model: Any) -> str:
     return "" if name == "MuJoCo Model" else name  # which is that of a file without one
 
 
-def _other(name: str, taken: Any, ending: str) -> str:
-    while name in taken:
+def _unused_name(name: str, used: Any, ending: str) -> str:
+    while name in used:
         name += ending
     return name
 
 
-def _others(names: Sequence[str], taken: Any, ending: str) -> list[str]:
+def _unused_names(names: Sequence[str], used: Any, ending: str) -> list[str]:
     """The names, those of something else with an ending that makes them names of nothing."""
-    return [_other(name + ending, {*taken, *names}, ending) if name in taken else name for name in names]
+    return [_unused_name(name + ending, {*used, *names}, ending) if name in used else name for name in names]
 
 
 _PLURALS = {"body": "bodies"}

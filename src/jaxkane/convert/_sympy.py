@@ -73,22 +73,22 @@ def from_sympy(
 
 
 def _values(extractor: Extractor, model: ExtractedModel, parameters: Mapping[Any, Any]) -> dict[str, Any]:
-    given = {str(symbol): value for symbol, value in parameters.items()}
+    numbers = {str(symbol): value for symbol, value in parameters.items()}
     names = [str(symbol) for symbol in model.constants]
-    missing = [name for name in names if name not in given]
+    missing = [name for name in names if name not in numbers]
     if missing:
         raise ValueError(f"{model.name}: no value for {', '.join(missing)}: `parameters` gives every symbol a number.")
-    unknown = [name for name in given if name not in names]
+    unknown = [name for name in numbers if name not in names]
     if unknown:
         raise ValueError(f"{model.name} has no symbol {unknown[0]!r}; {hint(unknown[0], names, 'it has')}")
-    taken = [name for name in names if hasattr(SympySystem, name) or "." in name]
-    if taken:
+    reserved = [name for name in names if hasattr(SympySystem, name) or "." in name]
+    if reserved:
         raise ValueError(
-            f"{model.name}: a parameter cannot be called {taken[0]!r}, which a system has, or which holds a dot: give "
-            "the symbol another name, by `subs` before."
+            f"{model.name}: a parameter cannot be called {reserved[0]!r}, which a system has, or which holds a dot: "
+            "give the symbol another name, by `subs` before."
         )
     basic = extractor.sympy.Basic
-    return {name: float(given[name]) if isinstance(given[name], basic) else given[name] for name in names}
+    return {name: float(numbers[name]) if isinstance(numbers[name], basic) else numbers[name] for name in names}
 
 
 class _SympyMotion(Motion):
@@ -239,8 +239,8 @@ def class_of(model: ExtractedModel) -> type[System]:
         "dependent_coordinates": model.q_dep,
         "inputs": names(model.inputs),
     }
-    made: Any = type(SympySystem)(model.name, (SympySystem,), members | of_parameters)  # pyright: ignore
-    return made
+    cls: Any = type(SympySystem)(model.name, (SympySystem,), members | of_parameters)  # pyright: ignore
+    return cls
 
 
 def _cholesky(M: Rows, M_dot: Rows) -> tuple[list[list[Component]], list[list[Component]]]:

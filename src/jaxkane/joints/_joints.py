@@ -320,22 +320,22 @@ def fixed() -> Joint:
     return Joint((), {})
 
 
-def universal(name: str, axes: Any = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), **more: Any) -> Joint:
-    """Two hinges, `name_1` on the carrier and `name_2` on the link, about two axes; `more` as of `hinge`, for both."""
+def universal(name: str, axes: Any = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), **options: Any) -> Joint:
+    """Two hinges, `name_1` on the carrier and `name_2` on the link, about two axes; `options` of `hinge`, for both."""
     if len(axes) != 2:
         raise ValueError(f"A universal joint has two axes, {name!r} {len(axes)}: give several hinges to a link.")
-    return _chain([hinge(f"{name}_{i + 1}", axis, **more) for i, axis in enumerate(axes)])
+    return _chain([hinge(f"{name}_{i + 1}", axis, **options) for i, axis in enumerate(axes)])
 
 
-def planar(name: str, axes: Any = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), **more: Any) -> Joint:
+def planar(name: str, axes: Any = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0)), **options: Any) -> Joint:
     """Two sliders `name_x` and `name_y` along two axes, and a hinge `name_angle` about the normal of their plane.
 
-    `more`, as `damping`, is of all three, in SI units.
+    `options`, as `damping`, is of all three, in SI units.
     """
     first, second = (np.asarray(axis, float) for axis in axes)
     normal = np.cross(first, second)
-    sliders = [slide(f"{name}_{end}", axis, **more) for end, axis in zip("xy", axes, strict=True)]
-    return _chain([*sliders, hinge(f"{name}_angle", normal, **more)])
+    sliders = [slide(f"{name}_{end}", axis, **options) for end, axis in zip("xy", axes, strict=True)]
+    return _chain([*sliders, hinge(f"{name}_angle", normal, **options)])
 
 
 def _chain(joints: Sequence[Joint]) -> Joint:

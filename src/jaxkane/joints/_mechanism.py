@@ -182,13 +182,13 @@ class Mechanism(System):
 
         **Raises:** `ValueError` for a parameter that it has already, or that is no name of Python.
         """
-        given = dict(parameters or {})
-        twice = [name for name in given if hasattr(self, name) or not name.isidentifier()]
+        extra = dict(parameters or {})
+        twice = [name for name in extra if hasattr(self, name) or not name.isidentifier()]
         if twice:
             raise ValueError(f"{type(self).__name__}: {twice[0]!r} cannot be the name of another parameter.")
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         kind: Any = type(self)
-        return _equipped(kind, outputs, tuple(given))(**values, **given)
+        return _equipped(kind, outputs, tuple(extra))(**values, **extra)
 
     def _read(self, name: str) -> Component:
         return getattr(self, name, 0.0)
@@ -418,8 +418,8 @@ def class_of(structure: Structure, fields: tuple[Field, ...]) -> type[Mechanism]
         "inputs": tuple(actuator.name for actuator in structure.actuators),
         "units": units,
     }
-    made: Any = type(Mechanism)(structure.name, (Mechanism,), members | of_parameters)  # pyright: ignore
-    return made
+    cls: Any = type(Mechanism)(structure.name, (Mechanism,), members | of_parameters)  # pyright: ignore
+    return cls
 
 
 @functools.lru_cache(maxsize=1000)

@@ -148,8 +148,8 @@ def motion_family(system: System, values: Any, motion: MotionAt, states: Sequenc
     check_is_system(system)
     if motion is None and isinstance(system, WhippleBicycle):
         is_straight, motion = True, straight_ahead
-        more = len(system.speeds) > len(WhippleBicycle.speeds) or system.states
-        if states is None and not (more and type(system).lateral is LATERAL):  # what else moves, it does not say
+        has_more = len(system.speeds) > len(WhippleBicycle.speeds) or system.states
+        if states is None and not (has_more and type(system).lateral is LATERAL):  # what else moves, it does not say
             states = system.lateral
     if motion is None:
         raise ValueError(

@@ -223,8 +223,8 @@ def as_motion(system, t, q, u, inputs, residual, missing=None, origin=()) -> Ste
     if missing is not None:
         q, u, u_dep, inputs = nan_where(missing, (q, u, u_dep, inputs), origin)
     x = jnp.stack([inputs[k] for k in system.states]) if system.states else jnp.zeros(0, q.dtype)
-    given = {k: value for k, value in inputs.items() if k not in system.states}
-    return SteadyMotion(q, u, u_dep, x, given, t, residual, names_of(system))
+    of_system = {k: value for k, value in inputs.items() if k not in system.states}
+    return SteadyMotion(q, u, u_dep, x, of_system, t, residual, names_of(system))
 
 
 def _no_steady_motion(name: str, equations: SteadyEquations, r: float, slopes: np.ndarray, J: np.ndarray) -> str:
