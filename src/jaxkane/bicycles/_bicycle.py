@@ -219,10 +219,11 @@ class Bicycle(WhippleBicycle):
 
     def q_dot(self, t, q, u):
         turning = [u[f"{name}_rate"] for name in ("roll", "rear_wheel", "steer", "yaw", "pitch", "front_wheel")]
-        rates = self.road.rates(q["x"], q["y"], q["yaw"], *contact_rates(self, q, u))
+        road: Any = self.road
+        rates = road.rates(q["x"], q["y"], q["yaw"], *contact_rates(self, q, u))
         moving = list(rates)
-        if self.road.curved:
-            moving += [*(u[name] for name in _front_speeds(self)), self.road.climbing(q["x"], q["y"], rates)]
+        if road.curved:
+            moving += [*(u[name] for name in _front_speeds(self)), road.climbing(q["x"], q["y"], rates)]
         for part in self.parts:
             moving += as_row(part.q_dot(self, t, q, u), part.coordinates, _method(part, "q_dot"))
         return (*turning, *moving)

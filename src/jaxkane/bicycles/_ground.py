@@ -1,4 +1,4 @@
-"""What a bicycle rides on: the level, a slope, a road given by its height. Knows surfaces; knows no wheel.
+"""What a bicycle rides on: the level, a slope, a road of given height.
 
 The inertial frame N has x and y along the ground and z downwards. On a slope it belongs to the plane of the road, so
 that gravity is tilted; on a road of given height N.z is vertical.
@@ -30,7 +30,7 @@ class Ground(eqx.Module):
     """Level ground, which is the base of all others."""
 
     curved = False
-    """Whether its normal depends on the place. Then the place of the front contact is a coordinate of its own."""
+    """Whether its normal depends on the place, as of a `Road`. Then the place of the front contact is a coordinate."""
 
     def __check_init__(self) -> None:
         check_parameters(self)
@@ -55,31 +55,6 @@ class Ground(eqx.Module):
     def tangent(self, N: Frame, x: Component, y: Component, rates: Callable[[], Pair]) -> Frame:
         """A frame with z square to the ground at a point, its x in a plane with N.x and N.z, as that point moves."""
         return N
-
-    # What follows is asked of a curved road only.
-
-    def at(self, x: Component, y: Component) -> Any:
-        """The height [m]."""
-        raise NotImplementedError
-
-    def climbing(self, x: Component, y: Component, rates: Pair) -> Component:
-        """The rate of the height of a point that moves on the road [m/s]."""
-        raise NotImplementedError
-
-    def velocity(self, N: Frame, x: Component, y: Component, rates: Pair) -> Vector:
-        """Of a point that stays on the road [m/s]."""
-        raise NotImplementedError
-
-    def normal_rate(self, N: Frame, x: Component, y: Component, rates: Pair) -> Vector:
-        """How the normal turns as its point moves [1/s]."""
-        raise NotImplementedError
-
-    def clearance(self, N: Frame, contact: Contact, center: Point, radius: Any, crown: Any) -> Component:
-        """How high a wheel is above the road beside its contact, over what it would be above its tangent plane.
-
-        The least of some places along its tread; not positive where it does not fit.
-        """
-        raise NotImplementedError
 
 
 class Slope(Ground):
@@ -143,14 +118,16 @@ class Road(Ground):
         """The rate of the height of a point that moves on the road [m/s]."""
         return dot(self.slopes(x, y), rates)
 
-    def velocity(self, N, x, y, rates):
+    def velocity(self, N: Frame, x: Component, y: Component, rates: Pair) -> Vector:
+        """Of a point that stays on the road [m/s]."""
         return N.vector(rates[0], rates[1], mul(-1.0, self.climbing(x, y, rates)))
 
     def normal(self, N, x, y):
         a, b = self.slopes(x, y)
         return N.vector(a, b, 1.0).normalize()
 
-    def normal_rate(self, N, x, y, rates):
+    def normal_rate(self, N: Frame, x: Component, y: Component, rates: Pair) -> Vector:
+        """How the normal turns as its point moves [1/s]."""
         (a, b), (a_dot, b_dot) = self.slopes(x, y), self.slope_rates(x, y, rates)
         shrink = 1.0 / jnp.sqrt(a * a + b * b + 1.0)
         n, change = shrink * N.vector(a, b, 1.0), shrink * N.vector(a_dot, b_dot, 0.0)
@@ -172,7 +149,11 @@ class Road(Ground):
         turned = N.rotate(2, jnp.arctan(a), mul(a_dot, 1.0 / s2))
         return turned.rotate(1, -jnp.arctan(b / s), tilt_rate, "tangent")
 
-    def clearance(self, N, contact, center, radius, crown):
+    def clearance(self, N: Frame, contact: Contact, center: Point, radius: Any, crown: Any) -> Component:
+        """How high a wheel is above the road beside its contact, over what it would be above its tangent plane.
+
+        The minimum over some places along its tread; not positive where it does not fit.
+        """
         inner = radius if crown is None else radius - crown
         middle = center.position if crown is None else center.position + crown * contact.normal
         cos, sin = jnp.cos(_LOOK), jnp.sin(_LOOK)

@@ -254,14 +254,15 @@ class Arms(Part):
             )
         if not is_concrete(self, rider) or in_batches(self) or in_batches(rider):
             return  # members that cannot be have NaN
-        reach, longest = self.grip - rider.right_shoulder, self.upper_length + self.fore_length
+        shoulder: Any = rider.right_shoulder
+        reach, longest = self.grip - shoulder, self.upper_length + self.fore_length
         distance, shortest = jnp.sqrt(reach @ reach), abs(self.upper_length - self.fore_length)
         if not shortest < distance < longest:
             raise ValueError(
                 f"Arms: from the shoulder to the grip it is {float(distance):.4g} m, and these arms reach from "
                 f"{float(shortest):.4g} to {float(longest):.4g} m. Change their lengths, the grips or the shoulders."
             )
-        if not np.all(np.isfinite(self.posture(rider.right_shoulder))):
+        if not np.all(np.isfinite(self.posture(shoulder))):
             raise ValueError(
                 "Arms: a hand is too far aside for an elbow that bends forwards: bring `grip` and the rider's "
                 "`shoulder` closer to each other across the bicycle, or lengthen the forearm."

@@ -245,6 +245,6 @@ def _as_family(equations: SteadyEquations, system: System, t, q, inputs, values,
         trim = {k: motion.inputs[k] for k in equations.find if k in motion.inputs}
         return (motion.q, motion.u, motion.u_dep, motion.x), motion.residual, trim
 
-    columns, residual, trim = members(jnp.asarray(zs, q.dtype))
+    (q, u, u_dep, x), residual, trim = members(jnp.asarray(zs, q.dtype))
     inputs = {k: x for k, x in {**inputs, **trim}.items() if k not in system.states}
-    return Family(*columns, jnp.asarray(arc), residual, inputs, t, names_of(system), reason)
+    return Family(q, u, u_dep, x, jnp.asarray(arc), residual, inputs, t, names_of(system), reason)

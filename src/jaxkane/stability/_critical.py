@@ -142,8 +142,8 @@ def critical_speeds(
     none = np.full((), np.nan, values.dtype)
     if not is_concrete(crossings, origin):
         none = nan_where(jnp.array(True), jnp.zeros((), values.dtype), origin)
-    ordered = (jnp.asarray(x[order]) for x in (critical, frequency, direction, column))
-    return CriticalSpeeds(*ordered, jnp.asarray(none), names)
+    critical, frequency, direction, column = (jnp.asarray(x[order]) for x in (critical, frequency, direction, column))
+    return CriticalSpeeds(critical, frequency, direction, column, jnp.asarray(none), names)
 
 
 class _Crossings(NamedTuple):
