@@ -151,7 +151,7 @@ def is_fusable(program: Jaxpr) -> bool:
 
 def unsupported_primitives(program: Jaxpr, is_ours: bool = False) -> Iterator[tuple[str, bool]]:
     """The operations that cannot be part of one compiled function, and whether they are the description's own: the
-    method itself has LAPACK solve what is too large to be written out (`_linear`)."""
+    method itself has LAPACK solve what is too large to be written out (`linear`)."""
     for equation in program.eqns:
         name, inner = equation.primitive.name, opened(equation)
         if inner is not None:

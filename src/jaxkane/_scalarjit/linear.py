@@ -53,7 +53,7 @@ def determinant(A: Rows) -> Component:
     return functools.reduce(mul, factors, float(round(sign)))
 
 
-# By these names `fuse` knows that it is not the description that calls a library.
+# By these names `unsupported_primitives` knows that it is not the description that calls a library.
 
 
 @jax.jit

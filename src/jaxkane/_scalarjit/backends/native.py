@@ -98,8 +98,6 @@ def _verdict() -> str | None:
         return f"LLVM does not work here: {error}"
 
 
-__all__ = ["Scalars", "is_on", "is_wanted", "tell", "use", "why_not"]
-
 Groups = tuple[tuple[int, ...], ...]
 FMOD = "fmod"  # in the C library what is `rem` in JAX
 

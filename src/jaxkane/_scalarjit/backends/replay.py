@@ -26,7 +26,9 @@ class Replay:
         self.program, self.structures = program, structures
         outputs = iter(program.jaxpr.outvars)
         row = iter([x if is_exact(x) else next(outputs) for x in leaves])
-        self.results = {part: [next(row) for _ in range(s.num_leaves)] for part, s in structures.items()}
+        self.results: dict[str, list[Any]] = {
+            part: [next(row) for _ in range(s.num_leaves)] for part, s in structures.items()
+        }
         self.needed = functools.cache(self._needed)  # a cached method would keep the instance alive
 
     def _needed(self, part: str) -> list[Any]:
