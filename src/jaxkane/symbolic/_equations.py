@@ -1,35 +1,38 @@
-"""Equations of motion as formulas of SymPy, in the names that the system declares. Knows formulas and SymPy."""
+"""Equations of motion as formulas of SymPy, in the names that the system declares."""
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from .._kane.formulas import Formulas
-from .._scalarjit.backends.source import as_objects, count_operations, uses
-from .._scalarjit.graph import NotScalarError, needed, reads
+from .._scalarjit.backends.source import count_operations, uses
+from .._scalarjit.graph import needed, reads
 from .._system.system import System
 from ._sympy import (
+    SymbolicModel,
+    Symbols,
     aligned,
-    escaped,
-    exact,
-    fresh_names,
-    given_nodes,
-    imported,
+    expressions_of,
+    fresh_symbols,
+    import_sympy,
     in_latex,
+    matrix_of,
     name_in_latex,
+    symbols_by_name,
     symbols_of,
-    table,
+    too_long,
 )
 
 WHOLE_UP_TO = 3000  # operations of all formulas, each written out wherever it is read
 _SHOWN_UP_TO = 400  # operations that a notebook shows
 
 # Of `Equations`: the function of formulas and its output.
-QUANTITIES = {
+_QUANTITIES = {
     "q_dot": ("coordinate_rates", "q_dot"),
     "configuration_constraints": ("configuration_residuals", "h"),
     "velocity_constraints": ("velocity_residuals", "c"),
@@ -43,7 +46,7 @@ QUANTITIES = {
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
-class Equations:
+class Equations(SymbolicModel):
     """Kane's equations of a system, M u_dot = f, with all that they are made of, as matrices of SymPy.
 
     Attributes:
@@ -63,7 +66,6 @@ class Equations:
     Formulas are those of generic finite numbers: x / x is 1, and 0 x is 0.
     """
 
-    name: str
     q_dot: Any
     velocity_constraints: Any
     configuration_constraints: Any
@@ -73,7 +75,6 @@ class Equations:
     W: tuple[Any, ...]
     M: Any
     f: Any
-    replacements: tuple[tuple[Any, Any], ...]
     t: Any
     q: tuple[Any, ...]
     u: tuple[Any, ...]
@@ -89,19 +90,12 @@ class Equations:
         """All symbols that stand for numbers: time, coordinates, independent speeds, inputs, parameters."""
         return (self.t, *self.q, *self.u, *self.inputs, *self.parameters)
 
-    def cse(self, expressions: Any) -> tuple[list[tuple[Any, Any]], Any]:
-        """`replacements` and the expressions, as the argument `cse` of `sympy.lambdify` takes them:
-
-        lambdify(equations.arguments, [equations.M, equations.f], cse=equations.cse)
-        """
-        return list(self.replacements), expressions
-
     def simplified(self) -> Equations:
         """The same, each formula simplified by `sympy.simplify`: some seconds for textbook systems.
 
         **Raises:** `ValueError` for a system that is too large to be written out.
         """
-        sp = imported()
+        sp = import_sympy()
         if not self.is_whole:
             raise ValueError(
                 f"{self.name}: {self.operations['all']} operations are too many for sympy.simplify, which would write "
@@ -109,29 +103,21 @@ class Equations:
                 "after the other, and what is made of them. equations(system, whole=True) has them written out, which "
                 "for a few hundred operations may take minutes; jaxkane.symbolic.linearize stays smaller."
             )
-        simplified: dict[Any, Any] = {}
-
-        def simpler(x: Any) -> Any:
-            if x not in simplified:
-                simplified[x] = sp.simplify(x)
-            return simplified[x]
-
-        matrix = lambda m: m.applyfunc(simpler)  # noqa: E731
-        changed: dict[str, Any] = {
-            name: tuple(map(matrix, x)) if isinstance(x, tuple) else matrix(x)
-            for name, x in ((name, getattr(self, name)) for name in QUANTITIES)
-        }
-        pairs = tuple((symbol, simpler(x)) for symbol, x in self.replacements)
-        return dataclasses.replace(self, **changed, replacements=pairs)
+        simplify = functools.cache(sp.simplify)
+        matrices: dict[str, Any] = {name: getattr(self, name) for name in _QUANTITIES}
+        for name, m in matrices.items():
+            matrices[name] = tuple(x.applyfunc(simplify) for x in m) if isinstance(m, tuple) else m.applyfunc(simplify)
+        pairs = tuple((symbol, simplify(x)) for symbol, x in self.replacements)
+        return dataclasses.replace(self, **matrices, replacements=pairs)
 
     def __repr__(self) -> str:
-        many = f"{self.operations['all']} operations" + ("" if self.is_whole else f", {len(self.replacements)} named")
-        return f"Equations of {self.name}: M {self.M.shape}, f {self.f.shape}; {many}"
+        size = f"{self.operations['all']} operations" + ("" if self.is_whole else f", {len(self.replacements)} named")
+        return f"Equations of {self.name}: M {self.M.shape}, f {self.f.shape}; {size}"
 
     def _repr_latex_(self) -> str:
-        sp = imported()
+        sp = import_sympy()
         if self.operations["all"] > _SHOWN_UP_TO or not self.is_whole:
-            return f"$\\text{{{escaped(repr(self))}}}$"
+            return too_long(self)
         names = {x: name_in_latex(_word(x)) for x in self.symbols.values() if x.is_Symbol}
         dotted = lambda xs: sp.Matrix([sp.Symbol(name_in_latex(_word(x), 1)) for x in xs])  # noqa: E731
         show = lambda x: in_latex(x, names)  # noqa: E731
@@ -167,46 +153,37 @@ def equations(system: System, *, of_time: bool = False, whole: bool | None = Non
     """
     formulas = Formulas(system)
     symbols = symbols_of(formulas, of_time)
-    # First, so that they stand first among the replacements: others read them by their names.
+    # First, so that they stand first among the replacements: formulas read them by their names.
     u_dep = formulas.nodes("dependent_speeds")["u_dep"] if symbols["u_dep"] else np.zeros(0, np.int64)
     quantities = _quantities(formulas)
     outputs = list(quantities.values())
-    is_whole = _written_out(formulas, outputs, u_dep) <= WHOLE_UP_TO if whole is None else whole
-    writer = _Writer(formulas, symbols, u_dep, outputs, is_whole)
-    matrices: dict[str, Any] = {name: writer.matrices(nodes) for name, nodes in quantities.items()}
+    is_whole = _size_written_out(formulas, outputs, u_dep) <= WHOLE_UP_TO if whole is None else whole
+    replacements, expressions = _expressions(formulas, symbols, u_dep, outputs, is_whole)
+    matrices: dict[str, Any] = {name: matrix_of(nodes, expressions) for name, nodes in quantities.items()}
     operations = {name: count_operations(formulas.graph, [nodes]) for name, nodes in quantities.items()}
     return Equations(
-        formulas.name,
+        name=formulas.name,
         **matrices,
-        replacements=tuple(writer.replacements),
+        replacements=tuple(replacements),
         t=symbols["t"]["t"],
         **{kind: tuple(symbols[kind].values()) for kind in ("q", "u", "u_dep", "inputs", "parameters")},
-        symbols=by_name(symbols),
+        symbols=symbols_by_name(symbols),
         operations={**operations, "all": count_operations(formulas.graph, outputs)},
         is_whole=is_whole,
     )
 
 
-def by_name(symbols: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Symbols by the names that they were declared with; a parameter that shares its name has an underscore more."""
-    symbol_of: dict[str, Any] = {}
-    for kind, of_kind in symbols.items():
-        for name, symbol in of_kind.items():
-            symbol_of[symbol.name if kind == "parameters" else name] = symbol
-    return symbol_of
-
-
 def _quantities(formulas: Formulas) -> dict[str, np.ndarray]:
-    """Nodes by the names of `QUANTITIES`; empty arrays for what a system has not."""
+    """Nodes by the names of `_QUANTITIES`; empty arrays for what a system has not."""
     n, k = len(formulas.system.speeds), len(formulas.system.dependent_speeds)
     empty = {"velocity_constraints": (0,), "J": (0, n), "J_dot": (0, n)}
     return {
         name: np.zeros(empty[name], np.int64) if name in empty and not k else formulas.nodes(function)[output]
-        for name, (function, output) in QUANTITIES.items()
+        for name, (function, output) in _QUANTITIES.items()
     }
 
 
-def _written_out(formulas: Formulas, outputs: list[np.ndarray], named: np.ndarray) -> int:
+def _size_written_out(formulas: Formulas, outputs: list[np.ndarray], named: np.ndarray) -> int:
     """How many operations there are where each is written wherever it is read; those that are named count once."""
     nodes, stops = formulas.graph.nodes, {int(k) for k in named.flat}
     size: dict[int, int] = {}
@@ -215,47 +192,30 @@ def _written_out(formulas: Formulas, outputs: list[np.ndarray], named: np.ndarra
     return sum(size[int(k)] for array in [*outputs, named] for k in array.flat)
 
 
-class _Writer:
-    """Nodes as expressions; dependent speeds, and what is read more than once in a large system, by symbols."""
+def _expressions(
+    formulas: Formulas, symbols: Symbols, u_dep: np.ndarray, outputs: list[np.ndarray], is_whole: bool
+) -> tuple[list[tuple[Any, Any]], dict[int, Any]]:
+    """Replacements, and nodes as expressions: dependent speeds, and what is read more than once unless all is written
+    out, by symbols."""
+    sp = import_sympy()
+    outputs = [*outputs, u_dep]
+    count = uses(formulas.graph, needed(formulas.graph.nodes, outputs), outputs)
+    own = (x.name for of_kind in symbols.values() for x in of_kind.values() if x.is_Symbol)
+    fresh = fresh_symbols([*symbols_by_name(symbols), *own])
+    speeds = dict(zip((int(k) for k in u_dep), symbols["u_dep"].values(), strict=True))
+    replacements: list[tuple[Any, Any]] = []
 
-    def __init__(
-        self,
-        formulas: Formulas,
-        symbols: Mapping[str, Mapping[str, Any]],
-        u_dep: np.ndarray,
-        outputs: list[np.ndarray],
-        is_whole: bool,
-    ):
-        sp = imported()
-        graph = formulas.graph
-        inputs = given_nodes(formulas, symbols)
-        order = needed(graph.nodes, [*outputs, u_dep])
-        count = uses(graph, order, [*outputs, u_dep])
-        names = fresh_names([*by_name(symbols), *(x.name for x in inputs.values() if x.is_Symbol)])
-        speeds = dict(zip((int(k) for k in u_dep), symbols["u_dep"].values(), strict=True))
-        self.replacements: list[tuple[Any, Any]] = []
+    def replaced(k: int, x: Any) -> Any:
+        if k not in speeds and (is_whole or count[k] < 2 or x.is_Atom or isinstance(x, sp.logic.boolalg.Boolean)):
+            return x
+        symbol = speeds[k] if k in speeds else next(fresh)
+        replacements.append((symbol, x))
+        return symbol
 
-        def replaced(k: int, x: Any) -> Any:
-            if k not in speeds and (is_whole or count[k] < 2 or x.is_Atom or isinstance(x, sp.logic.boolalg.Boolean)):
-                return x
-            symbol = speeds[k] if k in speeds else sp.Symbol(next(names), real=True)
-            self.replacements.append((symbol, x))
-            return symbol
-
-        try:
-            self.expressions = as_objects(graph, order, inputs, table(), exact, "SymPy", replaced)
-        except NotScalarError as error:
-            raise ValueError(f"{formulas.name}: its equations hold {error}.") from None
-        # A dependent speed that is a speed, or a number, itself.
-        named = {symbol for symbol, _ in self.replacements}
-        for k, symbol in zip(u_dep, symbols["u_dep"].values(), strict=True):
-            if symbol not in named:
-                self.replacements.append((symbol, self.expressions[int(k)]))
-
-    def matrices(self, nodes: np.ndarray) -> Any:
-        """An array of nodes as a matrix, a column where it has one axis; where it has three, one for each body."""
-        sp = imported()
-        if nodes.ndim == 3:
-            return tuple(self.matrices(x) for x in nodes)
-        rows = nodes.reshape(-1, 1) if nodes.ndim == 1 else nodes
-        return sp.ImmutableMatrix(*rows.shape, [self.expressions[int(k)] for k in rows.flat])
+    expressions = expressions_of(formulas, outputs, symbols, replaced)
+    # A dependent speed that is a speed, or a number, itself.
+    named = {symbol for symbol, _ in replacements}
+    for k, symbol in zip(u_dep, symbols["u_dep"].values(), strict=True):
+        if symbol not in named:
+            replacements.append((symbol, expressions[int(k)]))
+    return replacements, expressions

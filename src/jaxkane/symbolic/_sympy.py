@@ -1,20 +1,27 @@
-"""SymPy as a language of formulas, and formulas as LaTeX. Knows no mechanics."""
+"""Nodes of graphs as expressions of SymPy, and expressions as LaTeX."""
 
 from __future__ import annotations
 
+import dataclasses
 import fractions
 import functools
+import itertools
 import math
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from .._kane.formulas import Formulas
-from .._scalarjit.graph import OPERATORS
+from .._scalarjit.backends.source import as_objects
+from .._scalarjit.graph import OPERATORS, NotScalarError, needed
+
+Symbols = Mapping[str, Mapping[str, Any]]
+"""Symbols, or what is put in their place, by kind ("t", "q", "u", "u_dep", "inputs", "parameters") and name."""
 
 
-def imported() -> Any:
-    """SymPy, which is imported when it is asked for."""
+def import_sympy() -> Any:
     try:
         import sympy
     except ImportError as error:
@@ -27,7 +34,7 @@ def symbols_of(formulas: Formulas, of_time: bool) -> dict[str, dict[str, Any]]:
 
     A parameter that is called like a coordinate, a speed, an input, or the time, gets an underscore behind its name.
     """
-    sp = imported()
+    sp = import_sympy()
     t = sp.Symbol("t", real=True)
     symbols: dict[str, dict[str, Any]] = {"t": {"t": t}}
     reserved = {"t"}
@@ -48,23 +55,65 @@ def symbols_of(formulas: Formulas, of_time: bool) -> dict[str, dict[str, Any]]:
     return symbols
 
 
-def given_nodes(formulas: Formulas, symbols: Mapping[str, Mapping[str, Any]]) -> dict[int, Any]:
-    """The symbols that stand for input nodes."""
+def symbols_by_name(symbols: Symbols) -> dict[str, Any]:
+    """Symbols by their declared names; a parameter that shares its name with a variable has an underscore behind it."""
     return {
+        symbol.name if kind == "parameters" else name: symbol
+        for kind, of_kind in symbols.items()
+        for name, symbol in of_kind.items()
+    }
+
+
+def expressions_of(
+    formulas: Formulas,
+    outputs: Sequence[np.ndarray],
+    symbols: Symbols,
+    replaced: Callable[[int, Any], Any] = lambda k, x: x,
+) -> dict[int, Any]:
+    """Nodes, and all that they read, as expressions; `replaced` may put a symbol in the place of a node's expression.
+
+    **Raises:** `ValueError` for operations that are none of single numbers.
+    """
+    inputs = {
         int(k): symbols[a.kind][element]
         for a, nodes in zip(formulas.arguments, formulas.inputs, strict=True)
         for element, k in zip(a.elements, nodes.flat, strict=True)
     }
+    graph = formulas.graph
+    try:
+        return as_objects(graph, needed(graph.nodes, outputs), inputs, _operations(), exact, "SymPy", replaced)
+    except NotScalarError as error:
+        raise ValueError(f"{formulas.name}: its equations hold {error}.") from None
 
 
-def fresh_names(reserved: Iterable[str]) -> Any:
-    """x0, x1, ... without those that are reserved."""
-    reserved = {*reserved}
-    number = 0
-    while True:
-        if f"x{number}" not in reserved:
-            yield f"x{number}"
-        number += 1
+def matrix_of(nodes: np.ndarray, expressions: Mapping[int, Any]) -> Any:
+    """An array of nodes as a matrix, a column where it has one axis; a tuple of matrices where it has three."""
+    if nodes.ndim == 3:
+        return tuple(matrix_of(x, expressions) for x in nodes)
+    rows = nodes.reshape(-1, 1) if nodes.ndim == 1 else nodes
+    return import_sympy().ImmutableMatrix(*rows.shape, [expressions[int(k)] for k in rows.flat])
+
+
+def fresh_symbols(reserved: Iterable[str]) -> Iterator[Any]:
+    """x0, x1, ... without those whose names are reserved."""
+    names, sp = {*reserved}, import_sympy()
+    return (sp.Symbol(f"x{i}", real=True) for i in itertools.count() if f"x{i}" not in names)
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class SymbolicModel:
+    """Formulas of the system `name`, some of which stand in `replacements`: pairs (symbol, expression)."""
+
+    name: str
+    replacements: tuple[tuple[Any, Any], ...]
+
+    def cse(self, expressions: Any) -> tuple[list[tuple[Any, Any]], Any]:
+        """`replacements` and the expressions, as the argument `cse` of `sympy.lambdify` takes them:
+
+        lambdify(equations.arguments, [equations.M, equations.f], cse=equations.cse)
+        lambdify([*model.symbols.values()], model.A, cse=model.cse)
+        """
+        return list(self.replacements), expressions
 
 
 _LARGEST_DENOMINATOR = 10_000
@@ -72,7 +121,7 @@ _LARGEST_DENOMINATOR = 10_000
 
 def exact(value: float | bool, dtype: str) -> Any:
     """The number of small numerator and denominator, or the multiple of pi, that rounds to a float; else the float."""
-    sp = imported()
+    sp = import_sympy()
     if dtype == "bool":
         return sp.true if value else sp.false
     if not math.isfinite(value):
@@ -81,9 +130,9 @@ def exact(value: float | bool, dtype: str) -> Any:
     if float(ratio) == value:
         return sp.Rational(ratio.numerator, ratio.denominator)
     ratio = fractions.Fraction(value / math.pi).limit_denominator(360)
-    turned = sp.Rational(ratio.numerator, ratio.denominator) * sp.pi
-    if float(turned) == value:
-        return turned
+    multiple = sp.Rational(ratio.numerator, ratio.denominator) * sp.pi
+    if float(multiple) == value:
+        return multiple
     decimal = fractions.Fraction(repr(float(value)))  # 1e-05 as 1/100000
     if decimal.denominator <= 10**12:
         return sp.Rational(decimal.numerator, decimal.denominator)
@@ -91,9 +140,9 @@ def exact(value: float | bool, dtype: str) -> Any:
 
 
 @functools.cache
-def table() -> dict[str, Any]:
+def _operations() -> dict[str, Any]:
     """SymPy's functions for the operations of graphs, for real and finite numbers."""
-    sp = imported()
+    sp = import_sympy()
     # What is divided by zero is in no order with anything; SymPy raises there.
     ordered = lambda f: lambda x, y: sp.false if sp.nan in (x, y) else f(x, y)  # noqa: E731
     own = "sin cos tan asin acos atan atan2 sinh cosh tanh asinh acosh atanh exp log erf sqrt floor".split()
@@ -149,14 +198,18 @@ def name_in_latex(name: str, dots: int = 0) -> str:
     return f"{letter}_{{{index}}}" if index else letter
 
 
+def too_long(model: SymbolicModel) -> str:
+    return f"$\\text{{{escaped(repr(model))}}}$"
+
+
 def escaped(word: str) -> str:
     return re.sub(r"([_#$%&{}])", r"\\\1", word)
 
 
 def in_latex(expression: Any, names: dict[Any, str]) -> str:
-    return imported().latex(expression, symbol_names=names)
+    return import_sympy().latex(expression, symbol_names=names)
 
 
-def aligned(lines: list[tuple[str, str]]) -> str:
+def aligned(lines: Iterable[tuple[str, str]]) -> str:
     """Equations one below the other."""
     return "$\\displaystyle \\begin{aligned}" + r"\\ ".join(f"{a} &= {b}" for a, b in lines) + "\\end{aligned}$"
