@@ -111,10 +111,8 @@ class Comparison:
         units = {n: u for fit in self.fits.values() for n, u in zip(fit.names, fit.parameters.units, strict=True)}
         rows = [["parameter", *self.fits]]
         for name in names:
-            cells = []
-            for fit in self.fits.values():
-                cells.append(f"{fit.estimates[name]:.5g} ({fit.errors[name]:.2g})" if name in fit.names else "")
-            rows.append([f"{name} [{units[name]}]" if units[name] else name, *cells])
+            cell = lambda f, n=name: f"{f.estimates[n]:.5g} ({f.errors[n]:.2g})" if n in f.names else ""  # noqa: E731
+            rows.append([f"{name} [{units[name]}]" if units[name] else name, *map(cell, self.fits.values())])
         return rows
 
     def _sums(self) -> list[list[str]]:
@@ -132,15 +130,14 @@ class Comparison:
 
     def _channels(self, fits: Mapping[str, Fit]) -> list[list[str]]:
         channels = list(dict.fromkeys(c for fit in fits.values() for c in fit.problem.channels))
-        rows = [["channel", *fits]]
-        for channel in channels:
-            cells = []
-            for fit in fits.values():
-                share = fit.variance_accounted_for.get(channel, math.nan)
-                squares = sum(float(np.nansum(r[channel] ** 2)) for r in fit.residuals.values() if channel in r)
-                cells.append(f"{squares:.5g}, {100 * share:.1f} %" if channel in fit.problem.channels else "")
-            rows.append([channel, *cells])
-        return rows
+
+        def cell(fit: Fit, channel: str) -> str:
+            if channel not in fit.problem.channels:
+                return ""
+            squares = sum(float(np.nansum(r[channel] ** 2)) for r in fit.residuals.values() if channel in r)
+            return f"{squares:.5g}, {100 * fit.variance_accounted_for[channel]:.1f} %"
+
+        return [["channel", *fits], *([name, *(cell(fit, name) for fit in fits.values())] for name in channels)]
 
     def _trials(self, fits: Mapping[str, Fit]) -> list[list[str]]:
         trials = list(dict.fromkeys(name for fit in fits.values() for name in (*fit.trial_names, *fit.failed)))

@@ -39,18 +39,14 @@ def trial_names(problem: Problem) -> tuple[str, ...]:
 
 def by_trial(problem: Problem, simulated: np.ndarray) -> ByTrial:
     """Simulated measurements of windows (W, n_c, n_t), joined by trial and channel; NaN where no window is."""
-    joined = {}
-    for k, name in enumerate(trial_names(problem)):
-        trial, joined[name] = problem.trials[k], {}
-        for c, channel in enumerate(problem.channels):
-            if channel not in trial.measured:
-                continue
-            y = np.full(trial.t.shape, np.nan)
-            for i, (owner, first, n) in enumerate(problem.slices):
-                if owner == k:
-                    y[first : first + n] = simulated[i, c, :n]
-            joined[name][channel] = y
-    return joined
+    joined = [
+        {channel: np.full(trial.t.shape, np.nan) for channel in problem.channels if channel in trial.measured}
+        for trial in problem.trials
+    ]
+    for y, (owner, first, n) in zip(simulated, problem.slices, strict=True):
+        for channel, series in joined[owner].items():
+            series[first : first + n] = y[problem.channels.index(channel), :n]
+    return dict(zip(trial_names(problem), joined, strict=True))
 
 
 def variance_accounted_for(measured: Sequence[np.ndarray], fitted: Sequence[np.ndarray]) -> float:
