@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_other_systems import FIGURES, FourBarLinkage, RollingDiscDependent
+from sympy_systems import FIGURES, FourBarLinkage, RollingDiscDependent
 
 import jaxkane as jk
 from jaxkane import constraint_forces, constraint_multipliers

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_other_systems import FourBarLinkage
+from sympy_systems import FourBarLinkage
 
 import jaxkane as jk
 from jaxkane import best_dependent_speeds
