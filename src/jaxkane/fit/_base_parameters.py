@@ -266,7 +266,7 @@ def _structure(
         places=tuple(places),
         matrix=B,
         texts=tuple(_text(names, B[j], place, [f"{abs(x):.4g}" for x in B[j]]) for j, place in enumerate(places)),
-        without_influence=tuple(names[i] for i in np.flatnonzero(~sensitive)),
+        without_influence=tuple(names[i] for i in np.flatnonzero(~sensitive).tolist()),
         ratios_only=bool(np.linalg.norm(tau) <= 1e3 * eps * np.linalg.norm(size)) and bool(places),
         estimates=np.full(b, np.nan),
         deviations=np.full(b, np.nan),
@@ -427,7 +427,7 @@ def estimated(
 
 
 def _least_squares(A: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Singular values (m,), zero where they are rounding errors, a row (m, m) for each, and the least z (m,)."""
+    """Singular values (m,), zero where they are rounding errors, a row (m, m) for each, and the solution z (m,)."""
     m = A.shape[2]
     rows = np.column_stack([A.reshape(-1, m), rest.ravel()])
     R = np.linalg.qr(np.vstack([rows, np.zeros((m + 1, m + 1))]), mode="r")
@@ -437,8 +437,10 @@ def _least_squares(A: np.ndarray, rest: np.ndarray) -> tuple[np.ndarray, np.ndar
     return np.where(known, s, 0.0), V, z
 
 
-def _covariance(A: np.ndarray, residuals: np.ndarray, s: np.ndarray, trial: np.ndarray, given: bool) -> np.ndarray:
-    """Along each direction (m, m), infinite where nothing is known: formal where the deviations are `given` or there
+def _covariance(
+    A: np.ndarray, residuals: np.ndarray, s: np.ndarray, trial: np.ndarray, sigma_known: bool
+) -> np.ndarray:
+    """Along each direction (m, m), infinite where nothing is known: formal where the deviations are known or there
     are few samples; else robust to correlation within blocks, equal stretches of the trials."""
     length, block, first = max(len(trial) // _BLOCKS, 1), np.zeros(len(trial), int), 0
     for one in np.unique(trial):
@@ -447,7 +449,7 @@ def _covariance(A: np.ndarray, residuals: np.ndarray, s: np.ndarray, trial: np.n
         first = block[rows].max() + 1
     known, k = s > 0, int(np.sum(s > 0))
     covariance = np.diag(np.where(known, 0.0, np.inf))
-    if given or len(trial) < 5 * _BLOCKS or first == 1:
+    if sigma_known or len(trial) < 5 * _BLOCKS or first == 1:
         covariance[known, known] = s[known] ** -2.0
         return covariance
     parts = [A[block == g][:, :, known].reshape(-1, k) for g in range(first)]

@@ -32,7 +32,7 @@ class FirstEstimate:
 
     - `system`: with the estimates in it; a fit may begin from it.
     - `values` (p) by name, `starts` (p) from which they came.
-    - `base`: the `BaseParameters` that linear least squares found, with their deviations, and `feasible` (b): those of
+    - `base`: the `BaseParameters` of linear least squares, with their deviations, and `feasible` (b): those of
         `system`, whose bodies can be.
     - `distance`: how far the second are from the first, in standard deviations; where it is above 3 (`ok`), no body has
         what the equations ask for: the model lacks something, or the accelerations are too noisy.
@@ -179,7 +179,7 @@ def _check_linear(spec: RegressorSpec, parameters: Parameters) -> None:
 def _best_estimate(
     spec: RegressorSpec, motions: Motions, sigma: Mapping[str, float] | None, spacing: float | None
 ) -> tuple[BaseParameters, float]:
-    """The estimate with the spacing that leaves least unexplained."""
+    """The estimate with the smallest unexplained part, and its spacing."""
     system, structure, spacings = spec.system, base_structure(spec), [spacing]
     trials = [motion for motion in (motions if isinstance(motions, (list, tuple)) else [motions])
               if isinstance(motion, Trial)]  # fmt: skip

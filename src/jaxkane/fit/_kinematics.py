@@ -48,9 +48,9 @@ def max_spacing(trial: Trial, channels: Mapping[str, np.ndarray]) -> float:
     span = trial.t[-1] - trial.t[0]
     spacing, smallest = span / 2, _MIN_SAMPLES * float(np.median(np.diff(trial.t)))
     for name, y in channels.items():
-        seen = np.isfinite(y)
+        finite = np.isfinite(y)
         while spacing > smallest:
-            residuals = (spline(trial, name, y, spacing)(trial.t[seen]) - y[seen]) / trial.sigma[name][seen]
+            residuals = (spline(trial, name, y, spacing)(trial.t[finite]) - y[finite]) / trial.sigma[name][finite]
             if np.mean(residuals**2) <= 1.0:
                 break
             spacing /= _RATIO
@@ -59,8 +59,8 @@ def max_spacing(trial: Trial, channels: Mapping[str, np.ndarray]) -> float:
 
 def spline(trial: Trial, name: str, y: np.ndarray, spacing: float) -> Any:
     """The spline of least squares with knots of this spacing, without those between which nothing was measured."""
-    seen = np.isfinite(y)
-    t, y = trial.t[seen], y[seen]
+    finite = np.isfinite(y)
+    t, y = trial.t[finite], y[finite]
     if len(t) < 3 * (DEGREE + 1):
         raise ValueError(f"{trial.name}: {name} has {len(t)} samples; accelerations need at least {3 * (DEGREE + 1)}.")
     steps = np.abs(np.diff(y))
@@ -70,7 +70,7 @@ def spline(trial: Trial, name: str, y: np.ndarray, spacing: float) -> Any:
             f"{trial.name}: {name} jumps by a whole turn at t = {t[steps.argmax()]:g} s: make it one curve by "
             "np.unwrap."
         )
-    weights = None if name not in trial.sigma else 1.0 / trial.sigma[name][seen]
+    weights = None if name not in trial.sigma else 1.0 / trial.sigma[name][finite]
     n = max(1, round((t[-1] - t[0]) / spacing))
     inner, last = [], 0
     for knot in np.linspace(t[0], t[-1], n + 1)[1:-1]:
@@ -86,10 +86,10 @@ def covered(t: np.ndarray, channels: Mapping[str, np.ndarray], spacing: float) -
     """Where every channel was measured, and has no end nor a gap of a spacing within a spacing."""
     fine = np.ones(t.shape, bool)
     for y in channels.values():
-        seen = t[np.isfinite(y)]
-        fine &= (t >= seen[0] + spacing) & (t <= seen[-1] - spacing)
-        for i in np.flatnonzero(np.diff(seen) > spacing):
-            fine &= (t <= seen[i] - spacing) | (t >= seen[i + 1] + spacing)
+        times = t[np.isfinite(y)]
+        fine &= (t >= times[0] + spacing) & (t <= times[-1] - spacing)
+        for i in np.flatnonzero(np.diff(times) > spacing):
+            fine &= (t <= times[i] - spacing) | (t >= times[i + 1] + spacing)
     return fine
 
 
