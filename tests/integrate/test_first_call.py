@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._integrate import integrate as ride
+from jaxkane._integrate.integrate import solve
 from jaxkane._integrate.settings import settings_for
 from jaxkane._scalarjit.compat import nothing_is_traced
 from jaxkane._scalarjit.function import ScalarFunction
@@ -130,8 +130,7 @@ def test_the_program_of_a_motion_without_events_is_small():
     state = jk.State(jnp.array([1.0, -0.5]), jnp.array([0.0, 0.3]))
     arguments = (system, state, TS, {}, settings_for(TS))
     moving, fixed = eqx.partition(arguments, eqx.is_array)
-    solve = ride.solve.__wrapped__
-    program = jax.make_jaxpr(lambda x: eqx.filter(solve(*eqx.combine(x, fixed)), eqx.is_array))(moving)
+    program = jax.make_jaxpr(lambda x: eqx.filter(solve.__wrapped__(*eqx.combine(x, fixed)), eqx.is_array))(moving)
     assert equations(program.jaxpr) <= 1380
 
 

@@ -237,9 +237,9 @@ class Limits(eqx.Module):
 
 
 class EventState(NamedTuple):
-    """The state of an `EventController`: that of its `inner` controller; the quantities at the `start` of the step; the
-    `status` of the motion, as a float: `COMPLETED` unless an event or the bound ended it; the end of a step that was
-    rejected for an event, else -infinity; and the end of the first step over the bound, else infinity."""
+    """`inner`: of the inner controller; `start`: the quantities at the start of the step; `status` of the motion, as a
+    float: `COMPLETED` unless an event or the bound ended it; `rejected_end`: the end of a step that an event rejected,
+    else -infinity; `over_bound`: the end of the first step over the bound, else infinity."""
 
     inner: Any
     start: EventValues | None
@@ -252,15 +252,14 @@ class EventController(diffrax.AbstractStepSizeController[Any, Any]):
     """A controller that begins with a given step, and whose last step ends at the last time, or where a quantity
     vanishes. The solution then ends as one with an event.
 
-    The motion is watched through the cubic between both ends of a step: their values and rates. Where that passes zero
-    the step is taken back, and made anew to just beyond that time; so long, until the step that ends there is one that
-    is right by the inner controller's measure. Two crossings within one step are seen where the cubic sees them.
+    A cubic through the values and rates at both ends of a step tells whether an event passes zero. Where it does, the
+    step is rejected and repeated to just beyond that time, until the inner controller accepts a step that ends there.
 
-    A step behind which a quantity is no number is halved; where it is as short as the resolution, the motion ends
-    before it as one whose steps became too small, since whether the quantity passed zero cannot be said.
+    A step behind which a quantity is no number is halved. Where it is as short as the resolution, the motion ends
+    before it as one whose steps became too small: whether the quantity passed zero is unknown.
 
     A step over the bound is halved; where it is as short as the shortest, the motion ends before it. It also ends where
-    the first step over the bound did, if shorter ones do not pass it: so near to it, what is found is by chance.
+    the first step over the bound did, if shorter ones do not pass it: so near to it, the outcome is chance.
 
     `quantities`: (t, y, args) -> `EventValues`; None where there are none.
     """

@@ -138,4 +138,4 @@ def controller_of(
     controller: Any = diffrax.PIDController(settings.rtol, settings.atol, dtmin=times.shortest, force_dtmin=False)
     if discontinuities is not None:
         controller = ClipToDiscontinuities(controller, discontinuities.times, discontinuities.restart, end=times.end)
-    return AdaptiveEventController(controller, may_end, times.first, limits)
+    return AdaptiveEventController(controller, may_end, times.first, limits)  # pyright: ignore[reportCallIssue]
