@@ -98,8 +98,8 @@ class Parameters(eqx.Module):
     def subset(self, places: Sequence[int], x: Float[Array, " p"]) -> Parameters:
         """Those at `places`; all others keep their values at x."""
         at = jnp.asarray(places, dtype=jnp.int32)
-        new = [v[at] for v in (self.start, self.scale, self.prior_mean, self.prior_deviation)]
-        return Parameters(self.all_entries, self.bijections, self.sizes, *new, self.places[at], self._all(x))
+        new = {name: getattr(self, name)[at] for name in ("start", "scale", "prior_mean", "prior_deviation", "places")}
+        return dataclasses.replace(self, **new, rest=self._all(x))
 
     @property
     def entries(self) -> tuple[Entry, ...]:
