@@ -32,10 +32,10 @@ jax.config.update("jax_enable_x64", True)
 def main(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     bicycle = jk.catalog.WhippleBicycle.benchmark()
-    found = jk.stability.eigenvalues(bicycle, jnp.linspace(0.0, 10.0, 201))
-    stable = np.asarray(found.values)[np.asarray(found.stable)]
+    modes = jk.stability.eigenvalues(bicycle, jnp.linspace(0.0, 10.0, 201))
+    stable = np.asarray(modes.values)[np.asarray(modes.stable)]
     speed = 0.5 * (stable[0] + stable[-1])
-    ax = jk.plot.eigenvalues(found)
+    ax = jk.plot.eigenvalues(modes)
     ax.axvline(speed, color="0.5", linestyle="--", linewidth=1.0)
     ax.figure.savefig(folder / "eigenvalues.png", dpi=110)
     print(f"Rights itself from {stable[0]:.2f} to {stable[-1]:.2f} m/s: it rides at {speed:.2f} m/s.")

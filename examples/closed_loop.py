@@ -52,8 +52,8 @@ class CrankRocker(jk.System):
         N, A = jk.inertial()
         frame, pin, bars, points = N, A, [], {}
         lengths = (self.l_crank, self.l_coupler, self.l_rocker)
-        for here, name, l, angle, rate in zip("ABC", self.coordinates, lengths, q, u, strict=True):
-            points[here] = pin
+        for joint, name, l, angle, rate in zip("ABC", self.coordinates, lengths, q, u, strict=True):
+            points[joint] = pin
             frame = frame.rotate(3, angle, rate, name)
             I = self.density * l**3 / 12
             bars.append(jk.Body(self.density * l, (0.0, I, I), pin.fixed(0.5 * l * frame.x), frame, name=name))

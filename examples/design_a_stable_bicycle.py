@@ -94,8 +94,8 @@ def designed(x) -> jk.System:
 
 @jax.jit
 def speeds_of(x):
-    found = critical_speeds(designed(x), SPEEDS)
-    return jnp.stack([found["weave"], found["capsize"]])
+    critical = critical_speeds(designed(x), SPEEDS)
+    return jnp.stack([critical["weave"], critical["capsize"]])
 
 
 @jax.jit

@@ -55,7 +55,7 @@ def torque(coefficients, t):
 
 def errors_by_speed_and_sensors(bicycle, coefficients):
     """Standard error of each parameter, as a part of its value: (speeds, sensors, names)."""
-    found = np.zeros((len(SPEEDS), len(SENSORS), len(NAMES)))
+    deviations = np.zeros((len(SPEEDS), len(SENSORS), len(NAMES)))
     samples = {name: np.asarray(x) for name, x in torque(coefficients, jnp.asarray(TIMES)).items()}
     for i, speed in enumerate(SPEEDS):
         for j, sensors in enumerate(SENSORS.values()):
@@ -69,8 +69,8 @@ def errors_by_speed_and_sensors(bicycle, coefficients):
             plan = Trial(TIMES, {c: np.asarray(ride[c]) for c in SIGMA}, samples, sigma=sigma, initial=wheel)
             seen = identifiability(Problem.of(bicycle, plan, NAMES, simulation=Simulation(step=0.02), **OPTIONS))
             C = np.linalg.pinv(seen.information)
-            found[i, j] = np.sqrt(C.diagonal())
-    return found
+            deviations[i, j] = np.sqrt(C.diagonal())
+    return deviations
 
 
 def main():

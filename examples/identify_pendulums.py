@@ -107,12 +107,12 @@ def fitted(system, recording, free):
     return fit, rms
 
 
-def check(arms, told, fit, rms):
+def check(arms, base, fit, rms):
     """As well explained as elsewhere, and what cannot be told is named. No test fits these swings once more."""
     seen = fit.identifiability
     assert np.median(rms) < MEDIAN[arms] + 0.5e-4
     assert (len(seen.names), seen.rank) == TOLD[arms]
-    assert told.count == seen.rank
+    assert base.count == seen.rank
     assert all(direction.singular_value == 0.0 and len(direction.parts) > 1 for direction in seen.undetermined)
     # With one arm's mass nothing of friction moves: the others' centres and inertias make up for it.
     assert any("viscous" not in direction.text for direction in seen.undetermined)
@@ -122,12 +122,12 @@ def identified(system, recording):
     """With all that is not known; then with what can be told, and zeros and lengths besides."""
     numbers = range(1, len(system.coordinates) + 1)
     bodies = {f"arm{i}": ("m", "my", "Izz") for i in numbers}
-    told = jk.fit.base_parameters(system, bodies=bodies, parameters=[f"viscous{i}" for i in numbers])
-    print(told, "\n")
+    base = jk.fit.base_parameters(system, bodies=bodies, parameters=[f"viscous{i}" for i in numbers])
+    print(base, "\n")
     masses = [f"mass{i}" for i in numbers if i > 1]
     rest = [f"{what}{i}" for what in ("center", "inertia", "viscous") for i in numbers]
     first = fitted(system, recording, [*masses, *rest])
-    check(len(numbers), told, *first)
+    check(len(numbers), base, *first)
     # Masses, and the first mass centre with them, are held where the first fit left them: the others can be told.
     lengths = [name for name in ("length1", "length2") if hasattr(system, name)]
     zeros = [Free(f"zero{i}", scale=0.01) for i in numbers]
@@ -135,9 +135,9 @@ def identified(system, recording):
     return {"as described": first, "zeros, lengths": fitted(first[0].system, recording, [*rest, *lengths, *zeros])}
 
 
-def picture(found, path):
-    figure, axes = plt.subplots(len(found), 2, figsize=(9, 6), width_ratios=[1.6, 1], layout="constrained")
-    for (swing, errors), (title, fits) in zip(axes, found.items(), strict=True):
+def picture(results, path):
+    figure, axes = plt.subplots(len(results), 2, figsize=(9, 6), width_ratios=[1.6, 1], layout="constrained")
+    for (swing, errors), (title, fits) in zip(axes, results.items(), strict=True):
         fit, _ = fits["zeros, lengths"]
         trial, name = fit.problem.trials[0], fit.trial_names[0]
         for k, (channel, angle) in enumerate(trial.measured.items()):
@@ -158,12 +158,12 @@ def picture(found, path):
 def main(folder: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     systems = {"two arms": TwoArms(), "three arms": ThreeArms()}
-    found = {}
+    results = {}
     for arms, (title, system) in enumerate(systems.items(), start=2):
         recording = jk.data.multi_arm_pendulum(arms)
         print(f"{title}: {recording}")
-        found[title] = identified(system, recording)
-    picture(found, folder / "identify_pendulums.png")
+        results[title] = identified(system, recording)
+    picture(results, folder / "identify_pendulums.png")
     print("picture:", folder / "identify_pendulums.png")
 
 

@@ -83,7 +83,7 @@ def main(folder: Path) -> None:
         places = {name: np.asarray(x) for name, x in jk.positions(chain, ride).items()}
         falls[links] = -places[f"end{links}"][:, 1]
         error = jk.audit(chain, ride).energy_balance
-        print(f"{links:3} links: {told(ts, falls[links], chain)}; energy error {error:.0e}")
+        print(f"{links:3} links: {fall_time(ts, falls[links], chain)}; energy error {error:.0e}")
     stone = 0.5 * float(chain.gravity) * np.asarray(ts) ** 2
     print(f"a stone:   after {1e3 * np.sqrt(1.8 * float(chain.length / chain.gravity)):.0f} ms")
 
@@ -93,7 +93,7 @@ def main(folder: Path) -> None:
     print(f"picture: {path}")
 
 
-def told(ts: jax.Array, fallen: np.ndarray, chain: Chain) -> str:
+def fall_time(ts: jax.Array, fallen: np.ndarray, chain: Chain) -> str:
     """When the end has fallen by nine tenths of the chain's length."""
     i = int(np.argmax(fallen > 0.9 * float(chain.length)))  # before it swings back
     return f"after {1e3 * np.interp(0.9 * float(chain.length), fallen[: i + 1], ts[: i + 1]):.0f} ms"

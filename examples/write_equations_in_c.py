@@ -83,9 +83,9 @@ def main(folder: Path) -> None:
     print(subprocess.run([compiled["test"]], check=True, capture_output=True, text=True).stdout)
 
     started = time.perf_counter()
-    said = subprocess.run([compiled["ride"]], check=True, capture_output=True, text=True).stdout
+    printed = subprocess.run([compiled["ride"]], check=True, capture_output=True, text=True).stdout
     seconds = time.perf_counter() - started
-    in_c = np.array([line.split() for line in said.splitlines()], float)  # (101, 2)
+    in_c = np.array([line.split() for line in printed.splitlines()], float)  # (101, 2)
     start = jk.assemble(pendulum, {"theta1": 2.2, "theta2": 2.9})
     ts = jnp.linspace(0.0, DURATION, len(in_c))
     by_library = jk.simulate(pendulum, start, ts, rtol=1e-11, atol=1e-11)
