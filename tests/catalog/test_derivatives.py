@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
-from stability_systems import RodOnPin
+from mechanisms import RodOnPin
 
 import jaxkane as jk
 from jaxkane.catalog import CATALOG

@@ -9,12 +9,12 @@ import shutil
 import subprocess
 import sys
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_native import ODD, OPERATIONS
+from mechanisms import Bob, Odd, Part, case
+from operations import ODD, OPERATIONS
 
 import jaxkane as jk
 from jaxkane._kane.formulas import JACOBIANS, Formulas
@@ -42,79 +42,11 @@ from jaxkane.bicycles import (
     schwalbe_energizer,
     separate_rider,
 )
-from jaxkane.catalog import CATALOG
 from jaxkane.export._source import HELPERS, PYTHON, C, identifiers
 
 CC = shutil.which("cc") or shutil.which("gcc") or shutil.which("clang")
 needs_compiler = pytest.mark.skipif(CC is None, reason="no C compiler")
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror")
-
-
-class Part(eqx.Module):
-    mass: jax.Array = jk.parameter(0.4, positive=True, unit="kg")
-
-
-class Odd(jk.System):
-    """Names that are words of C and of Python, Greek ones, one that stands for two things, one that ends a comment;
-    parameters with axes and in parts; a whole number; branches of which one has no value; an auxiliary speed."""
-
-    register: jk.Scalar = jk.parameter(2.0, positive=True, unit="kg */")
-    angle: jk.Scalar = jk.parameter(0.3)
-    θ0: jk.Scalar = jk.parameter(-0.2)
-    moments: jax.Array = jk.parameter([0.1, 0.2, 0.3], positive=True)
-    part: Part = Part()
-    links: int = eqx.field(static=True, default=2)
-    coordinates = ("angle", "x0")
-    speeds = ("double", "lambda")
-    auxiliary_speeds = ("while",)
-    inputs = ("for", "I")
-    units = {"angle": "rad", "x0": "m"}
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        A = N.rotate(3, q["angle"], u["double"])
-        P = O.moving(q["x0"] * A.x, u["lambda"] * A.x + u["while"] * A.z)
-        return jk.Motion([jk.Body(self.register, tuple(self.moments), P, A), jk.Body(self.part.mass, 0.0, P)])
-
-    def loads(self, t, q, u, motion, inputs):
-        body, x = motion.bodies[0], q["x0"]
-        reach = jnp.where(x > self.θ0, jnp.sqrt(x - self.θ0), 0.0) * self.links
-        clipped = jnp.maximum(u["lambda"], -0.5) + jnp.minimum(x, 0.25) + jnp.clip(self.angle, 0.1, 0.2)
-        ripple = jax.lax.rem(7.0 * x, jnp.asarray(0.3, x.dtype)) + jnp.sign(x) * jnp.abs(x) ** 1.5
-        push = reach + clipped * ripple + jax.nn.softplus(u["double"]) + inputs["I"] * jnp.cos(3.0 * t)
-        return [jk.Force(push * body.frame.x, body), jk.Torque(inputs["for"] * body.frame.z, body)]
-
-
-class Bob(jk.System):
-    """A pendulum in Cartesian coordinates: one dependent coordinate, one dependent speed, no input."""
-
-    length: jk.Scalar = jk.parameter(1.0, positive=True, unit="m")
-    coordinates = ("x", "y")
-    dependent_coordinates = ("y",)
-    speeds = ("vx",)
-    dependent_speeds = ("vy",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        return jk.Motion([jk.Body(2.0, 0.0, O.moving(N.vector(*q, 0.0), N.vector(*u, 0.0)))])
-
-    def configuration_constraints(self, t, q):
-        return [q["x"] ** 2 + q["y"] ** 2 - self.length**2]
-
-    def loads(self, t, q, u, motion, inputs):
-        return jk.weight(motion, -9.81 * motion.N.y)
-
-
-def case(name):
-    """A system with a time, coordinates, speeds and inputs."""
-    if name in CATALOG:
-        entry = CATALOG[name]
-        system, q, u = entry.example(), entry.q, entry.u
-    elif name == "Odd":
-        system, q, u = Odd(), (0.4, 0.35), (0.6, -0.7)
-    else:
-        system, q, u = Bob(), (0.6, -0.8), (0.5,)
-    return system, 0.7, np.array(q), np.array(u), np.linspace(-0.4, 0.9, len(system.inputs))
 
 
 def by_library(system, t, q, u, w, functions):

@@ -4,7 +4,8 @@ import jax.numpy as jnp
 import matplotlib
 import numpy as np
 import pytest
-from test_events import TOP, Bead, Particle
+from mechanisms import Bead
+from test_events import TOP, Particle
 
 import jaxkane as jk
 from jaxkane._integrate.audit import Pieces

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mechanisms import Bead
 from scipy.special import ellipk
 from slopes import differences, slopes
 
@@ -185,31 +186,6 @@ def test_trial_steps_that_are_not_finite():
     assert np.isfinite(numeric)
     for both in (forward, reverse):
         np.testing.assert_allclose(both(v)[0], numeric, rtol=1e-5)
-
-
-class Bead(jk.System):
-    """On a circle of 1 m, without weight: x = sin(w t). Its vertical speed depends on the horizontal one, for
-    a quarter of a turn; there it no longer does. An event ends it before."""
-
-    level: jk.Scalar = jk.parameter(0.3)
-    ends: bool = eqx.field(static=True, default=True)
-    coordinates, speeds, dependent_speeds, inputs = ("x", "y"), ("vx",), ("vy",), ("push",)
-    dependent_coordinates = ("y",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        place, velocity = q["x"] * N.x + q["y"] * N.y, u["vx"] * N.x + u["vy"] * N.y
-        body = jk.Body(1.0, 0.0, O.moving(place, velocity), N)
-        return jk.Motion([body], [q["x"] * u["vx"] + q["y"] * u["vy"]])
-
-    def configuration_constraints(self, t, q):
-        return [q["x"] ** 2 + q["y"] ** 2 - 1.0]
-
-    def loads(self, t, q, u, motion, inputs):
-        return jk.Force(inputs["push"] * motion.N.x, motion.bodies[0])
-
-    def events(self, t, q, u):
-        return {"low": jk.falling(q["y"] - self.level)} if self.ends else {}
 
 
 class Brake(eqx.Module):

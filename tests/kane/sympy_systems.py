@@ -9,6 +9,7 @@ import pathlib
 import jax
 import jax.numpy as jnp
 import numpy as np
+from mechanisms import RollingDisc
 
 import jaxkane as jk
 from jaxkane import Scalar, parameter
@@ -33,33 +34,6 @@ class SpringMassDamper(jk.System):
 
     def loads(self, t, q, u, motion, inputs):
         return jk.Force(-(self.k * q[0] + self.c * u[0]) * motion.N.x, motion["mass"])
-
-
-class RollingDisc(jk.System):
-    """test_kane.test_rolling_disc: a thin disc from its contact point up; speeds in the lean frame L, N.z up."""
-
-    m: Scalar = parameter(positive=True)  # [kg]
-    r: Scalar = parameter(positive=True)  # [m]
-    g: Scalar = parameter()  # [m/s^2]
-
-    coordinates = ("q1", "q2", "q3")  # yaw, lean, spin
-    speeds = ("u1", "u2", "u3")
-
-    def q_dot(self, t, q, u):
-        return u["u3"] / jnp.cos(q["q2"]), u["u1"], u["u2"] - u["u3"] * jnp.tan(q["q2"])
-
-    def motion(self, t, q, u):
-        N, _ = jk.inertial()
-        yaw_rate, lean_rate, spin_rate = self.q_dot(t, q, u)
-        L = N.rotate(3, q["q1"], yaw_rate).rotate(1, q["q2"], lean_rate)
-        R = L.rotate(2, q["q3"], spin_rate)
-        C = jk.Point.at(0.0 * N.x)  # the disc's point in contact; where it is, nothing depends on
-        G = C.fixed(self.r * L.z, R)
-        I = self.m * self.r**2 / 4
-        return jk.Motion([jk.Body(self.m, (I, 2.0 * I, I), G, R, name="disc")])
-
-    def loads(self, t, q, u, motion, inputs):
-        return jk.weight(motion, -self.g * motion.N.z)
 
 
 class RollingDiscDependent(jk.System):

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_events import Bead
+from mechanisms import Bead
 
 import jaxkane as jk
 from jaxkane._kane.checks import _is_possible

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from stability_systems import RodOnPin
+from mechanisms import RodOnPin
 
 import jaxkane as jk
 from jaxkane.stability import critical_speeds, eigenvalues, equilibrium, family, linearize

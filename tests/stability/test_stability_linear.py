@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
-from stability_systems import RodOnPin
+from mechanisms import RodOnPin
 
 import jaxkane as jk
 from jaxkane import stability

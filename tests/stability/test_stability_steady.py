@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from sympy_systems import RollingDisc
+from mechanisms import RollingDisc
 
 import jaxkane as jk
 from jaxkane import Scalar, parameter

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from test_events import Bead
+from mechanisms import Bead
 
 import jaxkane as jk
 from jaxkane.catalog import DoublePendulum

@@ -5,7 +5,7 @@ import types
 
 import numpy as np
 import pytest
-from test_export import Bob, Odd, case
+from mechanisms import Bob, Odd, case
 
 import jaxkane as jk
 from jaxkane.catalog import CATALOG

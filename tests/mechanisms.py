@@ -1,0 +1,154 @@
+"""Systems that tests of several rooms use."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import jaxkane as jk
+from jaxkane import Scalar, parameter
+from jaxkane.catalog import CATALOG
+
+
+class RodOnPin(jk.System):
+    """A point on a rod in x and y, N.x down: x follows from y. SymPy's test_linearize_pendulum_kane_nonminimal."""
+
+    length: Scalar = parameter(positive=True)  # [m]
+    damping: Scalar = parameter(0.0)  # [N s/m]
+
+    coordinates = ("y", "x")
+    speeds = ("v",)
+    dependent_speeds = ("x_dot",)
+    dependent_coordinates = ("x",)
+    inputs = ("push",)
+
+    def configuration_constraints(self, t, q):
+        return (q["x"] ** 2 + q["y"] ** 2 - self.length**2,)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(N.vector(q["x"], q["y"], 0.0), N.vector(u["x_dot"], u["v"], 0.0))
+        return jk.Motion([jk.Body(2.0, 0.0, P, N, name="point")])
+
+    def loads(self, t, q, u, motion, inputs):
+        N = motion.N
+        return jk.weight(motion, 9.8 * N.x), jk.Force((inputs["push"] - self.damping * u["v"]) * N.y, motion["point"])
+
+
+class Bead(jk.System):
+    """On a circle of 1 m, without weight: x = sin(w t). Its vertical speed depends on the horizontal one, for
+    a quarter of a turn; there it no longer does. An event ends it before."""
+
+    level: jk.Scalar = jk.parameter(0.3)
+    ends: bool = eqx.field(static=True, default=True)
+    coordinates, speeds, dependent_speeds, inputs = ("x", "y"), ("vx",), ("vy",), ("push",)
+    dependent_coordinates = ("y",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        place, velocity = q["x"] * N.x + q["y"] * N.y, u["vx"] * N.x + u["vy"] * N.y
+        body = jk.Body(1.0, 0.0, O.moving(place, velocity), N)
+        return jk.Motion([body], [q["x"] * u["vx"] + q["y"] * u["vy"]])
+
+    def configuration_constraints(self, t, q):
+        return [q["x"] ** 2 + q["y"] ** 2 - 1.0]
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force(inputs["push"] * motion.N.x, motion.bodies[0])
+
+    def events(self, t, q, u):
+        return {"low": jk.falling(q["y"] - self.level)} if self.ends else {}
+
+
+class RollingDisc(jk.System):
+    """test_kane.test_rolling_disc: a thin disc from its contact point up; speeds in the lean frame L, N.z up."""
+
+    m: Scalar = parameter(positive=True)  # [kg]
+    r: Scalar = parameter(positive=True)  # [m]
+    g: Scalar = parameter()  # [m/s^2]
+
+    coordinates = ("q1", "q2", "q3")  # yaw, lean, spin
+    speeds = ("u1", "u2", "u3")
+
+    def q_dot(self, t, q, u):
+        return u["u3"] / jnp.cos(q["q2"]), u["u1"], u["u2"] - u["u3"] * jnp.tan(q["q2"])
+
+    def motion(self, t, q, u):
+        N, _ = jk.inertial()
+        yaw_rate, lean_rate, spin_rate = self.q_dot(t, q, u)
+        L = N.rotate(3, q["q1"], yaw_rate).rotate(1, q["q2"], lean_rate)
+        R = L.rotate(2, q["q3"], spin_rate)
+        C = jk.Point.at(0.0 * N.x)  # the disc's point in contact; where it is, nothing depends on
+        G = C.fixed(self.r * L.z, R)
+        I = self.m * self.r**2 / 4
+        return jk.Motion([jk.Body(self.m, (I, 2.0 * I, I), G, R, name="disc")])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -self.g * motion.N.z)
+
+
+class Part(eqx.Module):
+    mass: jax.Array = jk.parameter(0.4, positive=True, unit="kg")
+
+
+class Odd(jk.System):
+    """Names that are words of C and of Python, Greek ones, one that stands for two things, one that ends a comment;
+    parameters with axes and in parts; a whole number; branches of which one has no value; an auxiliary speed."""
+
+    register: jk.Scalar = jk.parameter(2.0, positive=True, unit="kg */")
+    angle: jk.Scalar = jk.parameter(0.3)
+    θ0: jk.Scalar = jk.parameter(-0.2)
+    moments: jax.Array = jk.parameter([0.1, 0.2, 0.3], positive=True)
+    part: Part = Part()
+    links: int = eqx.field(static=True, default=2)
+    coordinates = ("angle", "x0")
+    speeds = ("double", "lambda")
+    auxiliary_speeds = ("while",)
+    inputs = ("for", "I")
+    units = {"angle": "rad", "x0": "m"}
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        A = N.rotate(3, q["angle"], u["double"])
+        P = O.moving(q["x0"] * A.x, u["lambda"] * A.x + u["while"] * A.z)
+        return jk.Motion([jk.Body(self.register, tuple(self.moments), P, A), jk.Body(self.part.mass, 0.0, P)])
+
+    def loads(self, t, q, u, motion, inputs):
+        body, x = motion.bodies[0], q["x0"]
+        reach = jnp.where(x > self.θ0, jnp.sqrt(x - self.θ0), 0.0) * self.links
+        clipped = jnp.maximum(u["lambda"], -0.5) + jnp.minimum(x, 0.25) + jnp.clip(self.angle, 0.1, 0.2)
+        ripple = jax.lax.rem(7.0 * x, jnp.asarray(0.3, x.dtype)) + jnp.sign(x) * jnp.abs(x) ** 1.5
+        push = reach + clipped * ripple + jax.nn.softplus(u["double"]) + inputs["I"] * jnp.cos(3.0 * t)
+        return [jk.Force(push * body.frame.x, body), jk.Torque(inputs["for"] * body.frame.z, body)]
+
+
+class Bob(jk.System):
+    """A pendulum in Cartesian coordinates: one dependent coordinate, one dependent speed, no input."""
+
+    length: jk.Scalar = jk.parameter(1.0, positive=True, unit="m")
+    coordinates = ("x", "y")
+    dependent_coordinates = ("y",)
+    speeds = ("vx",)
+    dependent_speeds = ("vy",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(2.0, 0.0, O.moving(N.vector(*q, 0.0), N.vector(*u, 0.0)))])
+
+    def configuration_constraints(self, t, q):
+        return [q["x"] ** 2 + q["y"] ** 2 - self.length**2]
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+
+
+def case(name):
+    """A system with a time, coordinates, speeds and inputs."""
+    if name in CATALOG:
+        entry = CATALOG[name]
+        system, q, u = entry.example(), entry.q, entry.u
+    elif name == "Odd":
+        system, q, u = Odd(), (0.4, 0.35), (0.6, -0.7)
+    else:
+        system, q, u = Bob(), (0.6, -0.8), (0.5,)
+    return system, 0.7, np.array(q), np.array(u), np.linspace(-0.4, 0.9, len(system.inputs))
