@@ -21,7 +21,7 @@ from PIL import Image
 
 import jaxkane as jk
 from jaxkane._animate._figures import record
-from jaxkane._animate._scene import project, which_way_is_up
+from jaxkane._animate._scene import project, upward_axis
 
 needs_a_browser = pytest.mark.skipif(browser.PROGRAM is None, reason=browser.WHY_NOT)
 NODE = shutil.which("node")
@@ -159,11 +159,11 @@ def test_the_bicycle_stands_on_the_ground_and_is_followed(weaving):
 
 def test_up_is_opposite_to_the_weights(swing):
     forces = np.zeros((5, 2, 3))
-    assert which_way_is_up(forces) == "z"
+    assert upward_axis(forces) == "z"
     forces[:, 0, 1] = -9.81
-    assert which_way_is_up(forces) == "y"
+    assert upward_axis(forces) == "y"
     forces[:, 1, 1] = np.linspace(0.0, 1000.0, 5)  # a force that changes is no weight
-    assert which_way_is_up(forces) == "y"
+    assert upward_axis(forces) == "y"
     assert swing[2].scene.view.elevation == 0.0  # what moves in a plane is seen from the front
 
 

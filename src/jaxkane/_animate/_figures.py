@@ -1,4 +1,4 @@
-"""What is drawn of a system along a motion, and the sketch that users draw with."""
+"""Figures: the sketch that users draw with, bicycles, uniform solids; recorded at every instant of a motion."""
 
 from __future__ import annotations
 
@@ -179,7 +179,7 @@ class Record(eqx.Module):
     forces: Any
     elements: list[Element]
     bodies: tuple[str, ...] = eqx.field(static=True)
-    numbers: tuple[int, ...] = eqx.field(static=True)
+    body_numbers: tuple[int, ...] = eqx.field(static=True)
     point_names: tuple[str, ...] = eqx.field(static=True)
 
 
@@ -195,7 +195,7 @@ def record(system: System, trajectory: Trajectory, figure: Figure | None) -> Rec
     drawing = None if figure is None else _Drawing(weakref.ref(figure), CapturedValues(figure).version)
     t, q, u, u_dep = (np.asarray(x)[reached] for x in (trajectory.t, trajectory.q, trajectory.u, trajectory.u_dep))
     u = np.concatenate([u, u_dep], axis=1)
-    motion = jax.tree.map(np.asarray, _along(numbers, rest, drawing, version_of(system), t, q, u))
+    motion = jax.tree.map(np.asarray, _record_along(numbers, rest, drawing, version_of(system), t, q, u))
     if not motion.bodies:
         raise ValueError(f"animate({name}): no body has a position. Give points their places, see jaxkane.Point.at.")
     return eqx.tree_at(lambda r: (r.mass, r.inertia), motion, (motion.mass[0], motion.inertia[0]))
@@ -209,14 +209,14 @@ class _Drawing(eqx.Module):
 
 
 @functools.partial(jax.jit, static_argnums=(1, 2, 3))
-def _along(numbers, rest, drawing, version, t, q, u):
+def _record_along(numbers, rest, drawing, version, t, q, u):
     # A picture's program runs once or twice: it should compile quickly, which one function for one instant does.
     system = eqx.combine(numbers, rest)
-    return jax.lax.map(lambda now: _instant(system, drawing, *now), (t, q, u))
+    return jax.lax.map(lambda now: _record_at(system, drawing, *now), (t, q, u))
 
 
 @ScalarFunction
-def _instant(system: System, drawing: _Drawing | None, t, q, u) -> Any:
+def _record_at(system: System, drawing: _Drawing | None, t, q, u) -> Any:
     figure = None if drawing is None else drawing.figure()
     motion = system.motion(t, q, u)
     N, dtype = motion.N, q.dtype
@@ -256,7 +256,7 @@ def _instant(system: System, drawing: _Drawing | None, t, q, u) -> Any:
         forces=table([row(force) for force in forces], 3),
         elements=sketch.elements,
         bodies=tuple(b.name for b in bodies),
-        numbers=tuple(placed),
+        body_numbers=tuple(placed),
         point_names=tuple(points),
     )
 
@@ -375,22 +375,22 @@ def _solid(build: Builder, body: int, color: str, inertia: np.ndarray) -> None:
     largest = moments.max()
     if np.sqrt(largest) <= build.tolerance:
         return
-    odd = [k for k in range(3) if abs(moments[k - 1] - moments[k - 2]) <= 1e-6 * largest]
+    axial = [k for k in range(3) if abs(moments[k - 1] - moments[k - 2]) <= 1e-6 * largest]
     to_body = lambda x: np.asarray(x) @ axes.T  # noqa: E731
 
     def add(x, **style):
         build.local(to_body(x), body)
         build.shape(style.pop("kind", "line"), color, len(x), **style)
 
-    if len(odd) == 3:
+    if len(axial) == 3:
         radius = np.sqrt(2.5 * largest)
         for k in range(3):
             add(np.roll(_ring(radius, 0.0), k, axis=1), closed=True, fill=0.06)
-    elif odd:
-        k = odd[0]
+    elif axial:
+        k = axial[0]
         radius = np.sqrt(2.0 * moments[k])
         half = 0.5 * np.sqrt(max(12.0 * (moments[k - 1] - radius**2 / 4.0), 0.0))
-        turn = lambda x: np.roll(x, k + 1, axis=1)  # the third axis of a ring becomes the odd one  # noqa: E731
+        turn = lambda x: np.roll(x, k + 1, axis=1)  # the third axis of a ring becomes the axial one  # noqa: E731
         if radius < 0.02 * half:
             add(turn(np.array([[0.0, 0.0, -half], [0.0, 0.0, half]])), width=4.0)
             return
@@ -428,16 +428,16 @@ def _links(motion: Record, build: Builder) -> bool:
         old, new = group[j], group[i]
         group[:] = [new if g == old else g for g in group]
 
-    apart = {(i, j): points[:, j] - points[:, i] for i in range(n) for j in range(i + 1, n)}
+    separation = {(i, j): points[:, j] - points[:, i] for i in range(n) for j in range(i + 1, n)}
     still = np.ptp(points, axis=0).max(axis=1) <= build.tolerance
-    length = {pair: np.linalg.norm(r, axis=1).max() for pair, r in apart.items()}
-    for i, j in sorted(apart, key=lambda pair: length[pair]):
+    length = {pair: np.linalg.norm(r, axis=1).max() for pair, r in separation.items()}
+    for i, j in sorted(separation, key=lambda pair: length[pair]):
         if group[i] == group[j] or (still[i] and still[j]):
             continue
-        seen = [np.einsum("tji,tj->ti", R, apart[i, j]) for R in frames]
+        in_frames = [np.einsum("tji,tj->ti", R, separation[i, j]) for R in frames]
         if length[i, j] <= build.tolerance:
             join(i, j)
-        elif any(np.ptp(r, axis=0).max() <= build.tolerance for r in seen):
+        elif any(np.ptp(r, axis=0).max() <= build.tolerance for r in in_frames):
             join(i, j)
             build.moving(points[:, [i, j]])
             build.shape("line", "grey", 2, width=2.0)

@@ -1,4 +1,4 @@
-"""A motion as rigid parts that move, and from where it is seen. Knows numbers; knows no system and no page."""
+"""A scene: rigid parts that move, mesh vertices that they own, and a camera. Knows no system and no page."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ UPRIGHT = {
 """By the axis of N that is up: components in N -> on the page, where z is up."""
 
 
-def which_way_is_up(forces: np.ndarray) -> str:
+def upward_axis(forces: np.ndarray) -> str:
     """The axis of N that is nearest to the opposite of gravity: of the constant forces (n_t, l, 3) on mass centres."""
     constant = np.ptp(forces, axis=0).max(axis=1, initial=0.0) <= 1e-9 * (np.abs(forces).max(initial=0.0) + 1e-300)
     down = forces[0, constant].sum(axis=0)
@@ -68,8 +68,8 @@ def view_of(x: np.ndarray, moves: np.ndarray, center_of_mass: np.ndarray, follow
     low, high = x.min(axis=(0, 1)), x.max(axis=(0, 1))
     center = 0.5 * (low + high)
     reach = float(np.linalg.norm(x - center, axis=-1).max())
-    carried = x[:, moves] if moves.any() else x
-    size = float(np.linalg.norm(carried - center_of_mass[:, None], axis=-1).max())
+    vertices_of_parts = x[:, moves] if moves.any() else x
+    size = float(np.linalg.norm(vertices_of_parts - center_of_mass[:, None], axis=-1).max())
     travel = float(np.linalg.norm(np.ptp(center_of_mass, axis=0)))
     if follow is None:
         follow = travel > 4.0 * size
@@ -145,11 +145,11 @@ class Scene:
         center_of_mass = (1.0 - s[:, 0]) * self.center_of_mass[i] + s[:, 0] * self.center_of_mass[i + 1]
         x = np.broadcast_to(self.vertex, (len(t), *self.vertex.shape)).copy()
         for k in range(self.position.shape[1]):
-            mine = self.owner == k
-            if k < self.rotation.shape[1] and mine.any():
+            own = self.owner == k
+            if k < self.rotation.shape[1] and own.any():
                 R = Slerp(self.t, Rotation.from_quat(self.rotation[:, k]))(t).as_matrix()
-                x[:, mine] = np.einsum("nij,vj->nvi", R, self.vertex[mine])
-            x[:, mine] += position[:, k, None]
+                x[:, own] = np.einsum("nij,vj->nvi", R, self.vertex[own])
+            x[:, own] += position[:, k, None]
         return x, center_of_mass
 
 
@@ -180,8 +180,7 @@ class Builder:
 
     def local(self, vertices: np.ndarray, body: int) -> None:
         """Vertices (n, 3) that are fixed in a body, and turn with it."""
-        for x in vertices:
-            self._keep(x, "part", self.turned[body])
+        self._add_vertices(vertices, "part", self.turned[body])
 
     def moving(self, x: np.ndarray, body: int | None = None) -> None:
         """Vertices (F, n, 3) in N, kept in the part in which they do not move.
@@ -189,20 +188,18 @@ class Builder:
         `body` says which part they are to turn with; they are given as if it did not spin.
         """
         if body is not None:
-            self.local(self._seen_from(self.rotations[body], self.origins[body], x).mean(axis=0), body)
+            self.local(self._components(self.rotations[body], self.origins[body], x).mean(axis=0), body)
             return
         if np.abs(x - x[:1]).max() <= self.tolerance:
-            for vertex in x.mean(axis=0):
-                self._keep(vertex, "fixed", FIXED)
+            self._add_vertices(x.mean(axis=0), "fixed", FIXED)
             return
         for k, (R, origin) in enumerate(zip(self.rotations, self.origins, strict=True)):
-            seen = self._seen_from(R, origin, x)
-            if np.abs(seen - seen[:1]).max() <= self.tolerance:
-                for vertex in seen.mean(axis=0):
-                    self._keep(vertex, "part", k)
+            local = self._components(R, origin, x)
+            if np.abs(local - local[:1]).max() <= self.tolerance:
+                self._add_vertices(local.mean(axis=0), "part", k)
                 return
         if x.shape[1] == 1:
-            self._keep(np.zeros(3), "path", self._path(x[:, 0]))
+            self._add_vertices(np.zeros((1, 3)), "path", self._path(x[:, 0]))
         elif not self._turn_about_the_first(x):
             for i in range(x.shape[1]):
                 self.moving(x[:, i : i + 1])
@@ -211,29 +208,28 @@ class Builder:
         """Whether all vertices are fixed in a frame that turns as one of the bodies, or not at all, about the first."""
         still = np.broadcast_to(np.eye(3), (self.n_t, 3, 3))
         for R in (still, *self.rotations[: self.n_b]):
-            seen = self._seen_from(R, x[:, 0], x)
-            if np.abs(seen - seen[:1]).max() <= self.tolerance:
+            local = self._components(R, x[:, 0], x)
+            if np.abs(local - local[:1]).max() <= self.tolerance:
                 self.rotations.append(R)
                 self.origins.append(x[:, 0])
-                for vertex in seen.mean(axis=0):
-                    self._keep(vertex, "part", len(self.rotations) - 1)
+                self._add_vertices(local.mean(axis=0), "part", len(self.rotations) - 1)
                 return True
         return False
 
     @staticmethod
-    def _seen_from(R: np.ndarray, origin: np.ndarray, x: np.ndarray) -> np.ndarray:
+    def _components(R: np.ndarray, origin: np.ndarray, x: np.ndarray) -> np.ndarray:
         return np.einsum("tji,tnj->tni", R, x - origin[:, None])
 
     def _path(self, x: np.ndarray) -> int:
-        for k, known in enumerate(self.paths):
-            if np.abs(known - x).max() <= self.tolerance:
+        for k, path in enumerate(self.paths):
+            if np.abs(path - x).max() <= self.tolerance:
                 return k
         self.paths.append(x)
         return len(self.paths) - 1
 
-    def _keep(self, vertex: np.ndarray, kind: str, number: int) -> None:
-        self.vertices.append(np.asarray(vertex, dtype=float))
-        self.owners.append((kind, number))
+    def _add_vertices(self, vertices: np.ndarray, kind: str, number: int) -> None:
+        self.vertices.extend(np.asarray(vertices, dtype=float))
+        self.owners.extend([(kind, number)] * len(vertices))
 
     def arrays(self, upright: np.ndarray) -> dict[str, np.ndarray]:
         """Arrays of a `Scene`, turned by `upright` (3, 3), parts that own nothing left out."""

@@ -1,4 +1,4 @@
-"""The recordings, one function each. Knows columns, units and whose the data are; knows no system.
+"""Measured data sets, one function each, with their units and their licences.
 
 Channels have the names that a description will give its coordinates and speeds, so that a trial can be fitted as it is.
 Each function takes `file`: a CSV file with the same columns, plain or compressed by gzip, in the place of the one that

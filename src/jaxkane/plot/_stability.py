@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from .._common.lookup import as_names, label_of, refuse_unknown
-from ._trajectories import SOFT, STABLE, finish, one
+from ._trajectories import SOFT, STABLE, finish, panels
 
 
 def mode_shapes(
@@ -40,8 +40,6 @@ def mode_shapes(
 
     **Returns:** the axes (n_drawn,).
     """
-    import matplotlib.pyplot as plt
-
     lam, X, labels, names, where = _one_point(eigenvalues, vectors, states, at, modes)
     chosen = labels if only is None else as_names(only)
     refuse_unknown(chosen, labels, "mode_shapes: there is no state")
@@ -49,18 +47,7 @@ def mode_shapes(
     drawn = [k for k in range(len(lam)) if lam[k].imag >= -1e-9 * abs(lam[k])]
     if not np.all(np.isfinite(lam)):
         raise ValueError("mode_shapes: the eigenvalues are not finite here: there is no steady motion, and no mode.")
-    if axes is None:
-        axes = plt.subplots(
-            1,
-            len(drawn),
-            subplot_kw={"projection": "polar"},
-            figsize=(3.1 * len(drawn), 3.6),
-            squeeze=False,
-            layout="constrained",
-        )[1]
-    axes = np.ravel(axes)
-    if len(axes) != len(drawn):
-        raise ValueError(f"mode_shapes: {len(drawn)} polar axes are needed, got {len(axes)}.")
+    axes = panels(axes, 1, len(drawn), size=(3.1, 3.6), subplot_kw={"projection": "polar"})[0]
     for ax, k in zip(axes, drawn, strict=True):
         phasors = X[rows, k] / X[rows, k][np.argmax(np.abs(X[rows, k]))]
         for i, (row, z) in enumerate(zip(rows, phasors, strict=True)):
@@ -135,7 +122,7 @@ def eigenvalues(
     """
     x, lam, names = _table(values, eigenvalues, modes)
     xlabel = getattr(values, "parameter", "parameter") if xlabel is None else xlabel
-    ax = one(ax)
+    ax = panels(ax, 1, size=(6.4, 4.2))[0, 0]
     low, high = _limits(lam) if ylim is None else ylim
     borders = []
     for start, stop in stable_ranges(x, lam):
@@ -153,7 +140,9 @@ def eigenvalues(
         ax.annotate(f"{border:.3g}", (border, low), xytext=(2, 3), textcoords="offset points", fontsize="small")
     ax.set(xlabel=xlabel, ylabel="eigenvalues [1/s]", xlim=(x[0], x[-1]), ylim=(low, high))
     finish(ax, legend=False)
-    _legend(ax)
+    handles, labels = ax.get_legend_handles_labels()
+    handle_of = dict(zip(labels, handles, strict=True))  # modes of one name have one entry
+    ax.legend(handle_of.values(), handle_of.keys(), frameon=False, fontsize="small")
     return ax
 
 
@@ -174,7 +163,7 @@ def root_locus(
 
     x, lam, _ = _table(values, eigenvalues, None)
     label = getattr(values, "parameter", "parameter") if label is None else label
-    ax = one(ax)
+    ax = panels(ax, 1, size=(6.4, 4.2))[0, 0]
     for column in lam.T:
         at = np.stack([column.real, column.imag], axis=1)  # (m, 2)
         pieces = np.stack([at[:-1], at[1:]], axis=1)
@@ -236,9 +225,3 @@ def _limits(lam: Any) -> tuple[float, float]:
     finite = lam[np.isfinite(lam)]
     top = max(finite.real.max(), finite.imag.max(), 1e-6)
     return max(float(finite.real.min()), -1.2 * float(top)) - 0.05 * float(top), 1.05 * float(top)
-
-
-def _legend(ax: Any) -> None:
-    handles, labels = ax.get_legend_handles_labels()
-    by_label = dict(zip(labels, handles, strict=True))
-    ax.legend(by_label.values(), by_label.keys(), frameon=False, fontsize="small")

@@ -30,15 +30,6 @@ def panels(axes: Any, rows: int, columns: int = 1, *, size: tuple[float, float],
     return plt.subplots(rows, columns, figsize=figsize, squeeze=False, layout="constrained", **options)[1]
 
 
-def one(ax: Any, size: tuple[float, float] = (6.4, 4.2), **options: Any) -> Any:
-    """The axes given, or those of a new figure."""
-    if ax is not None:
-        return ax
-    import matplotlib.pyplot as plt
-
-    return plt.subplots(figsize=size, layout="constrained", **options)[1]
-
-
 def finish(ax: Any, legend: bool = True) -> None:
     """A faint grid, and a legend without a frame where something has a name."""
     ax.grid(alpha=0.25)
@@ -92,9 +83,9 @@ def trajectories(
     for ax, group in zip(panel_axes, groups, strict=True):
         labelled = []
         for name in group:
-            y, unit = _in_unit(values[name], units_by_name[name], degrees)
+            scale, unit = _scale(units_by_name[name], degrees)
             parts = [part for part in (label_of(name) if len(group) > 1 else "", label) if part]
-            y = y.reshape(n, -1)
+            y = (scale * values[name]).reshape(n, -1)
             line = ax.plot(t[0], y[0], label=", ".join(parts) or None, **members | style)[0]
             ax.plot(t[1:].T, y[1:].T, **members | style | {"color": line.get_color()})
             _mark_ends(ax, trajectory, t, y, line.get_color())
@@ -102,13 +93,14 @@ def trajectories(
         ax.set_ylabel(_axis_label(labelled))
         finish(ax)
     if np.ndim(trajectory.status) == 0 and int(trajectory.status) != Status.COMPLETED:
-        _tell_the_end(panel_axes, trajectory)
+        _mark_t_end(panel_axes, trajectory)
     panel_axes[-1].set_xlabel("time [s]")
     return panel_axes
 
 
-def _in_unit(y: np.ndarray, unit: str, degrees: bool) -> tuple[np.ndarray, str]:
-    return (np.degrees(y), unit.replace("rad", "deg")) if degrees and in_degrees(unit) else (y, unit)
+def _scale(unit: str, degrees: bool) -> tuple[float, str]:
+    """The factor to the unit that is drawn, and that unit."""
+    return (180.0 / np.pi, unit.replace("rad", "deg")) if degrees and in_degrees(unit) else (1.0, unit)
 
 
 def _axis_label(labelled: Sequence[tuple[str, str]]) -> str:
@@ -129,7 +121,7 @@ def _mark_ends(ax: Any, trajectory: Trajectory, t: np.ndarray, y: np.ndarray, co
             ax.plot(t[k, reached[-1]], y[k, reached[-1]], "x", color=color, markersize=6, markeredgewidth=1.5)
 
 
-def _tell_the_end(axes: np.ndarray, trajectory: Trajectory) -> None:
+def _mark_t_end(axes: np.ndarray, trajectory: Trajectory) -> None:
     for ax in axes:
         ax.axvline(float(trajectory.t_end), color=SOFT, linestyle=":", linewidth=1.0)
     axes[0].set_title(
@@ -162,14 +154,12 @@ def audit(audit: Audit, *, axes: Any = None) -> np.ndarray:
         if values.size:
             residuals.semilogy(audit.t, np.maximum(np.abs(values).max(1), 1e-17), label=label)
     if not residuals.lines:
-        residuals.text(0.5, 0.5, "no constraints", ha="center", transform=residuals.transAxes, color="0.5")
+        residuals.text(0.5, 0.5, "no constraints", ha="center", transform=residuals.transAxes, color=SOFT)
     conditions.semilogy(audit.t, audit.condition_M, label="condition of M")
     if audit.velocity_residuals.size:
         conditions.semilogy(audit.t, audit.condition_C_dep, label="condition of C_dep")
-    for panel in (energies, errors, residuals, conditions):
-        panel.grid(alpha=0.25)
-        if panel.lines:
-            panel.legend(frameon=False, fontsize="small")
+    for panel in panel_axes.flat:
+        finish(panel)
     for panel in (residuals, conditions):
         panel.set(xlabel="time [s]")
     return panel_axes
@@ -261,8 +251,3 @@ def _number(names: list[str], trial: str | int) -> int:
 
 def _spread(n: int) -> list[int]:
     return np.unique(np.linspace(0, n - 1, min(n, _TRIALS)).astype(int)).tolist()
-
-
-def _scale(unit: str, degrees: bool) -> tuple[float, str]:
-    turns = degrees and in_degrees(unit)
-    return (180.0 / np.pi, unit.replace("rad", "deg")) if turns else (1.0, unit)
