@@ -194,7 +194,6 @@ def _compact(scene: Scene, speed: float) -> dict[str, Any]:
     def encode(x: np.ndarray, dtype: str) -> str:
         return base64.b64encode(np.ascontiguousarray(x, dtype=np.dtype(dtype).newbyteorder("<")).tobytes()).decode()
 
-    view = scene.view
     return {
         "title": scene.title,
         "speed": speed,
@@ -202,21 +201,12 @@ def _compact(scene: Scene, speed: float) -> dict[str, Any]:
         "turning": scene.rotation.shape[1],
         "t": encode(scene.t - scene.t[0], "f4"),
         "start": float(scene.t[0]),
-        "position": encode(scene.position, "f4"),
+        **{name: encode(getattr(scene, name), "f4") for name in ("position", "center_of_mass", "vertex")},
         "rotation": encode(np.round(scene.rotation * 32767), "i2"),
-        "center_of_mass": encode(scene.center_of_mass, "f4"),
-        "vertex": encode(scene.vertex, "f4"),
         "owner": encode(scene.owner, "i2"),
         "shapes": [dataclasses.asdict(shape) for shape in scene.shapes],
         "ground": scene.ground,
-        "view": {
-            "center": view.center.tolist(),
-            "span": view.span,
-            "spanFollowing": view.span_following,
-            "azimuth": view.azimuth,
-            "elevation": view.elevation,
-            "follow": view.follow,
-        },
+        "view": dataclasses.asdict(scene.view) | {"center": scene.view.center.tolist()},
         "colors": COLORS,
     }
 

@@ -110,10 +110,10 @@ def steer_by_wire(*, seconds: float = 1.0, file: File = None) -> Recording:
         "steer_by_wire",
         "free_responses.csv.gz",
         file,
-        measured={"roll": "roll_angle", "steer": "steer_angle", "roll_rate": "roll_rate", "steer_rate": "steer_rate"},
+        measured=_BICYCLE_COLUMNS,
         inputs={"steer_torque": "steer_torque"},
         initial={"speed": "speed_treadmill"},
-        sigma=_BICYCLE,
+        sigma=_BICYCLE_SIGMA,
         parameters={"IByy": 2.0, "IHyy": 0.01} | _json("steer_by_wire", "parameters.json"),
     )
     return dataclasses.replace(recording, trials=tuple(ride.between(0.0, seconds - 0.005) for ride in recording.trials))
@@ -168,10 +168,10 @@ def davis_rider(*, file: File = None) -> Recording:
         "davis_rider",
         "run105.csv.gz",
         file,
-        measured={"roll": "roll_angle", "steer": "steer_angle", "roll_rate": "roll_rate", "steer_rate": "steer_rate"},
+        measured=_BICYCLE_COLUMNS,
         inputs={"steer_torque": "steer_torque", "lateral_force": "lateral_force"},
         initial={"speed": "speed"},
-        sigma=_BICYCLE,
+        sigma=_BICYCLE_SIGMA,
         by=None,
         parameters=_json("davis_rider", "parameters.json")
         | {"identified": _json("davis_rider", "reference_moore.json")},
@@ -202,7 +202,8 @@ def tossed_elbow(*, file: File = None) -> Recording:
     )
 
 
-_BICYCLE = {"roll": 0.01, "steer": 0.02, "roll_rate": 0.1, "steer_rate": 0.2}  # [rad], [rad/s]
+_BICYCLE_COLUMNS = {"roll": "roll_angle", "steer": "steer_angle", "roll_rate": "roll_rate", "steer_rate": "steer_rate"}
+_BICYCLE_SIGMA = {"roll": 0.01, "steer": 0.02, "roll_rate": 0.1, "steer_rate": 0.2}  # [rad], [rad/s]
 
 
 def _recording(

@@ -283,15 +283,10 @@ class _CModule:
         self.members = dict(zip(parameters, identifiers(parameters, C_WORDS), strict=True))
         self.nodes = {function: formulas.nodes(function) for function in functions}
         self.input_words = {
-            int(k): self._element(a.kind, a.name, i, a.shape)
+            int(k): (f"p->{self.members[a.name]}" if a.kind == "parameters" else a.kind) + f"[{i}]" * bool(a.shape)
             for a, nodes in zip(formulas.arguments, formulas.inputs, strict=True)
             for i, k in enumerate(nodes.flat)
         }
-
-    def _element(self, kind: str, name: str, i: int, shape: tuple[int, ...]) -> str:
-        if kind == "parameters":
-            return f"p->{self.members[name]}" + (f"[{i}]" if shape else "")
-        return f"{kind}[{i}]" if shape else kind
 
     def _comment(self) -> str:
         title = _in_comment(_title(self.formulas))
