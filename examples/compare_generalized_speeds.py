@@ -33,7 +33,7 @@ GOLD, BLUE, INK = "#e8a33d", "#3d8fd1", "#2b2f36"
 
 
 class TopWithAngles(SpinningTop):
-    """The same top; only coordinates and speeds are others."""
+    """The same top in other coordinates and speeds."""
 
     coordinates = ("precession", "nutation", "spin")
     speeds = ("precession_rate", "nutation_rate", "spin_rate")

@@ -87,7 +87,7 @@ def main(folder: Path) -> None:
 
 
 def end_of_rod(pendulum: RotaryPendulum, swing: jk.Trajectory) -> np.ndarray:
-    """Place (n_t, 3) of the rod's end [m], asked of the description."""
+    """Position (n_t, 3) of the rod's end [m], from the description."""
 
     def place(t, q, u):
         motion = pendulum.motion(t, q, u)

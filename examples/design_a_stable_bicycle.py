@@ -6,7 +6,7 @@ kept within bounds and halved where they do not help, make
 
     capsize speed - weave speed
 
-as large as it goes. The rider is not asked.
+as large as it goes. The rider is not considered.
 
     variable    meaning                                             unit      bounds
     w           wheelbase                                           m         0.95 to 1.10

@@ -1,7 +1,7 @@
 """Which ride would tell a bicycle's parameters apart?
 
 The roll inertia of the rear frame with its rider and the height of their mass centre are hard to tell apart: both slow
-the roll. Before anyone rides, the benchmark bicycle is asked at which speed and with which sensors a ride of two
+the roll. Before anyone rides, the benchmark bicycle shows at which speed and with which sensors a ride of two
 seconds would tell the two, for a torque at the handlebar that is made of five sines. Then the sines' amplitudes and
 phases are moved by gradient descent until the ride tells most (D-optimal: the smallest determinant of the covariance),
 for the same root mean square of the torque and with limits on roll rate and steer.

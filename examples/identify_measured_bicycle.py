@@ -38,7 +38,7 @@ FREE = {
 
 
 def check(fits, left_out):
-    """What is said of these rides. No test fits them once more."""
+    """The errors and estimates that these rides give. No test repeats these fits."""
     first, four, five = (fits[what] for what in list(FREE)[:3])
     assert first.status == four.status == "converged"
     assert first.cost < 3920 < 20000 < first.history[0]

@@ -1,14 +1,14 @@
-"""What can free swings tell of a double and a triple pendulum, and what not?
+"""Which parameters of a double and a triple pendulum are identifiable from free swings?
 
-Two and three arms hang from a fixed clamp (Kaheman and co-workers, 2022): 26 swings of 2.7 s, and 22 of 1.5 s, each of
-which begins where it likes. Masses, mass centres, inertias and friction are free, but for one mass: 7 and 11
-parameters, of which 5 and 8 combinations can be told. The others change nothing: they are named. Then parameters are
-held until all that is free can be told, and what the model lacks is freed besides: zeros of the encoders, and the
-lengths between the joints, which are said to be 172.7 and 228.7 mm.
+Two and three arms hang from a fixed clamp (Kaheman and co-workers, 2022): 26 swings of 2.7 s, and 22 of 1.5 s,
+each from its own initial state. Masses, mass centres, inertias and friction are estimated, but for one mass: 7 and 11
+parameters, of which 5 and 8 combinations are identifiable. The combinations that are not identifiable are named. Then
+parameters are fixed until all that is free is identifiable, and so are the zeros of the encoders and the
+lengths between the joints, which the authors give as 172.7 and 228.7 mm.
 
     variable          meaning                                                                unit
     angle1, ...       of each arm from the upright vertical (hanging is pi)                  rad
-    mass1, ...        of the arms; free swings tell only ratios: the first is held           kg
+    mass1, ...        of the arms; free swings determine only ratios: the first is fixed     kg
     center1, ...      mass centre from the arm's upper joint                                 m
     inertia1, ...     about the mass centre, across the plane                                kg m^2
     viscous1, ...     torque in a joint by its rate                                          N m s/rad
@@ -16,7 +16,7 @@ lengths between the joints, which are said to be 172.7 and 228.7 mm.
     zero1, ...        where the encoders read the vertical                                   rad
 
 Run:      python examples/identify_pendulums.py [--out FOLDER]
-Appears:  which sums of parameters can be told, and by what name; tables of estimates; the medians of the windows' rms
+Appears:  which sums of parameters are identifiable; tables of estimates; the medians of the windows' rms
           errors; and identify_pendulums.png: the errors of all windows, and one window of each pendulum.
 Takes:    about a minute and a half.
 """
@@ -36,7 +36,7 @@ jax.config.update("jax_enable_x64", True)
 GOLD, BLUE, INK = "#e8a33d", "#3d8fd1", "#2b2f36"
 # Medians [rad] by least squares with free starts, NumPy and SciPy on the same files, to four digits after the point.
 MEDIAN = {2: 0.0031, 3: 0.0018}
-TOLD = {2: (7, 5), 3: (11, 8)}  # parameters, and combinations of them that free swings tell
+COUNTS = {2: (7, 5), 3: (11, 8)}  # parameters, and identifiable combinations of them
 
 
 class TwoArms(jk.System):
@@ -108,10 +108,10 @@ def fitted(system, recording, free):
 
 
 def check(arms, base, fit, rms):
-    """As well explained as elsewhere, and what cannot be told is named. No test fits these swings once more."""
+    """The errors are no larger than expected, and what is not identifiable is named. No test repeats these fits."""
     seen = fit.identifiability
     assert np.median(rms) < MEDIAN[arms] + 0.5e-4
-    assert (len(seen.names), seen.rank) == TOLD[arms]
+    assert (len(seen.names), seen.rank) == COUNTS[arms]
     assert base.count == seen.rank
     assert all(direction.singular_value == 0.0 and len(direction.parts) > 1 for direction in seen.undetermined)
     # With one arm's mass nothing of friction moves: the others' centres and inertias make up for it.
@@ -119,7 +119,7 @@ def check(arms, base, fit, rms):
 
 
 def identified(system, recording):
-    """With all that is not known; then with what can be told, and zeros and lengths besides."""
+    """With all unknown parameters; then with the identifiable ones, zeros and lengths."""
     numbers = range(1, len(system.coordinates) + 1)
     bodies = {f"arm{i}": ("m", "my", "Izz") for i in numbers}
     base = jk.fit.base_parameters(system, bodies=bodies, parameters=[f"viscous{i}" for i in numbers])
@@ -128,7 +128,7 @@ def identified(system, recording):
     rest = [f"{what}{i}" for what in ("center", "inertia", "viscous") for i in numbers]
     first = fitted(system, recording, [*masses, *rest])
     check(len(numbers), base, *first)
-    # Masses, and the first mass centre with them, are held where the first fit left them: the others can be told.
+    # Masses, and the first mass centre with them, stay at the first fit's estimates: the rest is identifiable.
     lengths = [name for name in ("length1", "length2") if hasattr(system, name)]
     zeros = [Free(f"zero{i}", scale=0.01) for i in numbers]
     rest.remove("center1")
