@@ -3,7 +3,7 @@
 Two and three arms hang from a fixed clamp (Kaheman and co-workers, 2022): 26 swings of 2.7 s, and 22 of 1.5 s,
 each from its own initial state. Masses, mass centres, inertias and friction are estimated, but for one mass: 7 and 11
 parameters, of which 5 and 8 combinations are identifiable. The combinations that are not identifiable are named. Then
-parameters are fixed until all that is free is identifiable, and so are the zeros of the encoders and the
+parameters are fixed until the rest is identifiable. The second fit also estimates the zeros of the encoders and the
 lengths between the joints, which the authors give as 172.7 and 228.7 mm.
 
     variable          meaning                                                                unit
