@@ -1,5 +1,7 @@
 """Native kernels: machine code through LLVM gives what XLA gives, in every shape of a batch."""
 
+import warnings
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -179,3 +181,17 @@ def test_kernels_are_kept_beside_the_cache_of_jax(tmp_path):
         assert len(kept) == 2  # the kernel, and the function that XLA calls
     finally:
         jax.config.update("jax_compilation_cache_dir", was)
+
+
+@pytest.mark.skipif(not native_kernels.is_on(), reason="no native kernels here")
+def test_single_precision_without_x64():
+    """Numbers that are written in a program are rounded to its type, where JAX keeps them as floats of Python."""
+    entry = jk.catalog.CATALOG["DoublePendulum"]
+    with jax.enable_x64(False), warnings.catch_warnings():
+        warnings.simplefilter("error")
+        clipped = ScalarFunction(lambda x: jnp.clip(x, 0.2, 0.7) * 0.1)
+        np.testing.assert_array_equal(jax.jit(clipped)(jnp.float32(0.0)), np.float32(0.2) * np.float32(0.1))
+        system = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), entry.example())
+        ride = jk.simulate(system, jk.State(entry.q, entry.u), jnp.linspace(0.0, 0.5, 3))
+    assert ride.q.dtype == jnp.float32
+    assert ride.status == jk.Status.COMPLETED

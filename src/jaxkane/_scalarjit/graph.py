@@ -145,11 +145,13 @@ def graph_of(program: ClosedJaxpr) -> tuple[Graph, list[np.ndarray]]:
 def unrolled(program: ClosedJaxpr, inputs: Sequence[np.ndarray], graph: Graph) -> list[np.ndarray]:
     """The program's outputs as arrays of node numbers."""
     rule = functools.partial(applied, graph=graph)
-    return interpret(program, inputs, rule, lambda v, x: as_constants(x, graph))
+    return interpret(program, inputs, rule, functools.partial(as_constants, graph=graph))
 
 
-def as_constants(x: Any, graph: Graph) -> np.ndarray:
+def as_constants(v: Any, x: Any, graph: Graph) -> np.ndarray:
+    """The value x of the variable or literal v. A literal may be a float of Python in a program of float32."""
     x = np.asarray(x)
+    x = x.astype(v.aval.dtype) if x.dtype.kind == "f" else x
     dtype = _name_of(x.dtype)
     if dtype in DTYPES:
         return _each(lambda v: graph.constant(v, dtype), x)

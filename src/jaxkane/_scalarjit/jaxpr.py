@@ -206,7 +206,7 @@ def jacobian(
     jaxpr: Any = tangents.jaxpr
     avals = types_of(program)
     values = dict(zip(jaxpr.invars, inputs, strict=False)) | {
-        v: as_constants(x, graph) for v, x in zip(jaxpr.constvars, tangents.consts, strict=True)
+        v: as_constants(v, x, graph) for v, x in zip(jaxpr.constvars, tangents.consts, strict=True)
     }
     of_direction = set(jaxpr.invars[len(inputs) :])
     later = []
@@ -239,7 +239,7 @@ def _outputs(equation: Any, values: dict[Any, np.ndarray], graph: Any) -> list[n
 
 
 def _read(v: Any, values: dict[Any, np.ndarray], graph: Any) -> np.ndarray:
-    return as_constants(v.val, graph) if is_literal(v) else values[v]
+    return as_constants(v, v.val, graph) if is_literal(v) else values[v]
 
 
 NOTHING = -1  # in the place of a node: no derivative at all
