@@ -127,7 +127,7 @@ class KaneEquations(DescriptionEvaluator):
             return ()
         return tuple(add(dot(row, u_dot), b) for row, b in zip(zip(*self.J, strict=True), self.bias(), strict=True))
 
-    def momentum_rates(self, u_dot: Row | None = None) -> list[tuple[Row, Row]]:
+    def momentum_rates(self, u_dot: Row | None = None) -> list[tuple[Row, ...]]:
         """dp/dt and dH/dt of every body in the inertial frame; each in the frame where it stands.
 
         `u_dot` (n + k,) of the independent and the dependent speeds; by default u_dot = 0 and `bias`.

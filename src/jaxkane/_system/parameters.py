@@ -210,7 +210,8 @@ def _replaced(part: Any, values: Mapping[tuple[Any, ...], Any]) -> Any:
     for key, each in inner.items():
         place = key.idx if isinstance(key, jax.tree_util.SequenceKey) else key.key
         items[place] = _replaced(items[place], each)
-    return type(part)(items)
+    kind: Any = type(part)
+    return kind(items)
 
 
 def to_float(value: Any) -> Any:
