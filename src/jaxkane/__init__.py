@@ -41,14 +41,14 @@ from ._scalarjit.cache_key import forget as forget
 from ._scalarjit.components import Scalar as Scalar
 from ._scalarjit.configure import Configuration as Configuration
 from ._scalarjit.configure import configure as configure
-from ._system.bodies import Body as Body
-from ._system.bodies import Force as Force
-from ._system.bodies import Torque as Torque
 from ._system.kinematics import Frame as Frame
 from ._system.kinematics import Point as Point
 from ._system.kinematics import Vector as Vector
 from ._system.kinematics import inertial as inertial
+from ._system.motion import Body as Body
+from ._system.motion import Force as Force
 from ._system.motion import Motion as Motion
+from ._system.motion import Torque as Torque
 from ._system.motion import weight as weight
 from ._system.parameters import learned as learned
 from ._system.parameters import parameter as parameter

@@ -21,8 +21,8 @@ import jax
 import jax.numpy as jnp
 
 from ._scalarjit.components import Component, positive
-from ._system.bodies import Body, point_of
 from ._system.kinematics import Frame, Point, Vector
+from ._system.motion import Body, point_of
 
 Named = dict[str, Component]
 

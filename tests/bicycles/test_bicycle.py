@@ -129,7 +129,7 @@ def test_steer_damping_takes_power():
 def test_dependent_speeds_become_singular_where_the_design_says():
     """det C_dep changes sign at a steer of 91.77 degrees, upright; its condition number is about 120 at 90."""
     from jaxkane._kane.kane import KaneEquations
-    from jaxkane._scalarjit.linear import determinant, stack
+    from jaxkane._scalarjit.components import determinant, stack
 
     def det(degrees):
         q = jnp.zeros(8).at[2].set(jnp.deg2rad(degrees))

@@ -69,7 +69,7 @@ def test_every_entry_can_be_inherited_from(name):
     ]
     np.testing.assert_allclose(new, old, atol=1e-13)
     loads = [
-        jk._system.bodies.flatten_loads(s.loads(*where, motion, inputs))
+        jk._system.motion.flatten_loads(s.loads(*where, motion, inputs))
         for s, where, motion in ((system, at, here), (extended, beside, there))
     ]
     active = [np.array(numbers([load.vector for load in found])) for found in loads]

@@ -9,7 +9,7 @@ import pytest
 import jaxkane as jk
 from jaxkane._integrate.audit import _quantities
 from jaxkane._kane import kane as rates
-from jaxkane._scalarjit import linear
+from jaxkane._scalarjit import components
 from jaxkane._scalarjit.function import Program
 
 TILTS = ((0.3, 0.5, 0.81), (0.7, -0.2, 0.4), (-0.4, 0.6, 0.5))
@@ -83,7 +83,7 @@ def test_long_and_short_chains_are_audited_alike(monkeypatch):
     ride = jk.simulate(system, jk.State(q, u), jnp.linspace(0.0, 0.05, 6))
     found = []
     for most in (12, 0):
-        monkeypatch.setattr(linear, "_UNROLL_UP_TO", most)
+        monkeypatch.setattr(components, "_UNROLL_UP_TO", most)
         jax.clear_caches()
         audit = jk.audit(system, ride)
         at = (system, 0.0, q, u)

@@ -8,7 +8,7 @@ from benchmarks.chain import Chain
 
 import jaxkane as jk
 from jaxkane._kane import kane as rates
-from jaxkane._scalarjit import linear
+from jaxkane._scalarjit import components
 from jaxkane._scalarjit.function import Program
 
 
@@ -48,7 +48,7 @@ def test_both_forms_agree(name, monkeypatch):
     moved = jax.tree.map(lambda x: 0.3 * jnp.ones_like(x), args)
     found = []
     for most in (12, 0):
-        monkeypatch.setattr(linear, "_UNROLL_UP_TO", most)
+        monkeypatch.setattr(components, "_UNROLL_UP_TO", most)
         rates = lambda *args: (jk.equations_of_motion(*args), jk.accelerations(*args))  # noqa: E731
         found.append(jax.jit(lambda *args: jax.jvp(rates, args, moved))(*args))  # noqa: B023
     close = lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-11 * np.abs(a).max())  # noqa: E731
@@ -58,7 +58,7 @@ def test_both_forms_agree(name, monkeypatch):
 @pytest.mark.slow
 def test_a_long_chain_keeps_its_energy():
     chain, _, q, u, _ = at(Chain(n=14), 14)
-    assert not linear.is_written_out(14)
+    assert not components.is_written_out(14)
     state = jk.State(0.3 * q, 0.5 * u)
     ride = jk.simulate(chain, state, jnp.linspace(0.0, 0.5, 6), rtol=1e-9, atol=1e-9)
     assert ride.ok

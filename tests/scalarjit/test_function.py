@@ -12,9 +12,9 @@ import pytest
 
 from jaxkane._scalarjit import function
 from jaxkane._scalarjit.backends import xla
+from jaxkane._scalarjit.components import determinant, solve
 from jaxkane._scalarjit.function import ScalarFunction
 from jaxkane._scalarjit.jaxpr import cse
-from jaxkane._scalarjit.linear import determinant, solve
 
 
 def plain(a, b, x):

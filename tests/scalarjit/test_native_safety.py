@@ -14,8 +14,7 @@ import numpy as np
 import pytest
 
 from jaxkane._scalarjit.backends import compiler as objects
-from jaxkane._scalarjit.backends import ffi as handler
-from jaxkane._scalarjit.backends import native, probe
+from jaxkane._scalarjit.backends import llvm, native
 from jaxkane._scalarjit.backends import native as available
 from jaxkane._scalarjit.backends.compiler import LLVMCompiler
 from jaxkane._scalarjit.function import ScalarFunction
@@ -181,9 +180,9 @@ def test_places_are_those_of_the_header_of_jaxlib():
     assert re.search(r"#define XLA_FFI_API_MAJOR 0\b", text)
     for lists, items in ((arguments, "args"), ("XLA_FFI_Rets", "rets")):
         places = at(lists, "size"), at(lists, items), stated(lists)
-        assert places == (handler.LAYOUT.list_count, handler.LAYOUT.list_items, handler.LAYOUT.list_size), lists
+        assert places == (llvm.LAYOUT.list_count, llvm.LAYOUT.list_items, llvm.LAYOUT.list_size), lists
     version = at("XLA_FFI_Metadata", "api_version")
-    expected = handler.Layout(
+    expected = llvm.Layout(
         frame_size=stated(frame),
         frame_extension=at(frame, "extension_start"),
         frame_api=at(frame, "api"),
@@ -204,25 +203,25 @@ def test_places_are_those_of_the_header_of_jaxlib():
         error_message=at("XLA_FFI_Error_Create_Args", "message"),
         error_code=at("XLA_FFI_Error_Create_Args", "errc"),
     )
-    assert expected == handler.LAYOUT
+    assert expected == llvm.LAYOUT
 
 
 @pytest.fixture
 def unproven(tmp_path, monkeypatch):
     """A process that has tried nothing yet, and folders without verdicts."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(probe, "cache_folder", lambda: None)
+    monkeypatch.setattr(native, "cache_folder", lambda: None)
     monkeypatch.setattr(available, "_told", set())
-    available._verdict.cache_clear()
+    native._probed.cache_clear()
     yield tmp_path
     monkeypatch.undo()
-    available._verdict.cache_clear()
+    native._probed.cache_clear()
 
 
 # Places that make a wild pointer of the buffers' list, and a size that the handler finds wrong.
 @pytest.mark.parametrize(("place", "number", "how"), [("list_items", 24, "signal"), ("list_size", 48, "another way")])
 def test_a_moved_structure_leaves_the_work_to_xla(place, number, how, unproven, monkeypatch):
-    monkeypatch.setattr(handler, "LAYOUT", handler.LAYOUT._replace(**{place: number}))
+    monkeypatch.setattr(llvm, "LAYOUT", llvm.LAYOUT._replace(**{place: number}))
     f = ScalarFunction(lambda x: jnp.sin(x) * number)
     with pytest.warns(UserWarning, match=f"no native kernels, XLA does their work: a first kernel.*{how}") as told:
         found = jax.jit(f)(0.5), *jax.jit(jax.vmap(f))(jnp.ones(3))
@@ -231,18 +230,18 @@ def test_a_moved_structure_leaves_the_work_to_xla(place, number, how, unproven, 
     assert not native.is_on()
     assert "first kernel" in (native.why_not() or "")
     # The next process reads it, and tries for itself again a day later.
-    available._verdict.cache_clear()
+    native._probed.cache_clear()
     monkeypatch.setattr(subprocess, "run", None)
     assert not native.is_on()
-    monkeypatch.setattr(probe, "_A_DAY", -1.0)
-    available._verdict.cache_clear()
+    monkeypatch.setattr(native, "_A_DAY", -1.0)
+    native._probed.cache_clear()
     with pytest.raises(TypeError):
         native.is_on()
 
 
 def test_a_handler_that_finds_a_moved_structure_makes_an_error(monkeypatch):
     assert native.is_on()
-    monkeypatch.setattr(handler, "LAYOUT", handler.LAYOUT._replace(frame_size=4096))
+    monkeypatch.setattr(llvm, "LAYOUT", llvm.LAYOUT._replace(frame_size=4096))
     with pytest.raises(jax.errors.JaxRuntimeError, match=r"calls native kernels in another way .*native=False"):
         jax.block_until_ready(jax.jit(ScalarFunction(lambda x: jnp.cos(x) * 1.25))(0.5))
 
@@ -251,10 +250,10 @@ def test_the_probe_is_not_run_again_nor_where_kernels_are_off(unproven, monkeypa
     assert native.is_on()
     (verdict,) = (unproven / "jaxkane").glob("kernels-*.json")
     monkeypatch.setattr(subprocess, "run", None)  # whoever calls it fails
-    available._verdict.cache_clear()
+    native._probed.cache_clear()
     assert native.is_on()
     verdict.write_text("{")
-    available._verdict.cache_clear()
+    native._probed.cache_clear()
     with pytest.raises(TypeError):
         native.is_on()
     monkeypatch.setattr(available, "_wanted", False)
@@ -264,7 +263,7 @@ def test_the_probe_is_not_run_again_nor_where_kernels_are_off(unproven, monkeypa
 def test_without_a_place_for_the_verdict(unproven, monkeypatch):
     (unproven / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(unproven / "file"))
-    monkeypatch.setattr(probe, "_tried", lambda machine: (None, True))
+    monkeypatch.setattr(native, "_tried", lambda machine: (None, True))
     assert native.is_on()
 
 

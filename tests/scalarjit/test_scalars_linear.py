@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxkane._scalarjit.linear import determinant, solve
+from jaxkane._scalarjit.components import determinant, solve
 
 
 def rows_of(A, values=None):

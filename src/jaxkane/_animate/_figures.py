@@ -16,11 +16,10 @@ from jaxtyping import Array, Float
 from .._integrate.trajectory import Trajectory, reached_times
 from .._scalarjit.cache_key import version_of
 from .._scalarjit.captured_values import CapturedValues
+from .._scalarjit.components import stack
 from .._scalarjit.function import ScalarFunction
-from .._scalarjit.linear import stack
-from .._system.bodies import Body, Force, flatten_loads
 from .._system.kinematics import Frame, Point, Vector
-from .._system.motion import Motion
+from .._system.motion import Body, Force, Motion, flatten_loads
 from .._system.system import System
 from ..catalog import WhippleBicycle
 from ._scene import Builder

@@ -15,12 +15,10 @@ from .._kane.kane import accelerations_and_mass_matrix
 from .._kane.reactions import Reactions
 from .._kane.rhs import rates
 from .._scalarjit.cache_key import jit
-from .._scalarjit.components import ZERO3, Triple, add3, cross, dot, matvec
+from .._scalarjit.components import ZERO3, Triple, add3, as_vector, cross, dot, matvec, stack
 from .._scalarjit.function import ScalarFunction
-from .._scalarjit.linear import as_vector, stack
-from .._system.bodies import Force
 from .._system.kinematics import Point, Vector
-from .._system.motion import Motion, kinetic_energy_of
+from .._system.motion import Force, Motion, kinetic_energy_of
 from .._system.system import System
 from .trajectory import Trajectory, reached_times
 

@@ -16,9 +16,8 @@ from jaxtyping import Array, Float
 
 from .._kane.kane import KaneEquations
 from .._scalarjit.compat import depends_on
-from .._scalarjit.components import Component
+from .._scalarjit.components import Component, as_vector, determinant
 from .._scalarjit.function import ScalarFunction
-from .._scalarjit.linear import as_vector, determinant
 from .._system.system import State, System, unpacked
 from .status import REASONS, Status
 

@@ -16,8 +16,8 @@ from .._kane.constraints import configuration_is_met, correction, has_configurat
 from .._kane.kane import KaneEquations
 from .._kane.rhs import outputs_at, rates_are_native, values_of, vector_field
 from .._scalarjit.cache_key import captured_tracers, captures_any, jit
+from .._scalarjit.components import as_vector
 from .._scalarjit.function import ScalarFunction
-from .._scalarjit.linear import as_vector
 from .._scalarjit.nan import all_finite, derivative_free_where_not_finite, flat, nan_derivative_where, nan_where
 from .._system.parameters import ANY, ParameterInfo, parameters_in
 from .._system.system import State, System, names_of, packed, units_of, unpacked

@@ -14,8 +14,8 @@ from .._kane.kane import KaneEquations, motion_rates
 from .._kane.reactions import forces_now, multipliers_now
 from .._kane.rhs import outputs_at, rates
 from .._scalarjit.cache_key import jit
+from .._scalarjit.components import as_vector
 from .._scalarjit.function import ScalarFunction
-from .._scalarjit.linear import as_vector
 from .._scalarjit.nan import nan_where
 from .._system.kinematics import Point
 from .._system.system import System

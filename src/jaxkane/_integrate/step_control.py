@@ -16,15 +16,7 @@ from jaxtyping import Array, Float
 
 from .._scalarjit.function import ScalarFunction
 from .._system.system import System
-from .events import (
-    AdaptiveEventController,
-    EventController,
-    Events,
-    EventValues,
-    InnerTolerances,
-    Limits,
-    event_values,
-)
+from .events import AdaptiveEventController, EventController, Events, EventValues, InnerTolerances, Limits, event_values
 from .inputs import Discontinuities
 from .settings import Settings
 

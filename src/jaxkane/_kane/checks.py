@@ -15,17 +15,15 @@ import numpy as np
 
 from .._scalarjit.cache_key import Cache
 from .._scalarjit.compat import Tracer, concretely
-from .._scalarjit.components import Component, is_exact
+from .._scalarjit.components import Component, as_vector, is_exact, stack
 from .._scalarjit.function import ScalarFunction
-from .._scalarjit.linear import as_vector, stack
-from .._system.bodies import Force, Load
 from .._system.kinematics import Frame, Point
-from .._system.motion import Motion
+from .._system.motion import Force, Load, Motion
 from .._system.parameters import in_batches
 from .._system.system import State, System
 from .arguments import is_concrete
 from .constraints import configuration_residual
-from .evaluate import DescriptionEvaluator, at_random_point, frames_of, structure_of, turning_bodies
+from .kane import DescriptionEvaluator, at_random_point, frames_of, structure_of, turning_bodies
 
 ROUNDING, MEASURED = 2e-3, 0.05
 ROTATION_ERROR = 1e-3

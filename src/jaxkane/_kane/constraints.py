@@ -14,15 +14,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._scalarjit.components import Component
+from .._scalarjit.components import Component, as_vector, solve, stack
 from .._scalarjit.function import ScalarFunction
-from .._scalarjit.linear import as_vector, solve, stack
 from .._scalarjit.nan import nan_where
 from .._system.motion import flatten_residuals
 from .._system.system import System
 from .arguments import as_array, check_is_system, check_time, is_concrete, refuse_incomplete
-from .evaluate import DescriptionEvaluator
-from .kane import KaneEquations
+from .kane import DescriptionEvaluator, KaneEquations
 
 SINGULAR_ROUNDING = 1e-12
 """The reciprocal of the largest condition number with which residuals are solved for dependent speeds."""

@@ -15,17 +15,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from .._scalarjit.cache_key import jit
-from .._scalarjit.components import Component, matvec, sub
+from .._scalarjit.components import Component, as_vector, matvec, rounding_of_pivots, stack, sub
 from .._scalarjit.function import ScalarFunction
-from .._scalarjit.linear import as_vector, rounding_of_pivots, stack
-from .._system.bodies import Force
-from .._system.motion import kinetic_energy_of
+from .._system.motion import Force, kinetic_energy_of
 from .._system.system import System
 from .arguments import as_array, as_row, check_is_system, check_time, checked_values, is_concrete, refuse_incomplete
 from .checks import check_system
 from .constraints import SINGULAR_ROUNDING, check_left_out, constraint_rows, dependent_speeds_from
-from .evaluate import jvp
-from .kane import KaneEquations, motion_rates, rates_and_equations
+from .kane import KaneEquations, jvp, motion_rates, rates_and_equations
 
 InputValues = Mapping[str, Component] | None
 

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._scalarjit.compat import MISSING, ClosedJaxpr, jaxpr_as_fun
+from .._scalarjit.components import as_vector, is_written_out
 from .._scalarjit.graph import Graph, NotScalarError, unrolled
 from .._scalarjit.jaxpr import cse, jacobian
-from .._scalarjit.linear import as_vector, is_written_out
 from .._system.parameters import ANY, ParameterInfo, declared, in_batches, leaf_name
 from .._system.system import System
 from .arguments import as_row, check_is_system, is_concrete
@@ -31,8 +31,7 @@ from .equations import (
     kinetic_energy,
     partial_velocities,
 )
-from .evaluate import DescriptionEvaluator
-from .kane import motion_rates
+from .kane import DescriptionEvaluator, motion_rates
 from .rhs import rates
 
 

@@ -17,16 +17,14 @@ from typing import Any
 import jax.numpy as jnp
 
 from .._scalarjit.cache_key import jit
-from .._scalarjit.components import Component, Triple, add, dot, mul, total
+from .._scalarjit.components import Component, Triple, add, as_vector, dot, mul, solve, total
 from .._scalarjit.function import ScalarFunction
-from .._scalarjit.linear import as_vector, solve
 from .._system.kinematics import Frame, Point, auxiliary_speed
 from .._system.motion import Motion
 from .._system.system import System
 from .arguments import Row, as_row
 from .equations import InputValues
-from .evaluate import EvaluatedDescription, unit
-from .kane import KaneEquations, motion_rates
+from .kane import EvaluatedDescription, KaneEquations, motion_rates, unit
 
 
 @jit

@@ -15,16 +15,21 @@ from jaxtyping import Array, Float
 from .._common.lookup import as_names, refuse_unknown
 from .._scalarjit.cache_key import Cache
 from .._scalarjit.compat import concretely, depends_on
-from .._scalarjit.components import ZERO3, Component, add, add3, is_zero, mul
+from .._scalarjit.components import ZERO3, Component, add, add3, as_vector, is_zero, mul, stack
 from .._scalarjit.function import ScalarFunction
-from .._scalarjit.linear import as_vector, stack
-from .._system.bodies import UNNAMED, Body, Force, parallel_axis
 from .._system.kinematics import Point, Vector
-from .._system.motion import Motion
+from .._system.motion import UNNAMED, Body, Force, Motion, parallel_axis
 from .._system.system import System
 from .arguments import Row
-from .evaluate import DescriptionEvaluator, EvaluatedDescription, at_random_point, dtype_of, jvp, structure_of
-from .kane import KaneEquations
+from .kane import (
+    DescriptionEvaluator,
+    EvaluatedDescription,
+    KaneEquations,
+    at_random_point,
+    dtype_of,
+    jvp,
+    structure_of,
+)
 
 TEN = ("m", "mx", "my", "mz", "Ixx", "Iyy", "Izz", "Ixy", "Ixz", "Iyz")
 """Mass [kg], first moment [kg m], and inertia [kg m^2] as matrix entries, about the body's own point."""

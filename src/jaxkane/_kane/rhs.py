@@ -15,15 +15,13 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._common.lookup import not_there, refuse_unknown
-from .._scalarjit.components import Component, add3, component, cross, is_exact
+from .._scalarjit.components import Component, add3, as_vector, component, cross, is_exact, is_written_out
 from .._scalarjit.function import ScalarFunction
-from .._scalarjit.linear import as_vector, is_written_out
 from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Motion
 from .._system.system import NamedVector, State, System, has_outputs, packed, unpacked
 from .arguments import Inputs, Row, as_row, inputs_of
-from .evaluate import jvp
-from .kane import KaneEquations, motion_rates
+from .kane import KaneEquations, jvp, motion_rates
 from .reactions import Reactions
 
 

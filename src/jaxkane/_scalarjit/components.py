@@ -1,12 +1,20 @@
-"""Shape aliases. Knows jaxtyping and nothing of mechanics."""
+"""Arithmetic that knows exact zeros and ones, and linear systems of a few scalars. Knows no mechanics.
+
+Small systems are written out (Cramer's rule up to three unknowns, L D L^T without pivoting for positive definite
+ones), which keeps exact zeros and lets a batch stay component-major; so are larger ones whose exact zeros let them fall
+apart into such, one after the other, as closed loops that hang on a bicycle. What is left goes to LAPACK.
+"""
 
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+import jax
 import jax.numpy as jnp
+import jax.scipy.linalg as jsl
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -133,3 +141,199 @@ def scale3(s: Component, a: Triple) -> Triple:
 
 def matvec(matrix: Sequence[Sequence[Component]], a: Sequence[Component]) -> tuple[Component, ...]:
     return tuple(dot(row, a) for row in matrix)
+
+
+Rows = Sequence[Sequence[Component]]
+
+_CRAMER_UP_TO = 3
+_UNROLL_UP_TO = 12
+
+
+def solve(A: Rows, *rights: Sequence[Component]) -> list[tuple[Component, ...]]:
+    """The solutions x of A x = b for several right-hand sides b."""
+    n = len(A)
+    if n == 0:
+        return [() for _ in rights]
+    if n > _CRAMER_UP_TO:
+        blocks = _blocks(A)
+        return _solved_by_lapack_rows(A, rights) if blocks is None else _solved_by_blocks(A, rights, blocks)
+    adjugate, det = _adjugate(A)
+    if is_zero(det):  # an unknown that no equation holds: no number is right, and a zero must not hide it
+        return [(math.nan,) * n for _ in rights]
+    reciprocal = 1.0 / det
+    return [tuple(mul(dot(row, b), reciprocal) for row in adjugate) for b in rights]
+
+
+def determinant(A: Rows) -> Component:
+    """det A."""
+    if len(A) <= _CRAMER_UP_TO:
+        return _adjugate(A)[1]
+    blocks = _blocks(A)
+    if blocks is None:
+        return _det_by_lapack(stack(A))
+    rows, columns = ([i for block in blocks for i in block[side]] for side in (0, 1))
+    sign = np.linalg.det(np.eye(len(A))[rows]) * np.linalg.det(np.eye(len(A))[columns])
+    factors = [_adjugate(_part(A, *block))[1] for block in blocks]
+    return functools.reduce(mul, factors, float(round(sign)))
+
+
+# By these names `unsupported_primitives` knows that it is not the description that calls a library.
+
+
+@jax.jit
+def _solved_by_lapack(matrix, rights):
+    return jnp.linalg.solve(matrix, rights)
+
+
+@jax.jit
+def _det_by_lapack(matrix):
+    return jnp.linalg.det(matrix)
+
+
+Block = tuple[list[int], list[int]]
+
+
+def _blocks(A: Rows) -> list[Block] | None:
+    """Rows and columns of the blocks on the diagonal, where rows and columns of A can be ordered so that all entries
+    above these are exact zeros. None where a block is larger than what is written out, or A is singular by its zeros.
+    """
+    reads = np.array([[not is_zero(a) for a in row] for row in A])
+    column_of = _matched(reads)
+    if column_of is None:
+        return None
+    # Row i follows row j where it reads what j is solved for; rows that follow each other are one block.
+    follows = reads[:, column_of] | np.eye(len(A), dtype=bool)
+    for _ in range(len(A).bit_length()):
+        follows = (follows.astype(int) @ follows) > 0
+    together = follows & follows.T
+    order = sorted({tuple(np.flatnonzero(row)) for row in together}, key=lambda rows: (follows[rows[0]].sum(), rows))
+    if max(map(len, order)) > _CRAMER_UP_TO:
+        return None
+    return [([int(i) for i in rows], sorted(int(column_of[i]) for i in rows)) for rows in order]
+
+
+def _matched(reads: np.ndarray) -> list[int] | None:
+    """For every row a column of its own that it reads; None where there are not so many."""
+    owner: dict[int, int] = {}
+
+    def find(row: int, tried: set[int]) -> bool:
+        for column in map(int, np.flatnonzero(reads[row])):
+            if column not in tried:
+                tried.add(column)
+                if column not in owner or find(owner[column], tried):
+                    owner[column] = row
+                    return True
+        return False
+
+    if not all(find(row, set()) for row in range(len(reads))):
+        return None
+    return sorted(owner, key=owner.__getitem__)
+
+
+def _part(A: Rows, rows: list[int], columns: list[int]) -> Rows:
+    return [[A[i][j] for j in columns] for i in rows]
+
+
+def _solved_by_blocks(A: Rows, rights: Sequence[Sequence[Component]], blocks: list[Block]) -> list:
+    solutions: list[dict[int, Component]] = [{} for _ in rights]
+    for rows, columns in blocks:
+        remaining = []
+        for b, x in zip(rights, solutions, strict=True):
+            remaining.append([functools.reduce(sub, (mul(A[i][j], x[j]) for j in x), b[i]) for i in rows])
+        for x, solved in zip(solutions, solve(_part(A, rows, columns), *remaining), strict=True):
+            x.update(zip(columns, solved, strict=True))
+    return [tuple(x[j] for j in range(len(A))) for x in solutions]
+
+
+def _solved_by_lapack_rows(A: Rows, rights: Sequence[Sequence[Component]]) -> list:
+    solution = _solved_by_lapack(stack(A), jnp.stack([stack([b])[0] for b in rights], axis=-1))
+    return [tuple(solution[i, j] for i in range(len(A))) for j in range(len(rights))]
+
+
+def _adjugate(A: Rows) -> tuple[Rows, Component]:
+    if len(A) == 1:
+        return ((1.0,),), A[0][0]
+    if len(A) == 2:
+        (a, b), (c, d) = A
+        return ((d, mul(-1.0, b)), (mul(-1.0, c), a)), sub(mul(a, d), mul(b, c))
+    r1, r2, r3 = (tuple(row) for row in A)
+    columns = cross(r2, r3), cross(r3, r1), cross(r1, r2)  # type: ignore[arg-type]
+    return tuple(zip(*columns, strict=True)), dot(r1, columns[0])
+
+
+def is_written_out(n: int) -> bool:
+    """Whether positive definite systems of n unknowns are solved among the scalars."""
+    return n <= _UNROLL_UP_TO
+
+
+def solve_positive_array(M, b):
+    """The solution x (n,) of M x = b for a symmetric positive definite array M (n, n), by LAPACK; NaN where M is
+    singular but for rounding."""
+    factor = jsl.cho_factor(M)
+    is_regular = jnp.all(jnp.diag(factor[0]) ** 2 > rounding_of_pivots(M.dtype) * jnp.diag(M))
+    return jnp.where(is_regular, jsl.cho_solve(factor, b), jnp.nan)
+
+
+def rounding_of_pivots(dtype: Any) -> float:
+    """Pivots of L D L^T that are less than this, beside their diagonal entries of M, are zero but for rounding. Their
+    units do not matter, nor whether masses are small."""
+    return 100 * float(jnp.finfo(dtype).eps)
+
+
+def solve_positive(M: Rows, b: Sequence[Component]) -> tuple[Component, ...]:
+    """The solution x of M x = b for a symmetric positive definite M, of which the upper triangle is read; NaN where M
+    is singular but for rounding."""
+    n = len(M)
+    # M = L D L^T, column by column; d holds the pivots, L the rows below the diagonal.
+    L: list[list[Component]] = [[0.0] * n for _ in range(n)]
+    d: list[Component] = []
+    for j in range(n):
+        pivot = M[j][j]
+        for k in range(j):
+            pivot = sub(pivot, mul(mul(L[j][k], L[j][k]), d[k]))
+        if pivot is not M[j][j]:
+            pivot = _regular(pivot, M[j][j])
+        d.append(pivot)
+        for i in range(j + 1, n):
+            entry = M[j][i]
+            for k in range(j):
+                entry = sub(entry, mul(mul(L[i][k], L[j][k]), d[k]))
+            L[i][j] = entry if is_zero(entry) else _quotient(entry, pivot)
+    y = list(b)
+    for i in range(n):
+        for k in range(i):
+            y[i] = sub(y[i], mul(L[i][k], y[k]))
+    x = [_quotient(y_i, d_i) for y_i, d_i in zip(y, d, strict=True)]
+    for i in reversed(range(n)):
+        for k in range(i + 1, n):
+            x[i] = sub(x[i], mul(L[k][i], x[k]))
+    return tuple(x)
+
+
+def _regular(pivot: Component, diagonal: Component) -> Component:
+    """The pivot, or NaN where it is no more than what rounding has left of the diagonal entry."""
+    if is_exact(pivot) and is_exact(diagonal):
+        return pivot if pivot > rounding_of_pivots(float) * diagonal else math.nan
+    threshold = rounding_of_pivots(jnp.result_type(pivot, diagonal)) * diagonal
+    return jnp.where(pivot > threshold, pivot, math.nan)
+
+
+def _quotient(a: Component, b: Component) -> Component:
+    if is_zero(b):
+        return math.nan
+    return a if is_zero(a) else a / b
+
+
+def as_vector(row: Sequence[Component], like: Any) -> Any:
+    """A row of components as an array (n,) of the type of `like`."""
+    return stack([row])[0].astype(like.dtype)
+
+
+def stack(rows: Rows):
+    """Rows of components as an array (m, n)."""
+    width = len(rows[0]) if rows else 0
+    flat = [a for row in rows for a in row]
+    if not flat:
+        return jnp.zeros((len(rows), width))
+    dtype = jnp.result_type(*([a for a in flat if not is_exact(a)] or [float]))
+    return jnp.stack([jnp.asarray(a, dtype=dtype) for a in flat]).reshape(len(rows), width)

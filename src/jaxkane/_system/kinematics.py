@@ -33,8 +33,8 @@ from .._scalarjit.components import (
     matvec,
     mul,
     scale3,
+    stack,
 )
-from .._scalarjit.linear import stack
 from ..rotations import Matrix
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .._scalarjit.components import Scalar
-from .._system.bodies import Force
+from .._system.motion import Force
 from .._system.parameters import parameter
 from ..catalog.bicycle import FAR
 from ..loads import smooth_abs

@@ -8,9 +8,8 @@ from typing import Any
 import jax.numpy as jnp
 
 from .._scalarjit.components import Component, add
-from .._system.bodies import Body
 from .._system.kinematics import Frame, Point, Vector, inertial
-from .._system.motion import Motion
+from .._system.motion import Body, Motion
 from ._part import BicycleMotion, Contact
 from ._tyre import Tyre, rolling_speed
 

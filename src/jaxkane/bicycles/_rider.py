@@ -15,8 +15,8 @@ from jaxtyping import Array, Float
 from .._kane.arguments import is_concrete
 from .._kane.checks import why_no_body
 from .._scalarjit.components import Component, Scalar, add
-from .._system.bodies import Body, Torque
 from .._system.kinematics import Frame, Point
+from .._system.motion import Body, Torque
 from .._system.parameters import in_batches, parameter
 from ..catalog import read_bicycle_file
 from ..catalog.bicycle import ABOVE_GROUND, FAR, TILT

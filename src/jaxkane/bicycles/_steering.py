@@ -8,8 +8,8 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._scalarjit.components import Component, Scalar, mul
-from .._system.bodies import Body, Torque
 from .._system.kinematics import Frame, Point
+from .._system.motion import Body, Torque
 from .._system.parameters import parameter
 from ..catalog.bicycle import ABOVE_GROUND, FAR
 from ..loads import coulomb, rotor

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from .._scalarjit.components import Scalar
-from .._system.bodies import Body
+from .._system.motion import Body
 from .._system.parameters import parameter
 from ..catalog.bicycle import ABOVE_GROUND, FAR
 from ._part import Part

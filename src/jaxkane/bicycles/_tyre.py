@@ -9,8 +9,8 @@ import equinox as eqx
 import jax.numpy as jnp
 
 from .._scalarjit.components import Component, Scalar, is_zero, mul, sub
-from .._system.bodies import Body, Force, Torque
 from .._system.kinematics import Vector
+from .._system.motion import Body, Force, Torque
 from .._system.parameters import parameter
 from ._part import Contact, called, check_parameters
 from ._tyre_laws import LongitudinalSlip, TyreForceLaw

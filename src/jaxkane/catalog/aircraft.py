@@ -8,9 +8,8 @@ import jax.numpy as jnp
 
 from .. import rotations
 from .._scalarjit.components import Component, Scalar
-from .._system.bodies import Body, Force, Torque
 from .._system.kinematics import Frame, Point, inertial
-from .._system.motion import Motion
+from .._system.motion import Body, Force, Motion, Torque
 from .._system.parameters import parameter
 from .._system.system import System
 from ._entry import entry

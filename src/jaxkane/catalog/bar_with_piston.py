@@ -5,9 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from .._scalarjit.components import Scalar
-from .._system.bodies import Body, Force
 from .._system.kinematics import inertial
-from .._system.motion import Motion, weight
+from .._system.motion import Body, Force, Motion, weight
 from .._system.parameters import parameter
 from .._system.system import System
 from ._entry import entry

@@ -10,9 +10,8 @@ from typing import Any, ClassVar, Self
 import jax.numpy as jnp
 
 from .._scalarjit.components import Scalar
-from .._system.bodies import Body, Torque
 from .._system.kinematics import Frame, Point, Vector, inertial
-from .._system.motion import Motion, weight
+from .._system.motion import Body, Motion, Torque, weight
 from .._system.parameters import parameter, parameter_info
 from .._system.system import System
 from ._entry import entry, read_bicycle_file

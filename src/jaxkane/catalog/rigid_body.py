@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from .. import rotations
 from .._scalarjit.components import Scalar
-from .._system.bodies import Body, Force, Torque
 from .._system.kinematics import Point, inertial
-from .._system.motion import Motion
+from .._system.motion import Body, Force, Motion, Torque
 from .._system.parameters import parameter
 from .._system.system import System
 from ._entry import entry

@@ -5,9 +5,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 
 from .._scalarjit.components import Scalar
-from .._system.bodies import Body, Torque
 from .._system.kinematics import inertial
-from .._system.motion import Motion
+from .._system.motion import Body, Motion, Torque
 from .._system.parameters import parameter
 from .._system.system import System
 from ._entry import entry

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from .. import rotations
 from .._scalarjit.components import Scalar
-from .._system.bodies import Body
 from .._system.kinematics import inertial
-from .._system.motion import Motion, weight
+from .._system.motion import Body, Motion, weight
 from .._system.parameters import parameter
 from .._system.system import System
 from ._entry import entry

@@ -14,9 +14,8 @@ import jax.numpy as jnp
 
 from .._common.lookup import as_names, hint
 from .._scalarjit.components import ZERO3, Component, Scalar, add, dot, is_exact, is_zero, mul, sub
-from .._system.bodies import Body, Force, Torque
 from .._system.kinematics import Frame, Point, Vector, inertial
-from .._system.motion import Motion
+from .._system.motion import Body, Force, Motion, Torque
 from .._system.parameters import parameter
 from .._system.system import System
 from ._sympy_expressions import ExtractedModel, ExtractedVector, Extractor, function, imported, name_of

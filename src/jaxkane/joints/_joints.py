@@ -13,8 +13,8 @@ import numpy as np
 from .. import rotations
 from .._scalarjit.compat import Tracer
 from .._scalarjit.components import Component, Triple, is_zero, mul, sub
-from .._system.bodies import Body, Force, Load, Torque
 from .._system.kinematics import Frame, Point
+from .._system.motion import Body, Force, Load, Torque
 
 
 def unit_vector(axis: Any, name: str) -> Triple:

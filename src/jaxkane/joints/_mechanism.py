@@ -27,9 +27,8 @@ from .._scalarjit.components import (
     sub,
     total,
 )
-from .._system.bodies import Body, Force
 from .._system.kinematics import Frame, Point, inertial
-from .._system.motion import Motion
+from .._system.motion import Body, Force, Motion
 from .._system.parameters import parameter, parameter_info
 from .._system.system import System
 from ..rotations import Matrix

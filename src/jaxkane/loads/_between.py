@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from .._scalarjit.components import Component, component, is_zero, mul, positive
-from .._system.bodies import Body, Force, Torque, point_of
 from .._system.kinematics import Frame, Point, Vector, check_vector
+from .._system.motion import Body, Force, Torque, point_of
 from ._laws import coulomb, smooth_abs
 
 Law = Component | Callable[[Component], Component]

@@ -21,9 +21,8 @@ from .._kane.constraints import SINGULAR_ROUNDING, configuration_residual
 from .._kane.equations import dependent_speeds, diagnosis
 from .._kane.rhs import has_outputs, output_names, outputs_at, rates, values_of
 from .._scalarjit.cache_key import jit
-from .._scalarjit.components import Component
+from .._scalarjit.components import Component, as_vector, solve, stack
 from .._scalarjit.function import ScalarFunction
-from .._scalarjit.linear import as_vector, solve, stack
 from .._scalarjit.nan import nan_where
 from .._system.parameters import parameters_in
 from .._system.system import NamedVector, State, System
