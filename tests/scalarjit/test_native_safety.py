@@ -15,7 +15,6 @@ import pytest
 
 from jaxkane._scalarjit.backends import compiler as objects
 from jaxkane._scalarjit.backends import llvm, native
-from jaxkane._scalarjit.backends import native as available
 from jaxkane._scalarjit.backends.compiler import LLVMCompiler
 from jaxkane._scalarjit.function import ScalarFunction
 
@@ -211,7 +210,7 @@ def unproven(tmp_path, monkeypatch):
     """A process that has tried nothing yet, and folders without verdicts."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(native, "cache_folder", lambda: None)
-    monkeypatch.setattr(available, "_told", set())
+    monkeypatch.setattr(native, "_told", set())
     native._probed.cache_clear()
     yield tmp_path
     monkeypatch.undo()
@@ -256,7 +255,7 @@ def test_the_probe_is_not_run_again_nor_where_kernels_are_off(unproven, monkeypa
     native._probed.cache_clear()
     with pytest.raises(TypeError):
         native.is_on()
-    monkeypatch.setattr(available, "_wanted", False)
+    monkeypatch.setattr(native, "_wanted", False)
     assert not native.is_on()
 
 
@@ -278,7 +277,7 @@ class Text:
 
 
 def test_an_error_of_llvm_leaves_the_work_to_xla(monkeypatch):
-    monkeypatch.setattr(available, "_told", set())
+    monkeypatch.setattr(native, "_told", set())
     f = ScalarFunction(lambda x: jnp.sin(x) * 1.75)
     with monkeypatch.context() as broken:
         broken.setattr(native, "Writer", Text)
