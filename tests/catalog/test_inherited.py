@@ -247,7 +247,7 @@ class Rubbed(type(ARM)):
         return motion.extended([jk.Body(3.0, 0.0, arm.center.fixed(0.5 * arm.frame.x), name="load")])
 
     def loads(self, t, q, u, motion, inputs):
-        joint = motion.placed["q"].moved
+        joint = motion.joints["q"].child_frame
         rubs = jk.loads.torsional_friction(joint, None, motion.N.z, self.dry, rate=1e-6)
         return super().loads(t, q, u, motion, inputs), rubs
 
@@ -273,4 +273,4 @@ def test_a_mechanism_of_joints_keeps_its_own_when_it_is_extended():
     motion = arm.motion(0.0, [0.3], [0.1])
     more = motion.extended([jk.Body(1.0, 0.0, motion["a"].center, name="two")])
     assert type(more) is type(motion)
-    assert more.placed is motion.placed
+    assert more.joints is motion.joints
