@@ -84,7 +84,8 @@ def test_what_contradicts_itself_is_moved_to_the_nearest():
 
 
 def test_a_trial_that_does_not_say_what_others_do_is_named():
-    with pytest.raises(ValueError, match=r"bead \['x'\] says nothing of y, which other trials fix at their start: name it in `initial`"):
+    reason = r"bead \['x'\] says nothing of y, which other trials fix at their start: name it in `initial`"
+    with pytest.raises(ValueError, match=reason):
         posed(Wire(), "mass", bead({"x": 0.3}), bead({"y": 0.3}))
     of_each = posed(Wire(follows=("y",)), "mass", bead({"x": 0.3}), bead({}))
     np.testing.assert_allclose(starts(of_each), [[0.3, 0.7], [0.0, 1.0]], atol=1e-9)
