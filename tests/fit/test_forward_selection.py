@@ -139,13 +139,13 @@ def test_negative_friction_is_not_believed(rubbing):
     )
     assert not found.selected
     quadratic, spring = (next(row for row in found.rounds[0] if row.name == name) for name in ("quadratic", "spring"))
-    assert quadratic.objections == ("damping = 0.9051 is above 0.6", "quadratic = -0.1769 is below 0") or (
-        len(quadratic.objections) == 2 and "quadratic" in quadratic.objections[1]
+    assert quadratic.bound_violations == ("damping = 0.9051 is above 0.6", "quadratic = -0.1769 is below 0") or (
+        len(quadratic.bound_violations) == 2 and "quadratic" in quadratic.bound_violations[1]
     )
     assert quadratic.reason.startswith("not plausible: damping = 0.9")
     # Its bound is where it starts: it is searched for on both sides, and believed on one.
     assert spring.values["spring"] < 0
-    assert spring.objections[0].startswith("spring = -")
+    assert spring.bound_violations[0].startswith("spring = -")
 
 
 @pytest.mark.slow

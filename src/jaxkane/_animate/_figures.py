@@ -55,7 +55,7 @@ class Element(eqx.Module):
     label: str = eqx.field(static=True, default="")
 
 
-Place = Vector | Point | Body
+Location = Vector | Point | Body
 
 
 class Sketch:
@@ -77,7 +77,7 @@ class Sketch:
         body = None if turns_with is None else self.motion.bodies.index(turns_with)
         self.elements.append(Element(places, kind, color, body=body, **style))
 
-    def _at(self, place: Place) -> Float[Array, 3]:
+    def _at(self, place: Location) -> Float[Array, 3]:
         if isinstance(place, Body):
             place = place.center
         return (place.position if isinstance(place, Point) else place).to(self.motion.N)
@@ -85,7 +85,7 @@ class Sketch:
     def line(
         self,
         color: str,
-        *places: Place,
+        *places: Location,
         width: float = 2.0,
         closed: bool = False,
         fill: float = 0.0,
@@ -98,7 +98,7 @@ class Sketch:
     def circle(
         self,
         color: str,
-        center: Place,
+        center: Location,
         a: Vector,
         b: Vector,
         radius: Any,
@@ -122,26 +122,26 @@ class Sketch:
         self._add(jnp.stack([hub, rim], axis=1).reshape(-1, 3), "pairs", color, body, width=0.7)
         self.dot(color, body, 3.0)
 
-    def _around(self, center: Place, a: Vector, b: Vector, radius: Any, n: int) -> Float[Array, "n 3"]:
+    def _around(self, center: Location, a: Vector, b: Vector, radius: Any, n: int) -> Float[Array, "n 3"]:
         a_N, b_N = a.to(self.motion.N), b.to(self.motion.N)
         angles = 2.0 * np.pi * np.arange(n)[:, None] / n
         cos, sin = (jnp.asarray(f(angles), dtype=a_N.dtype) for f in (np.cos, np.sin))
         return self._at(center)[None, :] + jnp.asarray(radius, dtype=a_N.dtype) * (cos * a_N[None] + sin * b_N[None])
 
-    def dot(self, color: str, place: Place, radius: float = 4.0, label: str = "") -> None:
+    def dot(self, color: str, place: Location, radius: float = 4.0, label: str = "") -> None:
         """A dot; `radius` in pixels."""
         self._add(self._at(place)[None], "dot", color, width=radius, label=label)
 
-    def mass_center(self, color: str, place: Place, radius: float = 6.0, label: str = "") -> None:
+    def mass_center(self, color: str, place: Location, radius: float = 6.0, label: str = "") -> None:
         """The quartered disc that marks a mass centre; `radius` in pixels."""
         self._add(self._at(place)[None], "center", color, width=radius, label=label)
 
-    def trace(self, color: str, *places: Place) -> None:
+    def trace(self, color: str, *places: Location) -> None:
         """The paths that places leave behind."""
         for place in places:
             self._add(self._at(place)[None], "trace", color, width=1.2)
 
-    def axes(self, center: Place, frame: Frame, length: Any) -> None:
+    def axes(self, center: Location, frame: Frame, length: Any) -> None:
         """The axes 1, 2 and 3 of a frame in red, green and blue."""
         start = center.center.position if isinstance(center, Body) else center
         start = start.position if isinstance(start, Point) else start

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 
-def differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> str:
+def differences(old_groups: Mapping[str, Any], new_groups: Mapping[str, Any]) -> str:
     """In what two descriptions differ, in words: `option rtol (1e-08 there, 1e-06 here)`."""
     items = []
-    for group in dict.fromkeys((*there, *here)):
-        old, new = there.get(group, {}), here.get(group, {})
+    for group in dict.fromkeys((*old_groups, *new_groups)):
+        old, new = old_groups.get(group, {}), new_groups.get(group, {})
         if not isinstance(old, dict) or not isinstance(new, dict):
             old, new = {"": old}, {"": new}
         for key in dict.fromkeys((*old, *new)):

@@ -125,8 +125,8 @@ def _outputs(system: System, t: Component, q: Row, u: Row, motion: Motion, now: 
     """
     label = f"{type(system).__name__}.outputs"
     outputs = _flat(label, system.outputs(t, q, u, motion, now))
-    others = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.inputs, *system.states)
-    twice = [name for name in outputs if name in others]
+    reserved = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.inputs, *system.states)
+    twice = [name for name in outputs if name in reserved]
     if twice:
         raise ValueError(
             f"{label}: {', '.join(twice)} is the name of a coordinate, a speed, an input or a state already, and "

@@ -26,17 +26,17 @@ _HEADER = ("parameterization", "parameters", "rider", "description", "values")
 _SETS = {"MooreRiderLean2012": "ig11", "Moore2012": "ic11", "Moore2019": "kDaa", "Meijaard2007": "IBxx"}
 _CALLED = {"benchmark": "Meijaard2007", "principal": "Moore2019"}
 
-Values = dict[str, float]
+ParameterValues = dict[str, float]
 
 
-def read_yaml(path: str | os.PathLike[str]) -> tuple[str, Values]:
+def read_yaml(path: str | os.PathLike[str]) -> tuple[str, ParameterValues]:
     """The name of the set of parameters, and values by name, from a YAML file of BicycleParameters.
 
     **Raises:** `ValueError` with one line for every entry that is malformed or repeated, and for a set of names that is
     none of those above.
     """
     header: dict[str, str] = {}
-    values: Values = {}
+    values: ParameterValues = {}
     lines: dict[str, int] = {}
     faults: list[str] = []
     section = ""
@@ -67,7 +67,7 @@ def read_yaml(path: str | os.PathLike[str]) -> tuple[str, Values]:
     return _parameterization(os.fspath(path), header.get("parameterization", ""), values), values
 
 
-def _parameterization(path: str, name: str, values: Values) -> str:
+def _parameterization(path: str, name: str, values: ParameterValues) -> str:
     kind = _CALLED.get(name, name) or next((kind for kind, own in _SETS.items() if own in values), "")
     if kind not in _SETS:
         fault = f"the parameterization {name!r}" if name else "no parameterization, and no names of one,"
@@ -75,7 +75,7 @@ def _parameterization(path: str, name: str, values: Values) -> str:
     return kind
 
 
-def as_meijaard(kind: str, values: Mapping[str, float]) -> tuple[Values, Values | None]:
+def as_meijaard(kind: str, values: Mapping[str, float]) -> tuple[ParameterValues, ParameterValues | None]:
     """Meijaard's parameters, and those of a rider with a body of its own, with the names of `RigidRider`, or of
     `LeaningRider` where they hold a hinge. The speed `v` is none of either.
 
@@ -100,7 +100,7 @@ class _Parameters(dict[str, float]):
         self.missing += [name for name in names if name not in self]
         return [self.pop(name, math.nan) for name in names]
 
-    def named(self, *names: str) -> Values:
+    def named(self, *names: str) -> ParameterValues:
         return dict(zip(names, self.pop_values(*names), strict=True))
 
     def refuse_rest(self) -> None:
@@ -110,13 +110,13 @@ class _Parameters(dict[str, float]):
             raise ValueError(f"the parameters of {self.kind}: {'; '.join(faults)}.")
 
 
-def _meijaard(p: _Parameters) -> tuple[Values, None]:
+def _meijaard(p: _Parameters) -> tuple[ParameterValues, None]:
     values = dict(p)  # whose names `WhippleBicycle.from_parameters` looks at
     p.clear()
     return values, None
 
 
-def _principal(p: _Parameters) -> tuple[Values, Values]:
+def _principal(p: _Parameters) -> tuple[ParameterValues, ParameterValues]:
     """Moore and Hubbard (2019): radii of gyration k about principal axes a and b, a turned by alpha about y."""
     parameters = p.named("w", "c", "lam", "g", "rR", "rF", "mR", "mF", "mH", "xH", "zH")
     implied = {}  # what follows from the rest, or is zero by symmetry, and may be written out
@@ -139,7 +139,7 @@ def _principal(p: _Parameters) -> tuple[Values, Values]:
     return parameters, rider
 
 
-def _moore(p: _Parameters) -> tuple[Values, None]:
+def _moore(p: _Parameters) -> tuple[ParameterValues, None]:
     """Moore (2012): places and inertias of rear and front frame in axes of which the third is the steer axis."""
     d1, d2, d3, rR, rF = p.pop_values("d1", "d2", "d3", "rr", "rf")
     # The wheels stand on one level: (d1 + d3) sin(lam) - d2 cos(lam) = rF - rR.
@@ -163,7 +163,7 @@ def _moore(p: _Parameters) -> tuple[Values, None]:
     return parameters, None
 
 
-def _moore_lean(p: _Parameters) -> tuple[Values, Values]:
+def _moore_lean(p: _Parameters) -> tuple[ParameterValues, ParameterValues]:
     """The same with an upper body G: its hinge is level, `d4` below the rear wheel's centre; its mass centre is `l5`
     before that centre and `l6` below the hinge."""
     parameters, _ = _moore(p)
@@ -194,7 +194,7 @@ def _of_radii(p: _Parameters, body: str, mass: float) -> tuple[float, float, flo
     return _turned(alpha, mass * aa**2, mass * yy**2, mass * bb**2, 0.0)
 
 
-def _named(moments: tuple[float, ...], prefix: str) -> Values:
+def _named(moments: tuple[float, ...], prefix: str) -> ParameterValues:
     return {prefix + axes: value for axes, value in zip(("xx", "yy", "zz", "xz"), moments, strict=True)}
 
 

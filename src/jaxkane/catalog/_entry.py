@@ -53,9 +53,9 @@ def entry(
     """Put the class that follows into `CATALOG`, with the arguments of `Entry`; its example is `cls()` by default."""
 
     def enter(cls: _Class) -> _Class:
-        found = {**CATALOG, cls.__name__: Entry(book, shows, example or cls, q, u, operations, conservative)}
+        entries = {**CATALOG, cls.__name__: Entry(book, shows, example or cls, q, u, operations, conservative)}
         CATALOG.clear()
-        CATALOG.update(sorted(found.items(), key=lambda named: named[1].book))
+        CATALOG.update(sorted(entries.items(), key=lambda named: named[1].book))
         return cls
 
     return enter

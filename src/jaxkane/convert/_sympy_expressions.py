@@ -191,10 +191,11 @@ class Extractor:
         }
         if unknown:
             raise ValueError(f"{name}: {_listed(unknown)} has no counterpart here: write it by other functions.")
-        foreign = atoms([applied], self.of_motion) - known
-        if foreign:
+        undeclared = atoms([applied], self.of_motion) - known
+        if undeclared:
             raise ValueError(
-                f"{name}: {_listed(foreign)} in the motion is neither coordinate nor speed. What is prescribed in time "
+                f"{name}: {_listed(undeclared)} in the motion is neither coordinate nor speed. What is prescribed in "
+                "time "
                 "is written as an expression of time; an input stands in loads alone."
             )
         inputs = sorted(atoms([applied], self.of_loads) - known, key=str)

@@ -201,10 +201,10 @@ def _of_loads(sympy: Any, lagrange: Any, rate: Any, name: str) -> Any:
             v = part.ang_vel_in(N) if isinstance(part, mechanics.ReferenceFrame) else part.vel(N)
         except ValueError as error:
             raise ValueError(f"{name}: {part}, at which a load acts, has no velocity in {N}: {error}") from error
-        foreign = sorted(mechanics.find_dynamicsymbols(v, reference_frame=N) - known, key=str) if v != 0 else []
-        if foreign:
+        unknown = sorted(mechanics.find_dynamicsymbols(v, reference_frame=N) - known, key=str) if v != 0 else []
+        if unknown:
             raise ValueError(
-                f"{name}: the velocity of {part}, at which a load acts, holds {foreign[0]}, which is neither "
+                f"{name}: the velocity of {part}, at which a load acts, holds {unknown[0]}, which is neither "
                 f"coordinate nor rate of one: write it by {rate} and the like."
             )
         total += v.diff(rate, N).dot(vector) if v != 0 else 0

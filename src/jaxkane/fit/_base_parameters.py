@@ -392,14 +392,15 @@ def estimated(
 
     deviation: Any = np.array([sigma[name] for name in speeds]) if sigma else np.ones(len(speeds))
     s, V, z = _least_squares(A / deviation[:, None], rest / deviation)
-    freedom = rest.size - int(np.sum(s > 0))
-    if not sigma and freedom <= 0:
+    degrees_of_freedom = rest.size - int(np.sum(s > 0))
+    if not sigma and degrees_of_freedom <= 0:
         raise ValueError(
-            f"{rest.size} equations of motion, at {len(rest)} instants, determine {rest.size - freedom} numbers, and "
+            f"{rest.size} equations of motion, at {len(rest)} instants, determine {rest.size - degrees_of_freedom} "
+            "numbers, and "
             "not how large their errors are: give more instants, or `sigma`."
         )
     for _ in range(0 if sigma else 4):  # each equation weighted by what remains in it
-        remains = np.sqrt(np.mean((rest - A @ z) ** 2, axis=0) * rest.size / freedom)
+        remains = np.sqrt(np.mean((rest - A @ z) ** 2, axis=0) * rest.size / degrees_of_freedom)
         deviation = np.maximum(remains, _EXACT * np.where(size > 0, size, size.max()))
         s, V, z = _least_squares(A / deviation[:, None], rest / deviation)
     along = _covariance(A / deviation[:, None] @ V.T, (rest - A @ z) / deviation, s, trial, bool(sigma))

@@ -233,12 +233,12 @@ def autocorrelated_residuals(correlation: float) -> Iterator[str]:
         )
 
 
-def wrong_noise(residuals: ByTrial, innovation: float) -> Iterator[str]:
+def wrong_noise(residuals: ByTrial, mean_squared: float) -> Iterator[str]:
     """Innovations of another size than the noise that they are judged by: the standard errors are as wrong."""
     n = sum(int(np.isfinite(r).sum()) for channels in residuals.values() for r in channels.values())
-    if abs(innovation - 1) > 4 * (2 / n) ** 0.5:
+    if abs(mean_squared - 1) > 4 * (2 / n) ** 0.5:
         yield (
-            f"The innovations have the mean square {innovation:.2f}, where the given noise expects one: standard "
+            f"The innovations have the mean square {mean_squared:.2f}, where the given noise expects one: standard "
             "errors are wrong. Estimate the noise: SpectralDensity(...), NoiseScale(...) among `free`."
         )
 

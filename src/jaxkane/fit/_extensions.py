@@ -64,7 +64,7 @@ class Extension:
         fit, "F test" or "t test" after it; of what is not nested "trials left out" alone, or "BIC" where there is one.
     - `held_out_cost`: the sum of squares of trials that are left out in turn; unknowns of the trials' own, which are
         estimated for those too, count twice the variance of a residual each.
-    - `objections`: what is not plausible, in words. `accepted`, or the `reason` why not.
+    - `bound_violations`: what is not plausible, in words. `accepted`, or the `reason` why not.
     """
 
     name: str
@@ -77,7 +77,7 @@ class Extension:
     p: float = math.nan
     criterion: str = ""
     held_out_cost: float = math.nan
-    objections: tuple[str, ...] = ()
+    bound_violations: tuple[str, ...] = ()
     reason: str = ""
     accepted: bool = False
 
@@ -422,8 +422,8 @@ class SelectionRound:
             return extension
         held_out_cost = math.nan
         if self.folds is not None:
-            freedom = model.degrees_of_freedom - len(new) - count
-            optimism = _optimism(count, score.minimal_cost, freedom, model.correlation)
+            degrees_of_freedom = model.degrees_of_freedom - len(new) - count
+            optimism = _optimism(count, score.minimal_cost, degrees_of_freedom, model.correlation)
             held_out_cost = linearized.cost_left_out(x, self.folds) + optimism
         return dataclasses.replace(
             extension,
@@ -450,8 +450,8 @@ class SelectionRound:
         n, count = len(augmented.base_x), self._unknowns_of_trials(candidate, augmented)
         new, k = range(n, len(fit.names)), len(fit.names) - n + count
         linearized = linearized_problem(problem, at, fit.point, augmented.places(candidate)[1])
-        freedom, correlation = model.degrees_of_freedom - k, fit.autocorrelation
-        after = RestrictedModel(problem, fit.point, fit.names, fit.cost, freedom, correlation, linearized)
+        degrees_of_freedom, correlation = model.degrees_of_freedom - k, fit.autocorrelation
+        after = RestrictedModel(problem, fit.point, fit.names, fit.cost, degrees_of_freedom, correlation, linearized)
         score = score_test(
             linearized,
             range(n),
@@ -462,7 +462,7 @@ class SelectionRound:
         )
         p, criterion, reason = math.nan, "trials left out", ""
         if extension.nested:
-            p, criterion = f_test(model.cost - fit.cost, k, fit.cost, freedom, correlation), "F test"
+            p, criterion = f_test(model.cost - fit.cost, k, fit.cost, degrees_of_freedom, correlation), "F test"
             if not count and use_clusters(linearized, len(fit.names), correlation):
                 p = wald_test(np.asarray(fit.point.x - start.x)[n:], score.covariance, len(linearized.data))
                 criterion = "t test"
@@ -478,8 +478,8 @@ class SelectionRound:
             cost=fit.cost,
             p=p,
             criterion=criterion,
-            held_out_cost=after.held_out_cost(self.folds) + _optimism(count, fit.cost, freedom, correlation),
-            objections=tuple(o for o in group.plausible.bound_violations(after.values) if o not in before),
+            held_out_cost=after.held_out_cost(self.folds) + _optimism(count, fit.cost, degrees_of_freedom, correlation),
+            bound_violations=tuple(o for o in group.plausible.bound_violations(after.values) if o not in before),
             reason=reason,
         )
         return extension, after
@@ -493,7 +493,7 @@ class SelectionRound:
             (not is_fitted and np.isnan(extension.p), "not nested, not fitted"),
             (not is_fitted, "promising, not fitted"),
             (is_fitted and not extension.cost < model.cost, "its fit lowers nothing"),
-            (extension.objections, f"not plausible: {', '.join(extension.objections)}"),
+            (extension.bound_violations, f"not plausible: {', '.join(extension.bound_violations)}"),
             (extension.held_out_cost >= model.held_out_cost(self.folds), "does not predict trials left out"),
         )
         reason = next((words for applies, words in reasons if applies), "")
@@ -512,12 +512,12 @@ class SelectionRound:
         return len(own) * augmented.problem.clusters + augmented.point.z.size - self.model.point.z.size
 
 
-def _optimism(count: int, cost: float, freedom: int, correlation: float) -> float:
+def _optimism(count: int, cost: float, degrees_of_freedom: int, correlation: float) -> float:
     """By how much unknowns of the trials' own make a prediction look better: they are estimated from the trials that
     are left out, which takes away a variance each, and adds one to what comes after (as in Akaike's criterion)."""
-    if not count or freedom <= 0:
+    if not count or degrees_of_freedom <= 0:
         return 0.0
-    return 2.0 * count * cost / freedom / effective_sample_fraction(correlation)
+    return 2.0 * count * cost / degrees_of_freedom / effective_sample_fraction(correlation)
 
 
 def _errors(names: Sequence[str], slopes: np.ndarray, covariance: np.ndarray) -> dict[str, float]:

@@ -92,7 +92,7 @@ class LeastSquares(Optimizer):
     **Arguments:**
 
     - `rtol`: stop when a step promises to lower the cost by less than this part; or where no step lowers it, and what
-        is promised is less than a tenth of a standard error is worth.
+        is predicted is less than a tenth of a standard error is worth.
     - `damping`: at the start; it falls where the promise is kept, and rises where it is not. Gauss-Newton is the
         fastest where the initial guess is near; a step that fails is damped until it does not.
     - `horizons`: shares of every window, such as (0.25, 0.5), that are fitted before the whole: for initial guesses
@@ -122,8 +122,8 @@ class LeastSquares(Optimizer):
         damping, at = float(now.state), now.at
         assert at is not None
         eliminated = eliminate(at.blocks, damping)
-        x, promised = eliminated.step(damping)
-        gain = at.squares - float(promised)
+        x, predicted = eliminated.step(damping)
+        gain = at.squares - float(predicted)
         # What is left of a cost that vanishes is rounding: a millionth of a standard error.
         if gain <= max(self.rtol * at.squares, 1e-12) and damping <= 1e-2:
             return "converged"

@@ -298,7 +298,7 @@ class Fit:
     def notes(self) -> tuple[str, ...]:
         """What a reader should know, in words."""
         problem, parameters, identifiability = self.problem, self.parameters, self.identifiability
-        innovation = self.mean_normalized_innovation_squared
+        mean_squared = self.mean_normalized_innovation_squared
         return (
             *diagnostics.not_converged(self.status),
             *(f"{name} is left out: {why}." for name, why in self.failed.items()),
@@ -307,7 +307,7 @@ class Fit:
             *diagnostics.correlated_parameters(parameters, self.correlation),
             *diagnostics.outlier_trials(self.residuals),
             *diagnostics.autocorrelated_residuals(self.autocorrelation),
-            *(diagnostics.wrong_noise(self.residuals, innovation) if problem.model.noise is not None else ()),
+            *(diagnostics.wrong_noise(self.residuals, mean_squared) if problem.model.noise is not None else ()),
             *diagnostics.wrong_sigma(problem, self.variance, identifiability.degrees_of_freedom),
             *diagnostics.no_degrees_of_freedom(problem, self.variance),
             *self._coarse_steps,

@@ -23,7 +23,7 @@ from ._trial import Trial
 def validate(fit: Fit, trials: Sequence[Trial] | Trial) -> Fit:
     """The parameters of a fit on other trials, of which only starts and biases are estimated (held-out data).
 
-        jk.fit.validate(result, others).variance_accounted_for
+        jk.fit.validate(result, validation_trials).variance_accounted_for
 
     **Returns:** a `Fit` of these trials, with the status "validated": its `cost`, `variance_accounted_for`, `tests` and
     report are those of these trials; its parameters were not fitted to them, and have no errors (NaN). Trials that
@@ -168,8 +168,8 @@ def costs_by_trial(problem: Problem, point: Unknowns) -> np.ndarray:
     except Unsimulated as error:
         costs, left = np.full(len(problem.trials), np.inf), np.delete(np.arange(len(problem.trials)), [*error.reasons])
         if left.size:
-            others = problem.with_trials([problem.trials[k] for k in left])
-            costs[left] = costs_by_trial(others, dataclasses.replace(others.start, x=point.x))
+            left_out = problem.with_trials([problem.trials[k] for k in left])
+            costs[left] = costs_by_trial(left_out, dataclasses.replace(left_out.start, x=point.x))
         return costs
     value = at.prediction.cost
     costs = np.sum(np.asarray(at.blocks.R)[:, :, -1] ** 2, axis=1) if value is None else np.asarray(value)

@@ -262,8 +262,8 @@ def levenberg_marquardt(residual: Callable[[Array, Any], Array], z: Array, args:
     def step(carry):
         z, r, damping, small, k = carry
         J = jacobian(F, z)
-        safe = jnp.all(jnp.isfinite(J))
-        J = jnp.where(safe, J, 0.0)
+        finite = jnp.all(jnp.isfinite(J))
+        J = jnp.where(finite, J, 0.0)
         size = jnp.linalg.norm(J, axis=0)
         size = jnp.where(size > 0, size, 1.0)  # of columns, so that units do not matter
         U, s, Vt = jnp.linalg.svd(J / size[None, :], full_matrices=False)
@@ -273,7 +273,7 @@ def levenberg_marquardt(residual: Callable[[Array, Any], Array], z: Array, args:
         better = cost(trial) < cost(r)
         tiny = jnp.all(jnp.abs(dz) <= 4 * eps * (1 + jnp.abs(z)))
         z, r = jnp.where(better, z + dz, z), jnp.where(better, trial, r)
-        small = jnp.where(tiny | ~safe | (~better & (damping < 1e-13)) | (damping > 1e8), 1, 0)
+        small = jnp.where(tiny | ~finite | (~better & (damping < 1e-13)) | (damping > 1e8), 1, 0)
         damping = jnp.where(better, damping * jnp.where(damping < 1e-6, 0.0, 0.03), 10 * jnp.maximum(damping, 1e-14))
         return z, r, damping, small, k + 1
 
