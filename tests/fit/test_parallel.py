@@ -49,9 +49,9 @@ for k in range(3):
     seen = {name: y + 0.01 * rng.normal(size=t.shape) for name, y in zip(("angle", "rate"), ride)}
     trials.append(jk.fit.Trial(t, seen, {"torque": 3 * np.sin(2 * t + k)}, sigma=0.01, name=f"pendulum {k}"))
 windows = []
-from jaxkane.fit._problem import programs
-original = programs.each
-programs.each = lambda f, args: (windows.append(jax.tree.leaves(args)[0].shape[0]), original(f, args))[1]
+import jaxkane.fit._linearize as linearization
+original = linearization.map_windows
+linearization.map_windows = lambda f, args: (windows.append(jax.tree.leaves(args)[0].shape[0]), original(f, args))[1]
 
 def fitted(given):
     return jk.fit.fit(
