@@ -25,7 +25,7 @@ def public_names(module):
     tree = ast.parse((PACKAGE.joinpath(*module.split(".")[1:]) / "__init__.py").read_text(encoding="utf-8"))
     imports = [node for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) and node.module]
     names = [(alias, node.module.split(".")[0]) for node in imports for alias in node.names]
-    return {alias.asname: room for alias, room in names if alias.asname == alias.name}
+    return {a.asname: room for a, room in names if a.asname == a.name and not a.name.startswith("_")}
 
 
 def modules():
