@@ -35,6 +35,42 @@ class RodOnPin(jk.System):
         return jk.weight(motion, 9.8 * N.x), jk.Force((inputs["push"] - self.damping * u["v"]) * N.y, motion["point"])
 
 
+class OnACircle(jk.System):
+    """A point on a circle of 1 m, N.y up: y follows from x."""
+
+    coordinates, speeds = ("x", "y"), ("x_dot",)
+    dependent_speeds, dependent_coordinates = ("y_dot",), ("y",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(q["x"] * N.x + q["y"] * N.y, u["x_dot"] * N.x + u["y_dot"] * N.y)
+        return jk.Motion([jk.Body(1.0, 0.0, P)], points={"P": P})
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+
+    def configuration_constraints(self, t, q):
+        return [q["x"] ** 2 + q["y"] ** 2 - 1.0]
+
+
+class Slider(jk.System):
+    """A rod hinged to a slider: right; the wrong ones differ from it in a line."""
+
+    mass: jk.Scalar = jk.parameter(1.0)
+    inertia: jk.Scalar = jk.parameter(0.1)
+    coordinates = ("x", "angle")
+    speeds = ("x_dot", "angle_dot")
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(q["x"] * N.x, self.rate(u) * N.x)
+        B = N.rotate(3, q["angle"], u["angle_dot"], "B")
+        return jk.Motion([jk.Body(self.mass, (self.inertia,) * 3, P.fixed(0.5 * B.x), B, name="rod")])
+
+    def rate(self, u):
+        return u["x_dot"]
+
+
 class Bead(jk.System):
     """On a circle of 1 m, without weight: x = sin(w t). Its vertical speed depends on the horizontal one, for
     a quarter of a turn; there it no longer does. An event ends it before."""

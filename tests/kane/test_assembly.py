@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import OnACircle
 
 import jaxkane as jk
 from jaxkane.catalog import RigidBody
@@ -43,18 +44,6 @@ class Plane(jk.System):
 
     def configuration_constraints(self, t, q):
         return [q["y"] - self.height - q["x"] ** 2]
-
-
-class OnACircle(jk.System):
-    coordinates, speeds = ("x", "y"), ("x_dot",)
-    dependent_speeds, dependent_coordinates = ("y_dot",), ("y",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q[0] * N.x + q[1] * N.y, u[0] * N.x + u[1] * N.y))])
-
-    def configuration_constraints(self, t, q):
-        return [q["x"] ** 2 + q["y"] ** 2 - 1.0]
 
 
 def test_what_is_named_is_held_and_other_orientations_are_none(balls):

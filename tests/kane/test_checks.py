@@ -8,28 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from mechanisms import Bead
+from mechanisms import Bead, OnACircle, Slider
 
 import jaxkane as jk
 from jaxkane._kane.checks import _is_possible
 from jaxkane.catalog import DoublePendulum, WhippleBicycle
-
-
-class Slider(jk.System):
-    """A right description, from which the wrong ones differ in one line."""
-
-    mass: jk.Scalar = jk.parameter(1.0)
-    inertia: jk.Scalar = jk.parameter(0.1)
-    coordinates = ("x", "angle")
-    speeds = ("x_dot", "angle_dot")
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        P = O.moving(q["x"] * N.x, u["x_dot"] * N.x)
-        B = N.rotate(3, q["angle"], u["angle_dot"], "B")
-        G = P.fixed(0.5 * B.x)
-        return jk.Motion([jk.Body(self.mass, (self.inertia,) * 3, G, B, name="rod")])
-
 
 STATE = ([0.1, 0.2], [0.3, 0.4])
 
@@ -432,18 +415,6 @@ def test_shapes_and_names():
         jk.accelerations(bike, 0.0, q, u, {"brake": 1.0})
     with pytest.raises(ValueError, match=r"q has no lean; it has roll"):
         jk.accelerations(bike, 0.0, {"lean": 0.1}, u)
-
-
-class OnACircle(jk.System):
-    coordinates, speeds = ("x", "y"), ("x_dot",)
-    dependent_speeds, dependent_coordinates = ("y_dot",), ("y",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        return jk.Motion([jk.Body(1.0, 0.0, O.moving(q[0] * N.x + q[1] * N.y, u[0] * N.x + u[1] * N.y))])
-
-    def configuration_constraints(self, t, q):
-        return [q["x"] ** 2 + q["y"] ** 2 - 1.0]
 
 
 def test_assemble_says_when_it_cannot():

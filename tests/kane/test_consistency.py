@@ -7,28 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import Slider
 
 import jaxkane as jk
 
 TS = np.linspace(0.0, 0.1, 3)
-
-
-class Slider(jk.System):
-    """A rod hinged to a slider: right; the wrong ones differ from it in a line."""
-
-    mass: jk.Scalar = jk.parameter(1.0)
-    inertia: jk.Scalar = jk.parameter(0.1)
-    coordinates = ("x", "angle")
-    speeds = ("x_dot", "angle_dot")
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        P = O.moving(q["x"] * N.x, self.rate(u) * N.x)
-        B = N.rotate(3, q["angle"], u["angle_dot"], "B")
-        return jk.Motion([jk.Body(self.mass, (self.inertia,) * 3, P.fixed(0.5 * B.x), B, name="rod")])
-
-    def rate(self, u):
-        return u["x_dot"]
 
 
 STATE = jk.State(np.array([0.1, 0.2]), np.array([0.3, 0.4]))

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from mechanisms import OnACircle
 
 import jaxkane as jk
 from jaxkane._common.lookup import hint
@@ -47,22 +48,6 @@ def test_every_look_up_says_what_was_meant(ride):
         jk.simulate(PENDULUM, state, TS, {"sholder_torque": 1.0})
     with pytest.raises(KeyError, match="did you mean 'theta2_dot'"):
         jk.simulate(PENDULUM, state, TS, {"elbow_torque": lambda t, state: state["theta2_dott"]})
-
-
-class OnACircle(jk.System):
-    coordinates, speeds = ("x", "y"), ("x_dot",)
-    dependent_speeds, dependent_coordinates = ("y_dot",), ("y",)
-
-    def motion(self, t, q, u):
-        N, O = jk.inertial()
-        P = O.moving(q["x"] * N.x + q["y"] * N.y, u["x_dot"] * N.x + u["y_dot"] * N.y)
-        return jk.Motion([jk.Body(1.0, 0.0, P)], points={"P": P})
-
-    def loads(self, t, q, u, motion, inputs):
-        return jk.weight(motion, -9.81 * motion.N.y)
-
-    def configuration_constraints(self, t, q):
-        return [q["x"] ** 2 + q["y"] ** 2 - 1.0]
 
 
 class Undeclared(OnACircle):

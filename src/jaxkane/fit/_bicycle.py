@@ -52,7 +52,8 @@ def fit_bicycle(
     """
     problem = bicycle_problem(rides, bicycle, free, **options)
     optimizer = GradientDescent() if optimizer is None else optimizer
-    return solve(problem, optimizer, steps, start, checkpoint, callback, progress)
+    run = {"steps": steps, "callback": callback, "progress": progress}
+    return solve(problem, optimizer, start=start, checkpoint=checkpoint, **run)
 
 
 @with_options

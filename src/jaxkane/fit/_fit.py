@@ -76,21 +76,20 @@ def fit(
     **Raises:** `ValueError` that names what is wrong with a trial, a channel, a parameter or a window.
     """
     problem = Problem.of(system, trials, free, **options)
-    return solve(problem, optimizer, steps, start, checkpoint, callback, progress)
+    run = {"steps": steps, "callback": callback, "progress": progress}
+    return solve(problem, optimizer, start=start, checkpoint=checkpoint, **run)
 
 
 def solve(
     problem: Problem,
     optimizer: Optimizer | None = None,
-    steps: int | None = None,
+    *,
     start: Unknowns | None = None,
     checkpoint: str | os.PathLike[str] | None = None,
-    callback: Callable[[Unknowns, float], None] | None = None,
-    progress: bool = False,
+    **run: Any,
 ) -> Fit:
     """`minimize`, and again from where it ended while the steps of integration are too coarse there."""
     method: Any = LeastSquares() if optimizer is None else optimizer
-    run: Any = {"steps": steps, "callback": callback, "progress": progress}
     result = minimize(problem, method, start=start, checkpoint=checkpoint, **run)
     # The checkpoint has the first run only: what follows begins near its end.
     for _ in range(3):
