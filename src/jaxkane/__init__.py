@@ -22,7 +22,7 @@ from ._integrate.queries import velocities as velocities
 from ._integrate.simulate import simulate as simulate
 from ._integrate.status import Status as Status
 from ._integrate.trajectory import Trajectory as Trajectory
-from ._kane.assembly import assemble as assemble
+from ._kane.assemble import assemble as assemble
 from ._kane.constraints import best_dependent_speeds as best_dependent_speeds
 from ._kane.equations import accelerations as accelerations
 from ._kane.equations import constraint_jacobian as constraint_jacobian

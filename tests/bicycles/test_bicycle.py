@@ -128,7 +128,7 @@ def test_steer_damping_takes_power():
 
 def test_dependent_speeds_become_singular_where_the_design_says():
     """det C_dep changes sign at a steer of 91.77 degrees, upright; its condition number is about 120 at 90."""
-    from jaxkane._kane.kane import KaneEquations
+    from jaxkane._kane.kanes_method import KaneEquations
     from jaxkane._scalarjit.components import determinant, stack
 
     def det(degrees):

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._kane.kane import _motion_rates
+from jaxkane._kane.kanes_method import _motion_rates
 from jaxkane.bicycles import (
     Bicycle,
     ConstantSpeed,

@@ -12,7 +12,7 @@ import pytest
 import jaxkane as jk
 from jaxkane import Status
 from jaxkane._animate._figures import Sketch, figure_of
-from jaxkane._kane.kane import _motion_rates
+from jaxkane._kane.kanes_method import _motion_rates
 from jaxkane._scalarjit.function import Program
 from jaxkane._system.parameters import with_parameters
 from jaxkane.bicycles import (

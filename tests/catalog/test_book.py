@@ -16,7 +16,7 @@ from numpy import cos, sin
 
 import jaxkane as jk
 from jaxkane import catalog
-from jaxkane._kane.kane import KaneEquations
+from jaxkane._kane.kanes_method import KaneEquations
 
 RTOL = 1e-12
 # Under jit, where inertias are not checked: those drawn or given at random need not be a body's.

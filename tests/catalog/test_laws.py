@@ -9,7 +9,7 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 import jaxkane as jk
-from jaxkane._kane.kane import KaneEquations
+from jaxkane._kane.kanes_method import KaneEquations
 from jaxkane.catalog import CATALOG
 
 T = 0.3  # [s]: by then the engines of Example 5 have changed their speed

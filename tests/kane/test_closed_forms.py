@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxkane as jk
-from jaxkane._kane.kane import KaneEquations
+from jaxkane._kane.kanes_method import KaneEquations
 from jaxkane.catalog import CATALOG
 
 

@@ -8,7 +8,7 @@ from sympy_systems import FIGURES, FourBarLinkage, RollingDiscDependent
 
 import jaxkane as jk
 from jaxkane import constraint_forces, constraint_multipliers
-from jaxkane._kane.kane import KaneEquations
+from jaxkane._kane.kanes_method import KaneEquations
 from jaxkane.catalog import CATALOG
 
 RTOL = 1e-12

@@ -9,7 +9,7 @@ import pytest
 from operations import ODD, OPERATIONS
 
 import jaxkane as jk
-from jaxkane._kane.kane import _motion_rates, motion_rates
+from jaxkane._kane.kanes_method import _motion_rates, motion_rates
 from jaxkane._scalarjit import function
 from jaxkane._scalarjit.backends import native as native_kernels
 from jaxkane._scalarjit.function import Program, ScalarFunction

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._kane.assembly import newton, newton_in_numbers
+from jaxkane._kane.assemble import newton, newton_in_numbers
 from jaxkane._scalarjit.function import ScalarFunction
 
 ARGUMENTS = ({"a": jnp.array(0.7)}, np.array(-1.2), np.array([0.3, 0.9, -0.4]))

@@ -10,7 +10,7 @@ from mechanisms import RodOnPin
 
 import jaxkane as jk
 from jaxkane.stability import critical_speeds, eigenvalues, equilibrium, family, linearize
-from jaxkane.stability._eig import eig, eigvals
+from jaxkane.stability._eig_of_matrix import eig, eigvals
 
 
 def pair(p):

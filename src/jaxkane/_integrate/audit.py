@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._kane.constraints import configuration_residual, relative_condition
-from .._kane.kane import accelerations_and_mass_matrix
+from .._kane.kanes_method import accelerations_and_mass_matrix
 from .._kane.reactions import Reactions
 from .._kane.rhs import rates
 from .._scalarjit.cache_key import jit

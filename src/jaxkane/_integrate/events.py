@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._kane.kane import KaneEquations
+from .._kane.kanes_method import KaneEquations
 from .._scalarjit.compat import depends_on
 from .._scalarjit.components import Component, as_vector, determinant
 from .._scalarjit.function import ScalarFunction

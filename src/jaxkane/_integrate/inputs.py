@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 
 from .._common.lookup import not_there, refuse_unknown
 from .._kane.arguments import checked_inputs, is_numeric
-from .._kane.kane import KaneEquations
+from .._kane.kanes_method import KaneEquations
 from .._scalarjit.compat import Tracer, evaluated, interpret, operation_of, programs_in, types_of
 from .._scalarjit.components import Component, Inputs
 from .._system.system import State, System, explain_value_of_traced, names_of

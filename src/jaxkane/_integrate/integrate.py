@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from .._kane.constraints import configuration_is_met, correction, has_configuration_constraints, projected
-from .._kane.kane import KaneEquations
+from .._kane.kanes_method import KaneEquations
 from .._kane.rhs import outputs_at, rates_are_native, values_of, vector_field
 from .._scalarjit.cache_key import captured_tracers, captures_any, jit
 from .._scalarjit.components import as_vector

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._kane.equations import InputValues, _dependent_accelerations, checked_arrays, finite_or_explained
-from .._kane.kane import KaneEquations, motion_rates
+from .._kane.kanes_method import KaneEquations, motion_rates
 from .._kane.reactions import forces_now, multipliers_now
 from .._kane.rhs import outputs_at, rates
 from .._scalarjit.cache_key import jit

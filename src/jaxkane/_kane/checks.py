@@ -23,7 +23,7 @@ from .._system.parameters import in_batches
 from .._system.system import State, System
 from .arguments import is_concrete
 from .constraints import configuration_residual
-from .kane import DescriptionEvaluator, at_random_point, frames_of, structure_of, turning_bodies
+from .kanes_method import DescriptionEvaluator, at_random_point, frames_of, structure_of, turning_bodies
 
 ROUNDING, MEASURED = 2e-3, 0.05
 ROTATION_ERROR = 1e-3

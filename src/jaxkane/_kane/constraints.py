@@ -20,7 +20,7 @@ from .._scalarjit.nan import nan_where
 from .._system.motion import flatten_residuals
 from .._system.system import System
 from .arguments import as_array, check_is_system, check_time, is_concrete, refuse_incomplete
-from .kane import DescriptionEvaluator, KaneEquations
+from .kanes_method import DescriptionEvaluator, KaneEquations
 
 SINGULAR_ROUNDING = 1e-12
 """The reciprocal of the largest condition number with which residuals are solved for dependent speeds."""

@@ -22,7 +22,7 @@ from .._system.system import System
 from .arguments import as_array, as_row, check_is_system, check_time, checked_values, is_concrete, refuse_incomplete
 from .checks import check_system
 from .constraints import SINGULAR_ROUNDING, check_left_out, constraint_rows, dependent_speeds_from
-from .kane import KaneEquations, jvp, motion_rates, rates_and_equations
+from .kanes_method import KaneEquations, jvp, motion_rates, rates_and_equations
 
 InputValues = Mapping[str, Component] | None
 

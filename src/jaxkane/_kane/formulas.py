@@ -31,7 +31,7 @@ from .equations import (
     kinetic_energy,
     partial_velocities,
 )
-from .kane import DescriptionEvaluator, motion_rates
+from .kanes_method import DescriptionEvaluator, motion_rates
 from .rhs import rates
 
 

@@ -24,7 +24,7 @@ from .._system.motion import Motion
 from .._system.system import System
 from .arguments import Row, as_row
 from .equations import InputValues
-from .kane import EvaluatedDescription, KaneEquations, motion_rates, unit
+from .kanes_method import EvaluatedDescription, KaneEquations, motion_rates, unit
 
 
 @jit

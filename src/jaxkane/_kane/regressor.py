@@ -21,7 +21,7 @@ from .._system.kinematics import Point, Vector
 from .._system.motion import UNNAMED, Body, Force, Motion, parallel_axis
 from .._system.system import System
 from .arguments import Row
-from .kane import (
+from .kanes_method import (
     DescriptionEvaluator,
     EvaluatedDescription,
     KaneEquations,

@@ -21,7 +21,7 @@ from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Motion
 from .._system.system import NamedVector, State, System, has_outputs, packed, unpacked
 from .arguments import Inputs, Row, as_row, inputs_of
-from .kane import KaneEquations, jvp, motion_rates
+from .kanes_method import KaneEquations, jvp, motion_rates
 from .reactions import Reactions
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._common.lookup import refuse_unknown
-from .._kane.assembly import assemble
+from .._kane.assemble import assemble
 from .._kane.constraints import has_configuration_constraints
 from .._kane.regressor import Bodies
 from .._scalarjit.cache_key import jit

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._common.lookup import not_there
-from .._kane.kane import DescriptionEvaluator
+from .._kane.kanes_method import DescriptionEvaluator
 from .._kane.regressor import origin_of
 from .._scalarjit.cache_key import jit
 from .._system.parameters import leaf_name

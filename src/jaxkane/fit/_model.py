@@ -16,7 +16,7 @@ from .._integrate.inputs import Samples, share_times
 from .._integrate.integrate import solve
 from .._integrate.settings import Settings, settings_for
 from .._integrate.trajectory import Trajectory
-from .._kane.assembly import assemble
+from .._kane.assemble import assemble
 from .._system.system import System, packed, unpacked
 from ._parameters import Parameters
 from ._process_noise import Noise

@@ -17,7 +17,7 @@ from jaxtyping import Array
 
 from .._common.lookup import as_names, hint, real_number, refuse_unknown
 from .._integrate.trajectory import Trajectory
-from .._kane.assembly import AssemblyProblem, NoConfiguration, euler_parameters
+from .._kane.assemble import AssemblyProblem, NoConfiguration, euler_parameters
 from .._kane.constraints import has_configuration_constraints
 from .._kane.rhs import output_names
 from .._system.system import System

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from .._kane.arguments import as_array, check_is_system, check_time, checked_values, refuse_incomplete
 from .._kane.checks import check_system
 from .._kane.equations import InputValues
-from .._kane.kane import at_random_point, structure_of
+from .._kane.kanes_method import at_random_point, structure_of
 from .._kane.regressor import (
     UNITS,
     Bodies,

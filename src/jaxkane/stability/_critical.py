@@ -17,7 +17,7 @@ from .._kane.arguments import is_concrete
 from .._scalarjit.cache_key import jit
 from .._scalarjit.nan import nan_where
 from .._system.system import System
-from ._eig import Eig, eig
+from ._eig_of_matrix import Eig, eig
 from ._eigenvalues import MotionAt, eigenvalues, motion_family, names_of_modes, state_matrix, track_modes
 
 _MOST = 8

@@ -21,7 +21,7 @@ from .._system.parameters import parameter_info
 from .._system.system import State, System, unit_of, units_of
 from ..catalog import WhippleBicycle
 from ._bicycle import straight_ahead
-from ._eig import MOST_CONDITION, Eig, eig
+from ._eig_of_matrix import MOST_CONDITION, Eig, eig
 from ._linearize import linearize
 from ._modes import LATERAL, Groups, mode_names, track_modes
 from ._steady import SteadyMotion

@@ -26,7 +26,7 @@ from .._scalarjit.function import ScalarFunction
 from .._scalarjit.nan import nan_where
 from .._system.parameters import parameters_in
 from .._system.system import NamedVector, State, System
-from ._eig import Eig, eig, eigvals
+from ._eig_of_matrix import Eig, eig, eigvals
 from ._steady import (
     SteadyMotion,
     check_dependent,

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from ..catalog import WhippleBicycle
-from ._eig import Eig
+from ._eig_of_matrix import Eig
 
 LATERAL = WhippleBicycle.lateral
 """The states of Meijaard et al. (2007); riding straight, the speed does not notice them to first order."""

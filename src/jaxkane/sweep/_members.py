@@ -15,7 +15,7 @@ from .._common.lookup import not_there
 from .._integrate.inputs import Samples, as_signals
 from .._integrate.simulate import as_state, checked_state
 from .._kane.arguments import is_concrete
-from .._kane.assembly import assemble
+from .._kane.assemble import assemble
 from .._kane.checks import check_system
 from .._scalarjit.components import Inputs
 from .._system.parameters import in_batches, parameters_in, with_parameters

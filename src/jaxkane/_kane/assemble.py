@@ -24,7 +24,7 @@ from .arguments import as_array, check_is_system, check_time, is_concrete
 from .checks import check_system
 from .constraints import configuration_residual, configuration_tolerance, implied_residual
 from .equations import dependent_speeds
-from .kane import at_random_point, structure_of
+from .kanes_method import at_random_point, structure_of
 
 
 class AssemblyProblem(NamedTuple):
