@@ -7,9 +7,10 @@ import sys
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
-from benchmarks import _peers, chain
+from benchmarks import _peers, chain, first_calls
 from benchmarks._figures import Figure, digits, line
 from benchmarks._picture import draw, times_faster
 from benchmarks._process import child
@@ -145,3 +146,17 @@ def test_rivals_run_in_turns():
 def test_a_child_that_fails_says_why():
     with pytest.raises(RuntimeError, match="No module named no_such_module"):
         list(child("no_such_module"))
+
+
+def test_the_floor_of_first_calls_solves_its_equation():
+    rtol = 1e-7
+    slopes = first_calls.floor("sensitivities", samples=3, parameters=4)()
+    np.testing.assert_allclose(slopes, np.full(4, -5 * np.exp(-5) / 4), rtol=rtol)  # y = exp(-k t), k their mean
+    for call, shape in {"simulate": (3, 11), "gradient": (4,), "sweep": (first_calls.MEMBERS, 3, 11)}.items():
+        assert jax.eval_shape(first_calls.floor(call, samples=3, parameters=4)).shape == shape
+
+
+def test_parts_of_first_calls_are_seconds_of_the_wall():
+    assert first_calls.union([(5.0, 6.0), (1.0, 3.0), (2.0, 4.0), (1.5, 2.0)]) == 4.0
+    seconds = {"floor": 2.0, "native": 3.0, "XLA alone": 7.0}
+    assert first_calls.row("sweep", seconds) == "| sweep | 2 s | 3 s | 1.5 | 7 s | 3.5 |"
