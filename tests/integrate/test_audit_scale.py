@@ -8,7 +8,7 @@ import pytest
 
 import jaxkane as jk
 from jaxkane._integrate.audit import _quantities
-from jaxkane._kane import kane as rates
+from jaxkane._kane import kanes_method as rates
 from jaxkane._scalarjit import components
 from jaxkane._scalarjit.function import Program
 

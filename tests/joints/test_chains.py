@@ -7,7 +7,7 @@ import pytest
 from benchmarks.chain import Chain
 
 import jaxkane as jk
-from jaxkane._kane import kane as rates
+from jaxkane._kane import kanes_method as rates
 from jaxkane._scalarjit import components
 from jaxkane._scalarjit.function import Program
 
