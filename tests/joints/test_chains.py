@@ -55,6 +55,16 @@ def test_both_forms_agree(name, monkeypatch):
     jax.tree.map(close, *found)
 
 
+def test_both_forms_agree_in_reverse(monkeypatch):
+    system, t, q, u, inputs = SYSTEMS["double pendulum"]()
+    found = []
+    for most in (12, 0):
+        monkeypatch.setattr(components, "_UNROLL_UP_TO", most)
+        last = lambda *args: jk.accelerations(args[0], t, *args[1:], inputs)[1]  # noqa: E731
+        found.append(jax.jit(jax.grad(last, argnums=(0, 1, 2)))(system, q, u))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-11, atol=1e-12), *found)
+
+
 @pytest.mark.slow
 def test_a_long_chain_keeps_its_energy():
     chain, _, q, u, _ = at(Chain(n=14), 14)

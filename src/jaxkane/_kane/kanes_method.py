@@ -14,7 +14,8 @@ are needed are pushed: the residuals along every speed, the bodies along the n i
 
 For a few speeds this is written out, as scalars. For many, sums over bodies for every pair of speeds would be of order
 n^2 b. Then f and the columns of M are found without partial velocities, each in order b: vectors that stand on bodies
-are projected onto all speeds at once by the transpose of the map u -> (v, omega), which `jax.vjp` gives.
+are projected onto all speeds at once by the transpose of the map u -> (v, omega), which `jax.vjp` gives. The native
+kernel of u_dot needs no M: unknowns are eliminated along that map (`_scalarjit.elimination`).
 """
 
 from __future__ import annotations
@@ -51,6 +52,7 @@ from .._scalarjit.components import (
     stack,
     total,
 )
+from .._scalarjit.elimination import ScalarSolve
 from .._scalarjit.function import ScalarFunction
 from .._system.kinematics import Frame
 from .._system.motion import Body, Load, Motion, flatten_loads, flatten_residuals
@@ -454,8 +456,11 @@ def motion_rates(
     """q_dot and u_dot: the right-hand side, from arrays that were checked."""
     if is_written_out(len(system.speeds)):
         return _motion_rates(system, t, q, u, inputs)
-    q_dot, M, f = rates_and_equations(system, t, q, u, inputs)
-    return q_dot, solve_positive_array(M, f)
+    q_dot, f = _rates_and_forcing(system, t, q, u, inputs)
+    # The equation is differentiated, never the solution of the solve.
+    times = lambda u_dot: _mass_times(system, t, q, u, inputs, u_dot)  # noqa: E731
+    solve = lambda _, f: _accelerations_under(system, t, q, u, inputs, f)  # noqa: E731
+    return q_dot, jax.lax.custom_linear_solve(times, f, solve, symmetric=True)
 
 
 def rates_and_equations(
@@ -464,10 +469,14 @@ def rates_and_equations(
     """q_dot, M and f of M u_dot = f, from arrays that were checked."""
     if is_written_out(len(system.speeds)):
         return _equations_written_out(system, t, q, u, inputs)
-    # The columns of M are one program, whose lanes are the directions.
     q_dot, f = _rates_and_forcing(system, t, q, u, inputs)
-    columns = jax.vmap(lambda direction: _mass_times(system, t, q, u, inputs, direction))
-    return q_dot, columns(np.eye(len(system.speeds), dtype=q.dtype)), f
+    return q_dot, _columns(system, t, q, u, inputs), f
+
+
+def _columns(system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]) -> Float[Array, "n n"]:
+    """M. Its columns are one program, whose lanes are the directions."""
+    times = jax.vmap(lambda direction: _mass_times(system, t, q, u, inputs, direction))
+    return times(np.eye(len(system.speeds), dtype=q.dtype))
 
 
 def accelerations_and_mass_matrix(
@@ -476,8 +485,7 @@ def accelerations_and_mass_matrix(
     """u_dot and M, from arrays that were checked."""
     if is_written_out(len(system.speeds)):
         return _accelerations_and_mass_matrix(system, t, q, u, inputs)
-    _, M, f = rates_and_equations(system, t, q, u, inputs)
-    return solve_positive_array(M, f), M
+    return motion_rates(system, t, q, u, inputs)[1], _columns(system, t, q, u, inputs)
 
 
 @ScalarFunction
@@ -509,3 +517,19 @@ def _rates_and_forcing(system, t, q, u, inputs):
 def _mass_times(system, t, q, u, inputs, direction):
     kane = KaneEquations(system, t, q, u, inputs)
     return as_vector(kane.mass_times(as_row(direction, system.speeds, "direction")), q)
+
+
+def _accelerations_by_lapack(system, t, q, u, inputs, f):
+    return solve_positive_array(_columns(system, t, q, u, inputs), f)
+
+
+@functools.partial(ScalarSolve, by_lapack=_accelerations_by_lapack)
+def _accelerations_under(system, t, q, u, inputs, u_dot):
+    # M u_dot = f. Twice the kinetic energy is u^T M u = sum_i v_i . m_i v_i + omega_i . I_i omega_i
+    kane = KaneEquations(system, t, q, u, inputs)
+    direction = kane.with_dependent(as_row(u_dot, system.speeds, "u_dot"))
+    vectors = [x for pair in kane.along_speeds(kane.velocities, direction)[0] for x in pair]
+    rows: list[Row] = []
+    for mass, inertia in kane.read("bodies", kane.t, kane.q, kane.u_all):
+        rows += [(mass, 0.0, 0.0), (0.0, mass, 0.0), (0.0, 0.0, mass), *inertia]
+    return stack(vectors).astype(q.dtype), stack(rows).astype(q.dtype).reshape(-1, 3, 3)

@@ -18,6 +18,7 @@ import sys
 import threading
 import time
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -238,15 +239,16 @@ FMOD = "fmod"  # in the C library what is `rem` in JAX
 
 
 class Scalars:
-    """A program as a graph, and the targets compiled from it.
+    """A program as a graph, or what `as_graph` makes of it, and the targets compiled from that.
 
     Raises `NotScalarError` where the program cannot be written so.
     """
 
-    def __init__(self, program: ClosedJaxpr):
-        self.graph, self.outputs = graph_of(program)
-        inputs, results = types_of(program)
-        self.bytes_of = [a.size * a.dtype.itemsize for a in (*inputs, *results)]
+    def __init__(self, program: ClosedJaxpr, as_graph: Callable[..., tuple[Graph, list[np.ndarray]]] = graph_of):
+        self.graph, self.outputs = as_graph(program)
+        nodes, inputs = self.graph.nodes, types_of(program)[0]
+        results = [[np.dtype(nodes[k].dtype) for k in x.flat] for x in self.outputs]
+        self.bytes_of = [a.size * a.dtype.itemsize for a in inputs] + [sum(d.itemsize for d in x) for x in results]
         self.functions = {
             symbol(node._replace(operation=FMOD) if node.operation == "rem" else node)
             for node in self.graph.nodes
