@@ -3,6 +3,7 @@
 import functools
 import subprocess
 import sys
+import warnings
 
 import equinox as eqx
 import jax
@@ -288,3 +289,18 @@ def test_what_members_share_remains_shared():
     np.testing.assert_allclose(slopes(a), 2 * np.cos(0.7) + 6.0, rtol=1e-14)
     batch = jax.jit(jax.vmap(with_a_constant))(b)
     np.testing.assert_array_equal(batch, [np.ones(3), 2 * b])
+
+
+def test_where_devices_share_the_work_it_is_one_operation_too():
+    """JAX places constants on the devices of a mesh, by an operation that is none of scalars."""
+
+    @ScalarFunction
+    def nearest(x):
+        return jnp.where(x > 0.0, x, jnp.full_like(2.0 * x, jnp.inf))
+
+    mesh = jax.make_mesh((1,), ("members",), axis_types=(jax.sharding.AxisType.Auto,))
+    over, spec = functools.partial(jax.shard_map, mesh=mesh, check_vma=False), jax.sharding.PartitionSpec("members")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = jax.jit(over(jax.vmap(nearest), in_specs=(spec,), out_specs=spec))(jnp.array([-1.0, 2.0]))
+    np.testing.assert_array_equal(found, [jnp.inf, 2.0])

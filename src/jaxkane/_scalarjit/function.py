@@ -47,6 +47,7 @@ from .jaxpr import (
     cse,
     is_fusable,
     is_inexact,
+    program_of,
     reads_of,
     replaced,
     specs_of,
@@ -258,7 +259,7 @@ class _CapturedTracerError(Exception):
 
 
 def _jaxpr_of(f: Callable[..., Any], specs: Sequence[Any]) -> tuple[ClosedJaxpr, Any]:
-    program, out = jax.make_jaxpr(f, return_shape=True)(*specs)
+    program, out = program_of(f, *specs, return_shape=True)
     if any(isinstance(c, Tracer) for c in program.consts):
         raise _CapturedTracerError
     return program, out
@@ -324,7 +325,7 @@ class Program:
             of_linear = lambda *ys: self.evaluate(*replaced(full, places, ys))  # noqa: E731
             return jax.linear_transpose(of_linear, *[specs[i] for i in places])(list(cts))
 
-        program = jax.make_jaxpr(cotangents)(*[specs[i] for i in fixed], *specs_of(self.out_avals))
+        program = program_of(cotangents, *[specs[i] for i in fixed], *specs_of(self.out_avals))
         return Program(program, self.label, frozenset(j for j, i in enumerate(fixed) if i in self.loop_invariant))
 
     def _batched(self, sizes: tuple[int, ...], where: Where) -> Program:
@@ -336,7 +337,7 @@ class Program:
         f = lambda *xs: self.evaluate(*xs)  # noqa: E731
         for d in reversed(range(len(sizes))):
             f = jax.vmap(f, in_axes=tuple(0 if has[d] else None for has in where), axis_size=sizes[d])
-        return Program(jax.make_jaxpr(f)(*avals), self.label)
+        return Program(program_of(f, *avals), self.label)
 
     def moved(self, moving: tuple[bool, ...]) -> tuple[bool, ...]:
         """Which outputs follow from any of the inputs that move."""
@@ -352,7 +353,7 @@ class Program:
             return [y for y, is_one in results if is_one]
 
         fixed = frozenset(j for j, i in enumerate(places) if i in self.loop_invariant)
-        return Program(jax.make_jaxpr(part)(*[specs[i] for i in places]), self.label, fixed)
+        return Program(program_of(part, *[specs[i] for i in places]), self.label, fixed)
 
     def _jitted(self, sizes: tuple[int, ...], where: Where) -> Callable[..., list[Any]]:
         """The program over a batch, as a function that is compiled once for each kind of batch."""

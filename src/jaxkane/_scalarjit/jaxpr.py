@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -181,6 +181,13 @@ def is_inexact(aval: Any) -> bool:
     return jnp.issubdtype(aval.dtype, jnp.inexact)
 
 
+def program_of(f: Callable[..., Any], *specs: Any, return_shape: bool = False) -> Any:
+    """`jax.make_jaxpr(f)(*specs)` without devices that share the work: in `jax.shard_map` JAX places constants on them,
+    which is no operation of scalars."""
+    with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
+        return jax.make_jaxpr(f, return_shape=return_shape)(*specs)
+
+
 def tangent_program(program: ClosedJaxpr, moving: Sequence[int]) -> ClosedJaxpr:
     """(inputs, tangents of those at the places `moving`) -> tangents of the outputs that have any."""
     (inputs, outputs), evaluate = types_of(program), jaxpr_as_fun(program)
@@ -191,7 +198,7 @@ def tangent_program(program: ClosedJaxpr, moving: Sequence[int]) -> ClosedJaxpr:
         dys = jax.jvp(of_moving, [xs[i] for i in moving], dxs)[1]
         return [dy for dy, aval in zip(dys, outputs, strict=True) if is_inexact(aval)]
 
-    return jax.make_jaxpr(tangents)(specs, [specs[i] for i in moving])
+    return program_of(tangents, specs, [specs[i] for i in moving])
 
 
 Direction = tuple[int, int]  # an argument and the place of the element in it
