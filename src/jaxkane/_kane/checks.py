@@ -5,6 +5,8 @@ Whether velocities, frames and constraints contradict each other is judged by nu
 
 from __future__ import annotations
 
+import functools
+import operator
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
@@ -15,7 +17,7 @@ import numpy as np
 
 from .._scalarjit.cache_key import Cache
 from .._scalarjit.compat import Tracer, concretely
-from .._scalarjit.components import Component, as_vector, is_exact, stack
+from .._scalarjit.components import Component, as_vector, cross, is_exact, stack
 from .._scalarjit.function import ScalarFunction
 from .._system.kinematics import Frame, Point
 from .._system.motion import Force, Load, Motion
@@ -126,34 +128,46 @@ def _listed(moments: np.ndarray) -> str:
 
 def with_possible_bodies(system: System, t: Any, state: State) -> State:
     """The state, or NaN where the system has a body that `check_bodies` refuses: for members of a batch."""
-    bodies = _masses_and_inertias(system, t, state.q)
-    possible = jnp.all(jnp.stack([_is_possible(mass, I, system.check_inertia) for mass, I in bodies]))
     # Whether a body can be does not depend on the state; where it is NaN, it is another check's.
+    possible = _bodies_are_possible(*jax.tree.map(_value, (system, t, state.q)))
     return jax.tree.map(lambda x: jnp.where(possible, x, jnp.nan), state)
 
 
+@ScalarFunction
+def _bodies_are_possible(system: System, t: Any, q: Any) -> Any:
+    bodies = _masses_and_inertias.__wrapped__(system, t, q)
+    return functools.reduce(operator.and_, [_is_possible(mass, I, system.check_inertia) for mass, I in bodies])
+
+
 def _is_possible(mass: Any, I: Any, check_inertia: bool) -> Any:
-    mass, I = jax.lax.stop_gradient((mass, I))
-    trace = jnp.trace(I)
+    trace = I[0, 0] + I[1, 1] + I[2, 2]
     # c - a - b > 5 % of c, where c > trace / 1.95: and no c is, where trace / 1.95 - I has no eigenvalue below zero.
-    possible = (mass >= 0) & (jnp.max(jnp.abs(I - I.T)) <= 1e-6 * jnp.max(jnp.abs(I))) & _is_semidefinite(I)
+    skew = functools.reduce(jnp.maximum, [jnp.abs(I[i, j] - I[j, i]) for i, j in _PAIRS])
+    possible = (mass >= 0) & (skew <= 1e-6 * _size(I)) & _is_semidefinite(I)
     if check_inertia:
-        rest = trace / (2.0 - MEASURED) * jnp.eye(3, dtype=I.dtype) - I
+        rest = trace / (2.0 - MEASURED) * np.eye(3, dtype=I.dtype) - I
         is_rotor = sum(_minors(I)) <= 1e-12 * trace * trace
         possible &= _is_semidefinite(rest) | is_rotor
     return possible
 
 
+_PAIRS = ((0, 1), (0, 2), (1, 2))
+
+
 def _is_semidefinite(A: Any) -> Any:
     # By principal minors: LAPACK's eigenvalues of many small matrices would be slow, and wait for each other.
-    size = jnp.max(jnp.abs(A))
-    det = jnp.dot(A[0], jnp.cross(A[1], A[2]))
-    minors = [(jnp.min(jnp.diag(A)), size), (jnp.min(jnp.stack(_minors(A))), size**2), (det, size**3)]
-    return jnp.all(jnp.stack([x >= -1e-6 * scale for x, scale in minors]))
+    size = _size(A)
+    det = sum(x * y for x, y in zip(A[0], cross(A[1], A[2]), strict=True))
+    minors = [*((A[i, i], size) for i in range(3)), *((x, size**2) for x in _minors(A)), (det, size**3)]
+    return functools.reduce(operator.and_, [x >= -1e-6 * scale for x, scale in minors])
+
+
+def _size(A: Any) -> Any:
+    return functools.reduce(jnp.maximum, [jnp.abs(A[i, j]) for i in range(3) for j in range(3)])
 
 
 def _minors(A: Any) -> list[Any]:
-    return [A[i, i] * A[j, j] - A[i, j] * A[j, i] for i, j in ((0, 1), (0, 2), (1, 2))]
+    return [A[i, i] * A[j, j] - A[i, j] * A[j, i] for i, j in _PAIRS]
 
 
 # -- a description that contradicts itself
