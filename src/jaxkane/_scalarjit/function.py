@@ -283,7 +283,7 @@ class Program:
     """A traced program, and the programs that follow from it, each made once.
 
     `loop_invariant`: places of the arguments that stay what they are while the program is called again and again, as
-    the parameters of a system. `structure`: of the results.
+    the parameters of a system. `tangents`: places of those that are tangents. `structure`: of the results.
     """
 
     def __init__(
@@ -292,8 +292,9 @@ class Program:
         label: str = "A function",
         loop_invariant: frozenset[int] = frozenset(),
         structure: Any = None,
+        tangents: frozenset[int] = frozenset(),
     ):
-        self.label, self.loop_invariant, self.structure = label, loop_invariant, structure
+        self.label, self.loop_invariant, self.structure, self.tangents = label, loop_invariant, structure, tangents
         self.program = cse(program)
         self.evaluate = jaxpr_as_fun(self.program)
         self.in_avals, self.out_avals = self.program.in_avals, self.program.out_avals
@@ -311,7 +312,8 @@ class Program:
         """(primals, tangents of those that move) -> tangents of the outputs that have any."""
         places = [i for i, m in enumerate(moving) if m]
         fixed = self.loop_invariant | {len(moving) + j for j, i in enumerate(places) if i in self.loop_invariant}
-        return Program(tangent_program(self.program, places), self.label, fixed)
+        tangents = self.tangents | frozenset(range(len(moving), len(moving) + len(places)))
+        return Program(tangent_program(self.program, places), self.label, fixed, tangents=tangents)
 
     def _transposed(self, linear: tuple[bool, ...]) -> Program:
         """(the other inputs, cotangents of the outputs) -> cotangents of the linear inputs."""
@@ -415,9 +417,15 @@ def _abstract(*_, program, sizes, where):
 
 
 def _jvp(primals, tangents, *, program, sizes, where):
-    moving = tuple(not is_no_tangent(dx) and is_inexact(x) for x, dx in zip(program.in_avals, tangents, strict=True))
+    moving = tuple(
+        reads and is_inexact(x) and not is_no_tangent(dx)
+        for reads, x, dx in zip(program.reads, program.in_avals, tangents, strict=True)
+    )
     moves = [(dx, w) for dx, m, w in zip(tangents, moving, where, strict=True) if m]
     outputs = _program_p.bind(*primals, program=program, sizes=sizes, where=where)
+    shapes = _abstract(program=program, sizes=sizes, where=where)
+    if not moves:
+        return outputs, list(map(no_tangent, shapes))
     slopes = iter(
         _program_p.bind(
             *primals,
@@ -427,7 +435,6 @@ def _jvp(primals, tangents, *, program, sizes, where):
             where=(*where, *(w for _, w in moves)),
         )
     )
-    shapes = _abstract(program=program, sizes=sizes, where=where)
     return outputs, [next(slopes) if is_inexact(aval) else no_tangent(aval) for aval in shapes]
 
 
@@ -456,6 +463,13 @@ def _batch(args, axes, *, program, sizes, where):
     size = next(x.shape[axis] for x, axis in zip(args, axes, strict=True) if axis is not None)
     args = [x if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in zip(args, axes, strict=True)]
     moving = tuple(axis is not None for axis in axes)
+    if any(moving[i] for i in program.tangents):
+        # Tangents are a batch together: the kernel of a loop serves what is before it too, where fewer of them move.
+        args = [
+            jnp.broadcast_to(x, (size, *x.shape)) if i in program.tangents and not m else x
+            for i, (x, m) in enumerate(zip(args, moving, strict=True))
+        ]
+        moving = tuple(m or i in program.tangents for i, m in enumerate(moving))
     moves = program.moved(moving)
     if any(moves) and not all(moves) and not all(moving):  # what follows from shared inputs alone remains shared
         results = {}
