@@ -94,7 +94,7 @@ def _or_ones(values: Any, info_of: Callable[[Array], ParameterInfo], valid: Arra
     large, rest = eqx.partition(rest, eqx.is_inexact_array)
     leaves, treedef = jax.tree.flatten(small)
     if leaves:
-        leaves = _small_or_ones(_Limits(tuple(map(info_of, leaves))), leaves, valid)
+        leaves = _small_or_ones(leaves, _Limits(tuple(map(info_of, leaves))), valid)
     large = jax.tree.map(lambda x: _or_one(x, info_of(x), valid), large)
     return eqx.combine(jax.tree.unflatten(treedef, leaves), large, rest)
 
@@ -104,7 +104,7 @@ class _Limits(eqx.Module):
 
 
 @ScalarFunction
-def _small_or_ones(limits: _Limits, values: list[Array], valid: Array | None) -> list[Array]:
+def _small_or_ones(values: list[Array], limits: _Limits, valid: Array | None) -> list[Array]:
     return [_or_one(x, info, valid) for x, info in zip(values, limits.infos, strict=True)]
 
 

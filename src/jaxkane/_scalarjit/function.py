@@ -379,15 +379,14 @@ class Program:
             return None
 
     def groups(self, where: Where) -> tuple[tuple[int, ...], ...]:
-        """The arguments as a native kernel takes them: loop invariant numbers that all lanes share are one array, since
+        """The arguments as a native kernel takes them: loop invariant numbers of the same lanes are one array, since
         each argument takes XLA as long as some forty operations of a kernel, and a loop makes the array once. What is
         not read is not passed, so that XLA need not compute it either."""
         groups: dict[Any, list[int]] = {}
         for i, (aval, has) in enumerate(zip(specs_of(self.in_avals), where, strict=True)):
-            if not self.reads[i]:
-                continue
-            together = i in self.loop_invariant and aval.shape == () and not any(has)
-            groups.setdefault(aval.dtype if together else i, []).append(i)
+            if self.reads[i]:
+                together = i in self.loop_invariant and aval.shape == ()
+                groups.setdefault((aval.dtype, has) if together else i, []).append(i)
         return tuple(map(tuple, groups.values()))
 
     def target(self, sizes: tuple[int, ...], where: Where) -> str | None:
@@ -518,7 +517,7 @@ def _in_chunks(args, program, sizes, where):
 def _by_kernel(*args, program, sizes, where, target):
     groups = [[args[i] for i in group] for group in program.groups(where)]
     outputs = [jax.ShapeDtypeStruct((*sizes, *a.shape), a.dtype) for a in program.out_avals]
-    return jax.ffi.ffi_call(target, outputs)(*(jnp.stack(xs) if len(xs) > 1 else xs[0] for xs in groups))
+    return jax.ffi.ffi_call(target, outputs)(*(jnp.stack(xs, axis=-1) if len(xs) > 1 else xs[0] for xs in groups))
 
 
 def _lower_on_cpu(context, *args, program, sizes, where):
