@@ -198,29 +198,40 @@ def locate_event(
     To first order that is the implicit function theorem. Here `t` is a number, near enough (within `reach`) that two
     steps of Newton's method are exact, and the packed state `y` is the motion at that time.
 
-    **Arguments:** `rates`: (t, y) -> y_dot; `happened`: False where no event did: then it is `t` itself.
+    **Arguments:** `rates`: (t, y) -> y_dot; `which`: as a float; `happened`: False where no event did: then it is `t` itself.
     """
-    t = jax.lax.stop_gradient(t)
+    first = (jax.lax.stop_gradient(t), y)
 
-    def stage(carry: Any, k: Array):
-        (t, y), step, smooth = carry
-        y_dot = rates(t, y)
-        quantities = event_values(system, t, y, y_dot if events.read_speeds else None)
-        g, g_dot = quantities.values[which], quantities.rates[which]
-        # Beside the first point, where to go; there halfway, by the rates in the middle; and there again.
-        is_small = jnp.abs(g) <= jnp.abs(g_dot) * reach
-        newton = -g / jnp.where(happened & is_small & (g_dot != 0), g_dot, jnp.ones_like(g_dot))
-        newton = jnp.where(happened & is_small, newton, jnp.zeros_like(newton))
-        step = jnp.where(k == 1, step, newton)
-        ahead = jnp.where(k == 0, 0.5 * step, step)
-        base = jax.tree.map(lambda x, x0: jnp.where(k == 1, x0, x), (t, y), first)
-        moved = jax.tree.map(lambda x, x_dot: x + ahead * x_dot, base, (jnp.ones_like(t), y_dot))
-        return (moved, step, smooth & (is_small | (k == 1))), None
+    def stage(search: _Search, k: Array):
+        y_dot = rates(search.t, search.y)
+        quantities = event_values(system, search.t, search.y, y_dot if events.read_speeds else None)
+        return _next_point(reach, k, first, search, y_dot, quantities, which, happened), None
 
-    first = (t, y)
-    start = (first, jnp.zeros_like(t), jnp.array(True))
-    ((t, y), _, smooth), _ = jax.lax.scan(stage, start, np.arange(3))  # pyright: ignore[reportArgumentType]
-    return EventPoint(t, y, smooth)
+    start = _Search(*first, jnp.zeros_like(t), jnp.array(True))
+    search, _ = jax.lax.scan(stage, start, np.arange(3.0, dtype=y.dtype))  # pyright: ignore[reportArgumentType]
+    return EventPoint(search.t, search.y, search.smooth)
+
+
+class _Search(NamedTuple):
+    t: Array
+    y: Array
+    step: Array
+    smooth: Array
+
+
+@ScalarFunction.once
+def _next_point(reach: Array, k: Array, first: Any, search: _Search, y_dot, quantities, which, happened) -> _Search:
+    g, g_dot = quantities.values[0], quantities.rates[0]
+    for i in range(1, len(quantities.values)):
+        g, g_dot = (jnp.where(which == i, x[i], x0) for x, x0 in ((quantities.values, g), (quantities.rates, g_dot)))
+    # Beside the first point, where to go; there halfway, by the rates in the middle; and there again.
+    is_small = jnp.abs(g) <= jnp.abs(g_dot) * reach
+    newton = -g / jnp.where(happened & is_small & (g_dot != 0), g_dot, jnp.ones_like(g_dot))
+    newton = jnp.where(happened & is_small, newton, jnp.zeros_like(newton))
+    step = jnp.where(k == 1, search.step, newton)
+    ahead = jnp.where(k == 0, 0.5 * step, step)
+    t, y = (jnp.where(k == 1, x0, x) for x0, x in zip(first, (search.t, search.y), strict=True))
+    return _Search(t + ahead, y + ahead * y_dot, step, search.smooth & (is_small | (k == 1)))
 
 
 class Limits(eqx.Module):
@@ -322,7 +333,7 @@ class _Decision(NamedTuple):
     state: EventState
 
 
-@ScalarFunction
+@ScalarFunction.once
 def _without_rounding(limits: Limits, start: EventValues) -> EventValues:
     # What would have vanished within a rounding error of the start is on zero there.
     _, rounding, _ = limits.tolerances

@@ -22,7 +22,7 @@ from .._scalarjit.nan import all_finite, derivative_free_where_not_finite, flat,
 from .._system.parameters import ANY, ParameterInfo, parameters_in
 from .._system.system import State, System, names_of, packed, units_of, unpacked
 from .diffrax_compat import UnrolledERK, saveat_and_adjoint
-from .events import Events, events_of, locate_event
+from .events import EventPoint, Events, events_of, locate_event
 from .inputs import (
     Discontinuities,
     InputState,
@@ -36,7 +36,7 @@ from .inputs import (
     samples_of,
 )
 from .settings import Settings
-from .status import Status, status_of
+from .status import Outcome, Status, outcome_of, status_of
 from .step_control import Times, controller_of, times_of
 from .trajectory import InputDiscontinuities, Trajectory
 
@@ -63,7 +63,7 @@ def _is_valid(system: System, state: State, t: Array, signals: Any, rises: Array
     return _small_are_valid(*eqx.combine(jax.lax.stop_gradient(numbers), static), valid)
 
 
-@ScalarFunction
+@ScalarFunction.once
 def _small_are_valid(system: System, state: State, t: Array, large_are_valid: Array) -> Array:
     conditions = [large_are_valid, configuration_is_met(system, t, state.q)]
     conditions += [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((system, state)) if _is_small(x)]
@@ -103,7 +103,7 @@ class _Limits(eqx.Module):
     infos: tuple[ParameterInfo, ...] = eqx.field(static=True)
 
 
-@ScalarFunction
+@ScalarFunction.once
 def _small_or_ones(values: list[Array], limits: _Limits, valid: Array | None) -> list[Array]:
     return [_or_one(x, info, valid) for x, info in zip(values, limits.infos, strict=True)]
 
@@ -129,16 +129,23 @@ class InitialValueProblem(NamedTuple):
     settings: Settings
 
 
-class Solution(NamedTuple):
-    """Packed states `motion` (n_t, n), and which of them were `reached` (n_t,); the end, and whether it moves
-    `smooth`ly with what it comes from; the status; numbers of steps."""
+class Ending(NamedTuple):
+    """The `status`, as a float; the last time and packed state; whether these move `smooth`ly with what they come from;
+    whether the motion ended `by_event`."""
 
-    motion: Array
-    reached: Array
+    status: Array
     t_end: Array
     end: Array
     smooth: Array
-    status: Array
+    by_event: Array
+
+
+class Solution(NamedTuple):
+    """Packed states `motion` (n_t, n), and which of them were `reached` (n_t,); the `ending`; numbers of steps."""
+
+    motion: Array
+    reached: Array
+    ending: Ending
     stats: dict[str, Array]
 
 
@@ -263,38 +270,60 @@ def _integrated(problem: InitialValueProblem) -> Solution:
         throw=False,
     )
     (t_reached, t_last), (motion, last) = cast(Any, (jax.lax.stop_gradient(solution.ts), solution.ys))
-    status = status_of(solution, problem.valid)
-    completed = status == Status.COMPLETED
     steps = {"steps": "num_steps", "accepted": "num_accepted_steps", "rejected": "num_rejected_steps"}
     return Solution(
         motion=motion,
         reached=jnp.isfinite(t_reached) & problem.valid,
-        t_end=jnp.where(completed, times.end, jnp.where(problem.valid, t_last[0], times.start)),
-        end=last[0],
-        smooth=completed,
-        status=status,
+        ending=_ending(times, outcome_of(solution), problem.valid, t_last[0], last[0], problem.start),
         stats={name: solution.stats[key] for name, key in steps.items()},
     )
 
 
+# One function of scalars each: XLA would compute it anew in every program that reads any of it.
+
+
+@ScalarFunction.once
+def _ending(times: Times, outcome: Outcome, valid: Array, t_last: Array, last: Array, start: Array) -> Ending:
+    status = status_of(outcome, valid)
+    completed = status == Status.COMPLETED
+    t_end = jnp.where(completed, times.end, jnp.where(valid, t_last, times.start))
+    return Ending(status, t_end, jnp.where(valid, last, start), completed, status >= Status.EVENT)
+
+
+@ScalarFunction.once
+def _at_event(times: Times, ending: Ending, start: Array) -> tuple[Array, Array]:
+    """Where an event is looked for: the last point, where one happened."""
+    t = jnp.where(ending.by_event, ending.t_end, times.start)
+    return t, jnp.where(ending.by_event, ending.end, start)
+
+
+@ScalarFunction.once
+def _by_event(point: EventPoint, ending: Ending) -> Ending:
+    t, y = (jnp.where(ending.by_event, new, old) for new, old in ((point.t, ending.t_end), (point.y, ending.end)))
+    return ending._replace(t_end=t, end=y, smooth=ending.smooth | (ending.by_event & point.smooth))
+
+
 def _to_event(problem: InitialValueProblem, solution: Solution) -> Solution:
     """The same, whose end is the instant of the event, where one happened."""
-    times, happened = problem.times, solution.status >= Status.EVENT
-    event = jnp.maximum(solution.status - Status.EVENT, 0)
-    last, start = (solution.t_end, solution.end), (times.start, problem.start)
-    t, y = jax.tree.map(lambda x, x0: jnp.where(happened, x, x0), last, start)
+    times, ending = problem.times, solution.ending
     rates = lambda t, y: problem.rates(t, y, problem.args)  # noqa: E731
-    point = locate_event(problem.args[0], t, y, event, happened, rates, times.event_reach, problem.events)
-    t_end, end = jax.tree.map(lambda x, y: jnp.where(happened, x, y), (point.t, point.y), last)
+    point = locate_event(
+        problem.args[0],
+        *_at_event(times, ending, problem.start),
+        jnp.maximum(ending.status - Status.EVENT, 0.0),
+        ending.by_event,
+        rates,
+        times.event_reach,
+        problem.events,
+    )
+    end = _by_event(point, ending)
     # The last step ends a little beside the event: samples from there to here are those of the event itself.
-    before = problem.ts <= t_end + times.rounding
-    late = happened & ~solution.reached & before
+    before = problem.ts <= end.t_end + times.rounding
+    late = ending.by_event & ~solution.reached & before
     return solution._replace(
-        motion=jnp.where(late[:, None], end[None], solution.motion),
-        reached=jnp.where(happened, before, solution.reached),
-        t_end=t_end,
-        end=end,
-        smooth=solution.smooth | (happened & point.smooth),
+        motion=jnp.where(late[:, None], end.end[None], solution.motion),
+        reached=jnp.where(ending.by_event, before, solution.reached),
+        ending=end,
     )
 
 
@@ -302,15 +331,16 @@ def _filled(problem: InitialValueProblem, solution: Solution, project: bool) -> 
     """The same with the first state at the times that were not reached, since a value that is not finite has
     derivatives that a mask behind it cannot take away. `project`: onto the configuration constraints."""
     motion = jnp.where(solution.reached[:, None], solution.motion, problem.start[None])
-    end = jnp.where(problem.valid, solution.end, problem.start)
+    ending = solution.ending
     if project:
         n_q = len(problem.system.coordinates)
 
         def onto(t: Array, y: Array) -> Array:
             return jnp.concatenate([projected(problem.system, t, y[:n_q]), y[n_q:]])
 
-        motion, end = jax.vmap(onto)(problem.ts, motion), onto(solution.t_end, end)
-    return solution._replace(motion=motion, end=end)
+        motion = jax.vmap(onto)(problem.ts, motion)
+        ending = ending._replace(end=onto(ending.t_end, ending.end))
+    return solution._replace(motion=motion, ending=ending)
 
 
 def _trajectory(problem: InitialValueProblem, solution: Solution, origin: Array) -> Trajectory:
@@ -326,7 +356,8 @@ def _trajectory(problem: InitialValueProblem, solution: Solution, origin: Array)
     outputs = jax.vmap(lambda t, y, w: outputs_at(system, t, y.q, y.u, values_of(system, y.x, w)))(ts, states, inputs)
     values = nan_where(~solution.reached, (solution.motion, u_dep, inputs, outputs), origin)
     motion, u_dep, inputs, outputs = values
-    t_end, end = nan_derivative_where(~solution.smooth, (solution.t_end, solution.end), origin)
+    ending = solution.ending
+    t_end, end = nan_derivative_where(~ending.smooth, (ending.t_end, ending.end), origin)
     states, end = unpacked(system, motion), unpacked(system, nan_where(~problem.valid, end, origin))
     return Trajectory(
         t=ts,
@@ -336,7 +367,7 @@ def _trajectory(problem: InitialValueProblem, solution: Solution, origin: Array)
         x=states.u[:, :0] if states.x is None else states.x,
         inputs=inputs,
         outputs=outputs,
-        status=solution.status,
+        status=ending.status.astype(jnp.int32),
         t_end=t_end,
         stats=solution.stats,
         names=names_of(system),

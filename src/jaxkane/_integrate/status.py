@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+from typing import NamedTuple
 
 import diffrax
 import jax.numpy as jnp
@@ -31,19 +32,38 @@ class Status(enum.IntEnum):
     EVENT = 10
 
 
-def status_of(solution: diffrax.Solution, valid: Array) -> Array:
-    """The status of a solution. Its `EventController` says why it ended the motion, diffrax why else it ended.
+class Outcome(NamedTuple):
+    """What a solution says of its end: the status by its `EventController`, whether that ended it, whether it is
+    `successful` or `out_of_steps` to diffrax, and whether it has `no_step` that was accepted."""
+
+    by_controller: Array
+    is_event: Array
+    successful: Array
+    out_of_steps: Array
+    no_step: Array
+
+
+def outcome_of(solution: diffrax.Solution) -> Outcome:
+    result, state = solution.result, solution.controller_state
+    return Outcome(
+        by_controller=state.status,  # pyright: ignore[reportOptionalMemberAccess]
+        is_event=result == diffrax.RESULTS.event_occurred,
+        successful=result == diffrax.RESULTS.successful,
+        out_of_steps=result == diffrax.RESULTS.max_steps_reached,
+        no_step=solution.stats["num_accepted_steps"] == 0,
+    )
+
+
+def status_of(outcome: Outcome, valid: Array) -> Array:
+    """The status, as a float. The `EventController` says why it ended the motion, diffrax why else it ended.
 
     `valid`: whether the motion could begin.
     """
-    result, controller_state = solution.result, solution.controller_state
-    status = jnp.where(result == diffrax.RESULTS.successful, Status.COMPLETED, Status.STEP_TOO_SMALL)
-    status = jnp.where(result == diffrax.RESULTS.max_steps_reached, Status.MAX_STEPS, status)
-    no_step = (status == Status.STEP_TOO_SMALL) & (solution.stats["num_accepted_steps"] == 0)
-    status = jnp.where(no_step, Status.NO_SOLUTION, status)
-    by_controller = controller_state.status.astype(int)  # pyright: ignore[reportOptionalMemberAccess]
-    status = jnp.where(result == diffrax.RESULTS.event_occurred, by_controller, status)
-    return jnp.where(valid, status, Status.INVALID).astype(jnp.int32)
+    failed = jnp.where(outcome.no_step, float(Status.NO_SOLUTION), float(Status.STEP_TOO_SMALL))
+    status = jnp.where(outcome.successful, float(Status.COMPLETED), failed)
+    status = jnp.where(outcome.out_of_steps, float(Status.MAX_STEPS), status)
+    status = jnp.where(outcome.is_event, outcome.by_controller, status)
+    return jnp.where(valid, status, float(Status.INVALID))
 
 
 def reason(code: int, events: tuple[str, ...]) -> str:

@@ -87,7 +87,7 @@ class Times(NamedTuple):
     limits: Array
 
 
-@ScalarFunction
+@ScalarFunction.once
 def times_of(start: Array, second: Array, end: Array) -> Times:
     """Of the first, the second and the last time at which the motion is kept."""
     eps, duration = jnp.finfo(end.dtype).eps, jax.lax.stop_gradient(end - start)

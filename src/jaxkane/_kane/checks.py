@@ -133,7 +133,7 @@ def with_possible_bodies(system: System, t: Any, state: State) -> State:
     return jax.tree.map(lambda x: jnp.where(possible, x, jnp.nan), state)
 
 
-@ScalarFunction
+@ScalarFunction.once
 def _bodies_are_possible(system: System, t: Any, q: Any) -> Any:
     bodies = _masses_and_inertias.__wrapped__(system, t, q)
     return functools.reduce(operator.and_, [_is_possible(mass, I, system.check_inertia) for mass, I in bodies])

@@ -148,6 +148,14 @@ class ScalarFunction:
         functools.update_wrapper(self, f)
         self.__wrapped__ = f
         self._programs = Cache()
+        self._once = False
+
+    @classmethod
+    def once(cls, f: Callable[..., Any]) -> ScalarFunction:
+        """For what a program calls once: LLVM compiles it five times sooner, and it takes five times as long."""
+        function = cls(f)
+        function._once = True
+        return function
 
     def __call__(self, *args: Any) -> Any:
         numbers, program = self.program(*args)
@@ -181,7 +189,7 @@ class ScalarFunction:
                 "jnp.where and entries at places known beforehand can be part of it",
             )
         fixed = frozenset(range(key.structure.children()[0].num_leaves))
-        return None if inside else Program(program, label, fixed, jax.tree.structure(out))
+        return None if inside else Program(program, label, fixed, jax.tree.structure(out), once=self._once)
 
     def is_native(self, *args: Any) -> bool:
         """Whether LLVM makes a kernel of it for these, a call of which costs nothing to compile."""
@@ -283,7 +291,8 @@ class Program:
     """A traced program, and the programs that follow from it, each made once.
 
     `loop_invariant`: places of the arguments that stay what they are while the program is called again and again, as
-    the parameters of a system. `tangents`: places of those that are tangents. `structure`: of the results.
+    the parameters of a system. `tangents`: places of those that are tangents. `structure`: of the results. `once`:
+    whether it is called once.
     """
 
     def __init__(
@@ -293,8 +302,10 @@ class Program:
         loop_invariant: frozenset[int] = frozenset(),
         structure: Any = None,
         tangents: frozenset[int] = frozenset(),
+        once: bool = False,
     ):
         self.label, self.loop_invariant, self.structure, self.tangents = label, loop_invariant, structure, tangents
+        self.once = once
         self.program = cse(program)
         self.evaluate = jaxpr_as_fun(self.program)
         self.in_avals, self.out_avals = self.program.in_avals, self.program.out_avals
@@ -313,7 +324,7 @@ class Program:
         places = [i for i, m in enumerate(moving) if m]
         fixed = self.loop_invariant | {len(moving) + j for j, i in enumerate(places) if i in self.loop_invariant}
         tangents = self.tangents | frozenset(range(len(moving), len(moving) + len(places)))
-        return Program(tangent_program(self.program, places), self.label, fixed, tangents=tangents)
+        return Program(tangent_program(self.program, places), self.label, fixed, tangents=tangents, once=self.once)
 
     def _transposed(self, linear: tuple[bool, ...]) -> Program:
         """(the other inputs, cotangents of the outputs) -> cotangents of the linear inputs."""
@@ -328,7 +339,8 @@ class Program:
             return jax.linear_transpose(of_linear, *[specs[i] for i in places])(list(cts))
 
         program = program_of(cotangents, *[specs[i] for i in fixed], *specs_of(self.out_avals))
-        return Program(program, self.label, frozenset(j for j, i in enumerate(fixed) if i in self.loop_invariant))
+        invariant = frozenset(j for j, i in enumerate(fixed) if i in self.loop_invariant)
+        return Program(program, self.label, invariant, once=self.once)
 
     def _batched(self, sizes: tuple[int, ...], where: Where) -> Program:
         """The program over leading axes of these sizes, of which input i has those in `where[i]`."""
@@ -339,7 +351,7 @@ class Program:
         f = lambda *xs: self.evaluate(*xs)  # noqa: E731
         for d in reversed(range(len(sizes))):
             f = jax.vmap(f, in_axes=tuple(0 if has[d] else None for has in where), axis_size=sizes[d])
-        return Program(program_of(f, *avals), self.label)
+        return Program(program_of(f, *avals), self.label, once=self.once)
 
     def moved(self, moving: tuple[bool, ...]) -> tuple[bool, ...]:
         """Which outputs follow from any of the inputs that move."""
@@ -355,7 +367,7 @@ class Program:
             return [y for y, is_one in results if is_one]
 
         fixed = frozenset(j for j, i in enumerate(places) if i in self.loop_invariant)
-        return Program(program_of(part, *[specs[i] for i in places]), self.label, fixed)
+        return Program(program_of(part, *[specs[i] for i in places]), self.label, fixed, once=self.once)
 
     def _jitted(self, sizes: tuple[int, ...], where: Where) -> Callable[..., list[Any]]:
         """The program over a batch, as a function that is compiled once for each kind of batch."""
@@ -373,19 +385,19 @@ class Program:
     def scalars(self) -> Scalars | None:
         """The program as a graph of scalars for machine code, where it can be written so."""
         try:
-            return Scalars(self.program)
+            return Scalars(self.program, self.once)
         except NotScalarError as error:
             self._tell_not_scalar(error)
             return None
 
     def groups(self, where: Where) -> tuple[tuple[int, ...], ...]:
-        """The arguments as a native kernel takes them: loop invariant numbers of the same lanes are one array, since
-        each argument takes XLA as long as some forty operations of a kernel, and a loop makes the array once. What is
-        not read is not passed, so that XLA need not compute it either."""
+        """The arguments as a native kernel takes them: numbers of the same lanes are one array, since each
+        argument takes XLA as long as some forty operations of a kernel; unless a loop had to make the array in each of
+        its steps. What is not read is not passed, so that XLA need not compute it either."""
         groups: dict[Any, list[int]] = {}
         for i, (aval, has) in enumerate(zip(specs_of(self.in_avals), where, strict=True)):
             if self.reads[i]:
-                together = i in self.loop_invariant and aval.shape == ()
+                together = aval.shape == () and (self.once or i in self.loop_invariant)
                 groups.setdefault((aval.dtype, has) if together else i, []).append(i)
         return tuple(map(tuple, groups.values()))
 

@@ -97,23 +97,25 @@ class LLVMCompiler:
     def key(self) -> tuple[str, str, str]:
         return self.cpu, self.features, self.version
 
-    def compile(self, text: str, store: ObjectCache | None = None) -> tuple[int, str]:
-        """The address of the function that `text` defines as @it, and a name for it that other texts may call."""
+    def compile(self, text: str, store: ObjectCache | None = None, level: int = 2) -> tuple[int, str]:
+        """The address of the function that `text` defines as @it, and a name for it that other texts may call; `level`:
+        of optimization."""
+        text = f"; level {level}\n{text}"
         name = self.name_of(text)
         with self.lock:
             if name not in self._compiled:
-                engine, keepers = self._engine(name, text.replace("@it(", f"@{name}("), store)
+                engine, keepers = self._engine(name, text.replace("@it(", f"@{name}("), store, level)
                 address = engine.get_function_address(name)
                 self.llvm.add_symbol(name, address)
                 self._compiled[name] = address, keepers  # code lives as long as the process
             return self._compiled[name][0], name
 
-    def _engine(self, name: str, text: str, store: ObjectCache | None) -> tuple[Any, Any]:
+    def _engine(self, name: str, text: str, store: ObjectCache | None, level: int) -> tuple[Any, Any]:
         llvm = self.llvm
         module = llvm.parse_assembly(text)
         module.name = name
         target = llvm.Target.from_default_triple().create_target_machine(
-            cpu=self.cpu, features=self.features, opt=2, codemodel="jitdefault", jit=True
+            cpu=self.cpu, features=self.features, opt=level, codemodel="jitdefault", jit=True
         )
         engine = llvm.create_mcjit_compiler(module, target)
         kept, made = store.read(name) if store else None, []

@@ -239,12 +239,19 @@ FMOD = "fmod"  # in the C library what is `rem` in JAX
 
 
 class Scalars:
-    """A program as a graph, or what `as_graph` makes of it, and the targets compiled from that.
+    """A program as a graph, or what `as_graph` makes of it, and the targets compiled from that; those of what is called
+    `once` quickly.
 
     Raises `NotScalarError` where the program cannot be written so.
     """
 
-    def __init__(self, program: ClosedJaxpr, as_graph: Callable[..., tuple[Graph, list[np.ndarray]]] = graph_of):
+    def __init__(
+        self,
+        program: ClosedJaxpr,
+        once: bool = False,
+        as_graph: Callable[..., tuple[Graph, list[np.ndarray]]] = graph_of,
+    ):
+        self.level = 0 if once else 2
         self.graph, self.outputs = as_graph(program)
         nodes, inputs = self.graph.nodes, types_of(program)[0]
         results = [[np.dtype(nodes[k].dtype) for k in x.flat] for x in self.outputs]
@@ -260,7 +267,7 @@ class Scalars:
     def _kernel(self, groups: Groups, varies: tuple[bool, ...], lanes: int) -> str:
         of_lanes = functools.partial(llvm_compiler().of_lanes, lanes=lanes)
         writer = Writer(self.graph.reading_groups(groups), varies, lanes, of_lanes)
-        return _compiled(writer.text(len(varies), self.outputs))[1]
+        return _compiled(writer.text(len(varies), self.outputs), self.level)[1]
 
     def _target(self, sizes: tuple[int, ...], where: tuple[tuple[bool, ...], ...], groups: Groups) -> str:
         """The name under which XLA calls the program for a batch of `sizes`, of whose dimensions argument i has those
@@ -278,14 +285,16 @@ class Scalars:
         lanes = min(llvm_compiler().lanes, 1 << (sizes[-1] - 1).bit_length()) if sizes else 1
         with llvm_compiler().lock:
             kernel = self.kernel(groups, tuple(bool(w and w[-1]) for w in where), lanes)
-            address, name = _compiled(wrapper_text(kernel, sizes, where, len(self.outputs), bytes_of))
+            address, name = _compiled(
+                wrapper_text(kernel, sizes, where, len(self.outputs), bytes_of), self.level
+            )
             _register(address, name)
         return name
 
 
-def _compiled(text: str) -> tuple[int, str]:
+def _compiled(text: str, level: int) -> tuple[int, str]:
     folder = cache_folder()
-    return llvm_compiler().compile(text, ObjectCache(folder) if folder else None)
+    return llvm_compiler().compile(text, ObjectCache(folder) if folder else None, level)
 
 
 @functools.cache
