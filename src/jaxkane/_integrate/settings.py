@@ -154,6 +154,14 @@ def resolve_adjoint(settings: Settings, adjoint: Any, arguments: Any) -> tuple[S
     return settings, arguments
 
 
+def without_derivatives(settings: Settings) -> Settings:
+    """The settings for a motion that nobody can differentiate, which is compiled without what its derivative in reverse
+    mode would need: the same numbers."""
+    if nothing_is_traced() and isinstance(settings.adjoint, ADJOINTS["reverse"]):
+        return dataclasses.replace(settings, adjoint=ADJOINTS["forward"]())
+    return settings
+
+
 def _for_reverse_mode(values: Any) -> Any:
     """`values`, whose derivative in forward mode is an error that says what to do; in reverse mode it is untouched.
 

@@ -16,12 +16,12 @@ from .._kane.constraints import check_state
 from .._kane.equations import diagnosis
 from .._kane.rhs import values_of
 from .._scalarjit.cache_key import captured_tracers
-from .._scalarjit.compat import Tracer, nothing_is_traced
+from .._scalarjit.compat import Tracer
 from .._scalarjit.components import Inputs
 from .._system.system import State, System
 from .inputs import as_signals, inputs_at, real_array, share_times
 from .integrate import refuse_captured, solve
-from .settings import ADJOINTS, resolve_adjoint, settings_for, with_array_tolerances
+from .settings import resolve_adjoint, settings_for, with_array_tolerances, without_derivatives
 from .status import Status
 from .trajectory import Trajectory
 
@@ -95,10 +95,8 @@ def simulate(
     arguments = (system, state, ts, share_times(signals)), captured_tracers(signals)
     settings, (arguments, closures) = resolve_adjoint(settings, adjoint, arguments)
     name_of_adjoint = type(settings.adjoint).__name__
-    if nothing_is_traced() and isinstance(settings.adjoint, ADJOINTS["reverse"]):
-        # A motion that nobody can differentiate is compiled without what its derivative would need: the same numbers.
-        settings = dataclasses.replace(settings, adjoint=ADJOINTS["forward"]())
-    trajectory = solve(*arguments, with_array_tolerances(settings, ts.dtype), closures=closures)
+    settings = with_array_tolerances(without_derivatives(settings), ts.dtype)
+    trajectory = solve(*arguments, settings, closures=closures)
     trajectory = dataclasses.replace(trajectory, adjoint=name_of_adjoint)
     if is_concrete(trajectory.status) and int(trajectory.status) == Status.NO_SOLUTION:
         values = values_of(system, state.x, inputs_at(system, signals, ts[0], state))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import sys
 import warnings
@@ -14,7 +15,7 @@ import numpy as np
 from tqdm import tqdm
 
 from .._integrate.integrate import refuse_captured
-from .._integrate.settings import resolve_adjoint, settings_for
+from .._integrate.settings import resolve_adjoint, settings_for, without_derivatives
 from .._integrate.simulate import as_state, checked_times
 from .._integrate.status import Status
 from .._integrate.trajectory import Trajectory
@@ -107,6 +108,7 @@ def sweep(
         task = Task(shared, ts, settings, reduce, task.mesh, closures)
         return Sweep.of(task.solve(members, n), axes, ts, reduce is not None)
 
+    task = dataclasses.replace(task, settings=without_derivatives(settings))
     size = n if n <= GROUP else GROUP * -(-min(chunk, n) // GROUP)
     files = like = None
     if folder is not None:
