@@ -247,15 +247,32 @@ class Limits(eqx.Module):
 
 
 class EventState(NamedTuple):
-    """`inner`: of the inner controller; `start`: the quantities at the start of the step; `status` of the motion, as a
-    float: `COMPLETED` unless an event or the bound ended it; `rejected_end`: the end of a step that an event rejected,
-    else -infinity; `over_bound`: the end of the first step over the bound, else infinity."""
+    """`inner`: of the inner controller; `progress`: a `Progress`, packed into one array (n,), since a loop masks, copies
+    and saves each array of its state by a program of its own."""
 
     inner: Any
-    start: EventValues | None
+    progress: Array
+
+
+class Progress(NamedTuple):
+    """`status` of the motion, as a float: `COMPLETED` unless an event or the bound ended it; `rejected_end`: the end of a
+    step that an event rejected, else -infinity; `over_bound`: the end of the first step over the bound, else infinity;
+    `start`: the quantities at the start of the step."""
+
     status: Array
     rejected_end: Array
     over_bound: Array
+    start: EventValues | None
+
+    def packed(self) -> Array:
+        start: Any = () if self.start is None else (self.start.bound[None], self.start.values, self.start.rates)
+        return jnp.concatenate([jnp.stack(self[:3]), *start])
+
+    @classmethod
+    def unpacked(cls, numbers: Array) -> Progress:
+        values = numbers[4:]
+        n = values.size // 2
+        return cls(*numbers[:3], EventValues(values[:n], values[n:], numbers[3]) if numbers.size > 3 else None)
 
 
 class EventController(diffrax.AbstractStepSizeController[Any, Any]):
@@ -284,10 +301,7 @@ class EventController(diffrax.AbstractStepSizeController[Any, Any]):
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):  # type: ignore[override]
         end, inner = self.controller.init(terms, t0, t1, y0, self.first, args, func, error_order)
-        start = self._values(t0, y0, args)
-        if start is not None:
-            start = _without_rounding(self.limits, start)
-        return end, EventState(inner, start, *(jnp.full_like(t0, x) for x in (Status.COMPLETED, -jnp.inf, jnp.inf)))
+        return end, EventState(inner, _first_progress(self.limits, t0, self._values(t0, y0, args)))
 
     def adapt_step_size(self, t0: Any, t1: Any, y0, y1_candidate, args, y_error, error_order, controller_state):  # type: ignore[override]
         state: EventState = controller_state
@@ -296,8 +310,8 @@ class EventController(diffrax.AbstractStepSizeController[Any, Any]):
         )
         keep, next_t0, next_t1, jumped, inner, result = following
         step = Step(t0, t1, next_t0, next_t1, jnp.asarray(keep))
-        decision = _decide(self.limits, state._replace(inner=None), self._values(t1, y1_candidate, args), step)
-        state = decision.state._replace(inner=_where(decision.inner_unchanged, state.inner, inner))
+        decision = _decide(self.limits, state.progress, self._values(t1, y1_candidate, args), step)
+        state = EventState(_where(decision.inner_unchanged, state.inner, inner), decision.progress)
         result = diffrax.RESULTS.where(decision.repeat, diffrax.RESULTS.successful, result)
         result = diffrax.RESULTS.where(decision.ends, diffrax.RESULTS.event_occurred, result)
         result = diffrax.RESULTS.where(decision.fails, diffrax.RESULTS.dt_min_reached, result)
@@ -321,7 +335,7 @@ class Step(NamedTuple):
 
 class _Decision(NamedTuple):
     """What becomes of a step: whether it is kept; the next one; whether it is to `repeat`; `ends` the motion; `fails`,
-    since a quantity is no number behind it; whether the inner controller's state stays; and the state that follows."""
+    since a quantity is no number behind it; whether the inner controller's state stays; and the `progress`, packed."""
 
     keep: Array
     next_t0: Array
@@ -330,36 +344,39 @@ class _Decision(NamedTuple):
     ends: Array
     fails: Array
     inner_unchanged: Array
-    state: EventState
+    progress: Any
 
 
 @ScalarFunction.once
-def _without_rounding(limits: Limits, start: EventValues) -> EventValues:
-    # What would have vanished within a rounding error of the start is on zero there.
-    _, rounding, _ = limits.tolerances
-    on_zero = jnp.abs(start.values) <= jnp.abs(start.rates) * rounding
-    return start._replace(values=jnp.where(on_zero, jnp.zeros_like(start.values), start.values))
+def _first_progress(limits: Limits, t: Array, start: EventValues | None) -> Array:
+    if start is not None:
+        # What would have vanished within a rounding error of the start is on zero there.
+        on_zero = jnp.abs(start.values) <= jnp.abs(start.rates) * limits.tolerances[1]
+        start = start._replace(values=jnp.where(on_zero, jnp.zeros_like(start.values), start.values))
+    return Progress(*(jnp.full_like(t, x) for x in (Status.COMPLETED, -jnp.inf, jnp.inf)), start).packed()
 
 
 @ScalarFunction
-def _decide(limits: Limits, state: EventState, end: EventValues | None, step: Step) -> _Decision:
+def _decide(limits: Limits, numbers: Array, end: EventValues | None, step: Step) -> _Decision:
     # One function of scalars: as a hundred operations it would be as many programs, and half of XLA's work.
     # The rest of a rejected step follows at once: a fixed step stays on its grid.
-    resumes = step.keep & (step.t1 < state.rejected_end)
-    step = step._replace(next_t1=jnp.where(resumes, state.rejected_end, step.next_t1))
+    progress = Progress.unpacked(numbers)
+    resumes = step.keep & (step.t1 < progress.rejected_end)
+    step = step._replace(next_t1=jnp.where(resumes, progress.rejected_end, step.next_t1))
     false = jnp.zeros_like(step.keep)
-    decision = _Decision(step.keep, step.next_t0, step.next_t1, false, false, false, resumes, state)
+    decision = _Decision(step.keep, step.next_t0, step.next_t1, false, false, false, resumes, progress)
     if end is not None:
-        decision = _decide_by_events(limits, state, end, step, resumes)
+        decision = _decide_by_events(limits, progress, end, step, resumes)
     # As diffrax does it, a last step is none of a rounding error, and one that was not kept is halved.
     near = decision.next_t1 > limits.end - 100 * jnp.finfo(limits.end.dtype).eps * jnp.abs(limits.end)
     last = jnp.where(decision.keep, limits.end, decision.next_t0 + 0.5 * (limits.end - decision.next_t0))
     arrived = decision.keep & (decision.next_t0 >= limits.end)
-    return decision._replace(next_t1=jnp.where(near, last, decision.next_t1), ends=decision.ends | arrived)
+    next_t1 = jnp.where(near, last, decision.next_t1)
+    return decision._replace(next_t1=next_t1, ends=decision.ends | arrived, progress=decision.progress.packed())
 
 
-def _decide_by_events(limits: Limits, state: EventState, end: EventValues, step: Step, resumes: Array) -> _Decision:
-    start: Any = state.start
+def _decide_by_events(limits: Limits, progress: Progress, end: EventValues, step: Step, resumes: Array) -> _Decision:
+    start: Any = progress.start
     resolution, _, shortest = limits.tolerances
     t0, t1 = jax.lax.stop_gradient((step.t0, step.t1))
     h, kept = t1 - t0, step.keep
@@ -369,13 +386,13 @@ def _decide_by_events(limits: Limits, state: EventState, end: EventValues, step:
     event, x = _first_event(limits, start, end, h)
     crossed = kept & (x <= 1)
     over = kept & (start.bound * end.bound < 0)
-    at_bound = (over & (h <= shortest)) | (kept & ~over & (t1 >= state.over_bound))
+    at_bound = (over & (h <= shortest)) | (kept & ~over & (t1 >= progress.over_bound))
     at_start = crossed & (x == 0) & ~over & ~at_bound
     at_end = crossed & ((1 - x) * h <= resolution) & ~over & (x != 0) & ~at_bound
     repeat = ((crossed | over) & ~at_end & ~at_start & ~at_bound) | (unknown & ~fails)
     beyond = jnp.where(over | unknown, 0.5 * h, jnp.minimum(x, 1.0) * h + 0.5 * resolution)
     rejected = repeat | at_start | at_bound | fails
-    status = jnp.where(at_bound, float(Status.SINGULAR_SPEEDS), state.status)
+    status = jnp.where(at_bound, float(Status.SINGULAR_SPEEDS), progress.status)
     return _Decision(
         keep=step.keep & ~rejected,
         next_t0=jnp.where(rejected, step.t0, step.next_t0),
@@ -384,12 +401,11 @@ def _decide_by_events(limits: Limits, state: EventState, end: EventValues, step:
         ends=at_end | at_start | at_bound,
         fails=fails,
         inner_unchanged=resumes | rejected,
-        state=EventState(
-            inner=None,
-            start=_where(kept & ~rejected, end, start),
+        progress=Progress(
             status=jnp.where(at_end | at_start, float(Status.EVENT) + event, status),
-            rejected_end=jnp.where(repeat & ~over, jnp.maximum(state.rejected_end, t1), state.rejected_end),
-            over_bound=jnp.where(over, jnp.minimum(state.over_bound, t1), state.over_bound),
+            rejected_end=jnp.where(repeat & ~over, jnp.maximum(progress.rejected_end, t1), progress.rejected_end),
+            over_bound=jnp.where(over, jnp.minimum(progress.over_bound, t1), progress.over_bound),
+            start=_where(kept & ~rejected, end, start),
         ),
     )
 

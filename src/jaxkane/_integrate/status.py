@@ -46,7 +46,7 @@ class Outcome(NamedTuple):
 def outcome_of(solution: diffrax.Solution) -> Outcome:
     result, state = solution.result, solution.controller_state
     return Outcome(
-        by_controller=state.status,  # pyright: ignore[reportOptionalMemberAccess]
+        by_controller=state.progress[0],  # pyright: ignore[reportOptionalMemberAccess]
         is_event=result == diffrax.RESULTS.event_occurred,
         successful=result == diffrax.RESULTS.successful,
         out_of_steps=result == diffrax.RESULTS.max_steps_reached,

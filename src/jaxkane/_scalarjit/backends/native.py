@@ -285,9 +285,7 @@ class Scalars:
         lanes = min(llvm_compiler().lanes, 1 << (sizes[-1] - 1).bit_length()) if sizes else 1
         with llvm_compiler().lock:
             kernel = self.kernel(groups, tuple(bool(w and w[-1]) for w in where), lanes)
-            address, name = _compiled(
-                wrapper_text(kernel, sizes, where, len(self.outputs), bytes_of), self.level
-            )
+            address, name = _compiled(wrapper_text(kernel, sizes, where, len(self.outputs), bytes_of), self.level)
             _register(address, name)
         return name
 
