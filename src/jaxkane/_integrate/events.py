@@ -198,7 +198,8 @@ def locate_event(
     To first order that is the implicit function theorem. Here `t` is a number, near enough (within `reach`) that two
     steps of Newton's method are exact, and the packed state `y` is the motion at that time.
 
-    **Arguments:** `rates`: (t, y) -> y_dot; `which`: as a float; `happened`: False where no event did: then it is `t` itself.
+    **Arguments:** `rates`: (t, y) -> y_dot; `which`: as a float; `happened`: False where no event did: then it is `t`
+    itself.
     """
     first = (jax.lax.stop_gradient(t), y)
 
@@ -247,17 +248,17 @@ class Limits(eqx.Module):
 
 
 class EventState(NamedTuple):
-    """`inner`: of the inner controller; `progress`: a `Progress`, packed into one array (n,), since a loop masks, copies
-    and saves each array of its state by a program of its own."""
+    """`inner`: of the inner controller; `progress`: a `Progress`, packed into one array (n,), since a loop masks,
+    copies and saves each array of its state by a program of its own."""
 
     inner: Any
     progress: Array
 
 
 class Progress(NamedTuple):
-    """`status` of the motion, as a float: `COMPLETED` unless an event or the bound ended it; `rejected_end`: the end of a
-    step that an event rejected, else -infinity; `over_bound`: the end of the first step over the bound, else infinity;
-    `start`: the quantities at the start of the step."""
+    """`status` of the motion, as a float: `COMPLETED` unless an event or the bound ended it; `rejected_end`: the end of
+    a step that an event rejected, else -infinity; `over_bound`: the end of the first step over the bound, else
+    infinity; `start`: the quantities at the start of the step."""
 
     status: Array
     rejected_end: Array
@@ -272,7 +273,8 @@ class Progress(NamedTuple):
     def unpacked(cls, numbers: Array) -> Progress:
         values = numbers[4:]
         n = values.size // 2
-        return cls(*numbers[:3], EventValues(values[:n], values[n:], numbers[3]) if numbers.size > 3 else None)
+        start = EventValues(values[:n], values[n:], numbers[3]) if numbers.size > 3 else None
+        return cls(numbers[0], numbers[1], numbers[2], start)
 
 
 class EventController(diffrax.AbstractStepSizeController[Any, Any]):
@@ -353,7 +355,8 @@ def _first_progress(limits: Limits, t: Array, start: EventValues | None) -> Arra
         # What would have vanished within a rounding error of the start is on zero there.
         on_zero = jnp.abs(start.values) <= jnp.abs(start.rates) * limits.tolerances[1]
         start = start._replace(values=jnp.where(on_zero, jnp.zeros_like(start.values), start.values))
-    return Progress(*(jnp.full_like(t, x) for x in (Status.COMPLETED, -jnp.inf, jnp.inf)), start).packed()
+    status, past, never = (jnp.full_like(t, x) for x in (Status.COMPLETED, -jnp.inf, jnp.inf))
+    return Progress(status, past, never, start).packed()
 
 
 @ScalarFunction

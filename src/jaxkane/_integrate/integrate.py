@@ -307,15 +307,9 @@ def _to_event(problem: InitialValueProblem, solution: Solution) -> Solution:
     """The same, whose end is the instant of the event, where one happened."""
     times, ending = problem.times, solution.ending
     rates = lambda t, y: problem.rates(t, y, problem.args)  # noqa: E731
-    point = locate_event(
-        problem.args[0],
-        *_at_event(times, ending, problem.start),
-        jnp.maximum(ending.status - Status.EVENT, 0.0),
-        ending.by_event,
-        rates,
-        times.event_reach,
-        problem.events,
-    )
+    t, y = _at_event(times, ending, problem.start)
+    event = jnp.maximum(ending.status - Status.EVENT, 0.0)
+    point = locate_event(problem.args[0], t, y, event, ending.by_event, rates, times.event_reach, problem.events)
     end = _by_event(point, ending)
     # The last step ends a little beside the event: samples from there to here are those of the event itself.
     before = problem.ts <= end.t_end + times.rounding

@@ -312,9 +312,9 @@ class Program:
         self.is_fusable = is_fusable(self.program.jaxpr)
         self.reads = reads_of(self.program.jaxpr)
         # Caches of each instance, since a cached method would keep the instance itself alive.
-        once = functools.lru_cache(maxsize=256)
-        self.tangent, self.transposed, self.batched = once(self._tangent), once(self._transposed), once(self._batched)
-        self.part, self.jitted = once(self._part), once(self._jitted)
+        cached = functools.lru_cache(maxsize=256)
+        self.tangent, self.transposed = cached(self._tangent), cached(self._transposed)
+        self.batched, self.part, self.jitted = cached(self._batched), cached(self._part), cached(self._jitted)
 
     def __call__(self, *leaves: Any) -> list[Any]:
         return _program_p.bind(*leaves, program=self, sizes=(), where=((),) * len(leaves))
