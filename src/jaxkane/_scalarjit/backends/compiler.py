@@ -89,9 +89,10 @@ class LLVMCompiler:
         _load(llvm, _MATHEMATICS.get(platform.system()), "m")
         self._compiled: dict[str, tuple[int, Any]] = {}
 
-    def name_of(self, text: str) -> str:
-        """The name under which `compile(text)` defines its function: of the text, the processor and the LLVM."""
-        return "jaxkane_" + hashlib.sha256("\n".join((text, *self.key)).encode()).hexdigest()[:32]
+    def name_of(self, text: str, level: int = 2) -> str:
+        """The name under which `compile(text)` defines its function: of the text, the level, the processor and the
+        LLVM."""
+        return "jaxkane_" + hashlib.sha256("\n".join((text, str(level), *self.key)).encode()).hexdigest()[:32]
 
     @property
     def key(self) -> tuple[str, str, str]:
@@ -100,8 +101,7 @@ class LLVMCompiler:
     def compile(self, text: str, store: ObjectCache | None = None, level: int = 2) -> tuple[int, str]:
         """The address of the function that `text` defines as @it, and a name for it that other texts may call; `level`:
         of optimization."""
-        text = f"; level {level}\n{text}"
-        name = self.name_of(text)
+        name = self.name_of(text, level)
         with self.lock:
             if name not in self._compiled:
                 engine, keepers = self._engine(name, text.replace("@it(", f"@{name}("), store, level)
