@@ -71,7 +71,7 @@ class _Solve(Program):
     @functools.cached_property
     def scalars(self) -> Scalars | None:
         try:
-            return Scalars(self.program, graph_of_solution)
+            return Scalars(self.program, as_graph=graph_of_solution)
         except NotScalarError:
             return None
 
