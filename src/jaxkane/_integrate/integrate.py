@@ -186,7 +186,7 @@ def solve(
         ts=ts,
         times=times,
         discontinuities=discontinuities_of(
-            system, signals, _reads_samples(system), times.start, state, fixed=settings.step is not None
+            system, signals, _reads_samples(system), times.start, state, settings.step is not None, settings.rtol
         ),
         valid=valid,
         rates=_rates(valid, settings.stabilize if constrained else 0.0),

@@ -16,7 +16,8 @@ from .status import Status, advice, reason
 
 
 class InputDiscontinuities(eqx.Module):
-    """Where inputs that are samples have kinks and jumps: at `times` (n,) [s]. Where there are jumps, `inputs` (n_t,)
+    """Where inputs that are samples have kinks and jumps: at `times` (n,) [s], infinite for kinks that steps pass over
+    since they are smaller than the tolerance. Where there are jumps, `inputs` (n_t,)
     by name just before and just after each time of the trajectory."""
 
     times: Float[Array, "*batch n"]

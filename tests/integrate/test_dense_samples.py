@@ -1,0 +1,110 @@
+"""Samples much denser than the motion needs: which of them steps pass over, which they end at, and derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_zero_order_hold import Cart
+
+import jaxkane as jk
+from jaxkane._integrate.inputs import _needed_knots, _needed_times, discontinuities_of
+
+
+def wave(t):
+    return np.sin(5 * t) + 0.3
+
+
+def place(t):
+    return t / 5 - np.sin(5 * t) / 25 + 0.15 * t**2
+
+
+def ride(ts, values, **options):
+    push = {"push": jk.Samples(ts, values)}
+    return jk.simulate(Cart(), jk.State([0.0], [0.0]), np.linspace(0.0, 1.0, 3), push, **options)
+
+
+@pytest.mark.parametrize("n", [100_000, pytest.param(1_000_000, marks=pytest.mark.slow)])
+def test_a_second_of_dense_samples(n):
+    """The samples of a smooth signal; and the same with a peak of one sample: a push of `height` dt [N s]."""
+    atol, ts = 1e-8, np.linspace(0.0, 1.0, n)
+    smooth = ride(ts, wave(ts))
+    np.testing.assert_allclose(smooth["place"], place(smooth.t), atol=atol)
+    assert smooth.stats["steps"] < 100
+    height, i = 1000.0, n // 3 + 1
+    peak = ride(ts, wave(ts) + height * (np.arange(n) == i))
+    gained = height * (ts[1] - ts[0]) * np.maximum(smooth.t - ts[i], 0.0)
+    assert gained[-1] > 1e4 * atol * (100_000 / n)
+    np.testing.assert_allclose(peak["place"], place(smooth.t) + gained, atol=atol)
+
+
+def test_steps_end_beside_a_peak_wherever_it_stands():
+    rtol, n = 1e-8, 10_000
+    ts = np.linspace(0.0, 1.0, n)
+    needed = jax.jit(jax.vmap(_needed_knots, (None, 0, None)))
+    peaks = np.array([1, 7, 8, 9, 4095, 4096, 4097, 5000, 8192, n - 3, n - 2])
+    heights = np.where(np.arange(n) == peaks[:, None], 1e-5, 0.0)
+    smooth, *each = np.asarray(needed(ts, np.concatenate([np.zeros((1, n)), heights]) + np.sin(ts), rtol))
+    assert smooth[0]
+    assert smooth[-1]
+    assert smooth.sum() < 20
+    for i, knots in zip(peaks, each, strict=True):
+        assert knots[i - 1 : i + 2].all()
+        assert knots.sum() < 500
+
+
+@pytest.mark.parametrize("signal", ["noise", "coarse", "uneven"])
+def test_steps_pass_over_no_signal_that_is_not_smooth(signal):
+    """A remainder of a thousand times the tolerance; a kink; a gap in which the line is no wave."""
+    rtol, n, rng = 1e-8, 10_000, np.random.default_rng(0)
+    ts = np.linspace(0.0, 1.0, n)
+    if signal == "uneven":
+        ts = np.where(ts < 0.5, ts, ts + 0.3)
+    values = {"noise": np.sin(ts) + 1e-4 * rng.normal(size=n), "coarse": np.sin(50 * ts)}.get(signal, np.sin(ts))
+    needed = np.asarray(jax.jit(_needed_knots)(ts, values, rtol))
+    if signal == "uneven":
+        gap = np.searchsorted(ts, 0.6)
+        assert needed[gap - 1 : gap + 1].all()
+    else:
+        assert needed.mean() > 0.9
+
+
+def test_all_samples_end_steps_where_a_derivative_by_them_is_asked_for():
+    ts = jnp.linspace(0.0, 1.0, 3000)
+    signal = lambda x: (ts + x[0], (1 + x[1]) * jnp.sin(ts)[None], 1e-6 + x[2])  # noqa: E731
+    times = jax.jit(lambda x: _needed_times(*signal(x)))
+    assert np.isfinite(times(jnp.zeros(3))).sum() < 20
+    for i, slope in ((0, 1.0), (1, 0.0)):
+        along = jax.jit(lambda x, i=i: jax.jvp(lambda x: times(jnp.zeros(3).at[i].set(x)), (x,), (1.0,)))
+        ends, slopes = along(0.0)
+        np.testing.assert_array_equal(ends, ts)
+        np.testing.assert_array_equal(slopes, slope)
+
+
+@pytest.mark.slow
+def test_steps_end_where_a_derivative_by_samples_is_asked_for():
+    """By a delay and by a factor of all values, against those of the motion in closed form."""
+    atol, n = 1e-7, 9001
+    ts = np.linspace(-1.0, 2.0, n)
+
+    def end(x):
+        motion = ride(ts + x[0], (1 + x[1]) * wave(ts), adjoint="forward")
+        return motion["place"][-1], motion.stats["steps"]
+
+    slopes, steps = jax.jit(jax.jacfwd(end, has_aux=True))(jnp.zeros(2))
+    # By d at d = 0, of the integral of (1 - t) wave(t - d).
+    by_delay = -(1 - np.cos(5)) / 5
+    np.testing.assert_allclose(slopes, [by_delay, place(1.0)], atol=atol)
+    assert steps > n / 3 - 2
+
+
+def test_each_jump_of_a_zero_order_hold_ends_a_step():
+    n, state = 10_000, jk.State(jnp.zeros(1), jnp.zeros(1))
+    ts = jnp.linspace(0.0, 1.0, n)
+    held, linear = (
+        discontinuities_of(
+            Cart(), {"push": jk.Samples(ts, jnp.sin(ts), zero_order_hold=hold)}, {}, ts[0], state, False, 1e-8
+        )
+        for hold in (True, False)
+    )
+    np.testing.assert_array_equal(held.times, ts)
+    assert np.isfinite(linear.times).sum() < 20
