@@ -31,7 +31,7 @@ from .equations import (
     kinetic_energy,
     partial_velocities,
 )
-from .kanes_method import DescriptionEvaluator, motion_rates
+from .kanes_method import DescriptionEvaluator, motion_rates_by_matrix
 from .rhs import rates
 
 
@@ -59,7 +59,7 @@ def _configuration_residuals(system, t, q, u, w, u_dep):
 
 
 FUNCTIONS: dict[str, Function] = {
-    "rates": Function(("q_dot", "u_dot"), lambda s, t, q, u, w, _: motion_rates(s, t, q, u, w)),
+    "rates": Function(("q_dot", "u_dot"), lambda s, t, q, u, w, _: motion_rates_by_matrix(s, t, q, u, w)),
     "equations": Function(("M", "f"), lambda s, t, q, u, w, _: equations_of_motion(s, t, q, u, w)),
     "dependent_speeds": Function(("u_dep",), lambda s, t, q, u, w, _: (dependent_speeds(s, t, q, u),), True),
     "dependent_accelerations": Function(

@@ -463,6 +463,16 @@ def motion_rates(
     return q_dot, jax.lax.custom_linear_solve(times, f, solve, symmetric=True)
 
 
+def motion_rates_by_matrix(
+    system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]
+) -> tuple[Float[Array, " n_q"], Float[Array, " n"]]:
+    """As `motion_rates`, in operations that can be exported."""
+    if is_written_out(len(system.speeds)):
+        return _motion_rates(system, t, q, u, inputs)
+    q_dot, M, f = rates_and_equations(system, t, q, u, inputs)
+    return q_dot, solve_positive_array(M, f)
+
+
 def rates_and_equations(
     system: System, t: Array, q: Array, u: Array, inputs: dict[str, Array]
 ) -> tuple[Float[Array, " n_q"], Float[Array, "n n"], Float[Array, " n"]]:
