@@ -353,6 +353,14 @@ def test_a_tyre_pulls_against_its_slip(law):
         assert float(force(1.0, 5.0, load=-10.0)) == 0.0  # a wheel that would lift does not pull
 
 
+@pytest.mark.parametrize("curvature", [-2.0, 0.0, 0.5])
+def test_the_magic_formula_has_its_stiffness_and_its_peak(curvature):
+    law = MagicFormula(12.0, friction=0.8, shape=1.4, curvature=curvature)
+    np.testing.assert_allclose(jax.grad(law.force)(0.0, 400.0, 0.0), 12.0 * 400.0, rtol=1e-12)
+    forces = law.force(jnp.linspace(0.0, 2.0, 2001), 400.0, 0.0)
+    np.testing.assert_allclose(forces.max(), 0.8 * 400.0, rtol=1e-4)
+
+
 # mechmotum/bicycle-kickplate-model at commit 6cc4d65 (BSD 3-clause), inputs.calc_nonlinear_tire_force over its factor
 # of friction 1.31917, with signs turned, as its axes are: pressure [Pa], slip angle [deg], camber [deg], load [N],
 # force [N], moment [N m].

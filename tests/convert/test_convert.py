@@ -183,6 +183,11 @@ def test_joints_that_follow_others():
     system = jk.convert.from_mjcf(text)
     state = jk.assemble(system, {"j": 0.3}, {"j_rate": 1.0})
     assert float(state.q[1]) == pytest.approx(2 * 0.3 + 0.5 * 0.09, rel=1e-12)
+    for angle, name in ((20, "j"), (-10, "k")):
+        text = text.replace(f'name="{name}"', f'name="{name}" ref="{angle}"')
+    state = jk.assemble(jk.convert.from_mjcf(text), {"j": 0.3}, {"j_rate": 1.0})
+    turned, follows = 0.3 - np.deg2rad(20.0), float(state.q[1]) - np.deg2rad(-10.0)
+    assert follows == pytest.approx(2 * turned + 0.5 * turned**2, rel=1e-12)
 
 
 @needs_mujoco

@@ -126,6 +126,12 @@ def test_a_fixed_parameter_that_differs_is_named():
     assert differences(there, here) == "fixed parameter gain (1.0 there, 2.5 here)"
 
 
+def test_what_only_one_has_is_a_difference():
+    fewer, more = {"trials": 2}, {"trials": 2, "option": {"step": 0.1}}
+    assert differences(fewer, more) == "option step (nothing there, 0.1 here)"
+    assert differences(more, fewer) == "option step (0.1 there, nothing here)"
+
+
 def test_a_file_that_is_no_fit_is_named(path, tmp_path):
     problem, data = pose(), path.read_bytes()
     for damaged in (b"", bytes(500), data[:-40], b"thesis"):

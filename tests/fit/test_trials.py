@@ -176,6 +176,9 @@ def test_windows_cover_every_sample_once():
     assert problem.slices == ((0, 0, 4), (0, 4, 7), (1, 0, 2), (1, 2, 2), (1, 4, 2), (1, 6, 2), (1, 8, 3))
     assert int(jnp.sum(problem.windows.weight > 0)) == 22
     assert bool(jnp.all(jnp.diff(problem.windows.t_input, axis=1) > 0))
+    times = 5.0 + 0.1 * np.arange(13)  # of which 5.3 - 5.0 is less than 0.3 by rounding
+    problem = Problem.of(pendulum, trial(t=times, measured={"theta1": np.sin(times)}), "mass", window=0.3)
+    assert problem.slices == ((0, 0, 3), (0, 3, 3), (0, 6, 3), (0, 9, 4))
 
 
 ENTRIES = {

@@ -1,5 +1,7 @@
 """The instant at which a motion ends: exact times, directions, derivatives, batches, and what does not end it."""
 
+import itertools
+
 import diffrax
 import equinox as eqx
 import jax
@@ -154,8 +156,8 @@ def test_the_earlier_of_several_events_in_one_step():
 
 
 def test_an_event_at_a_sample_and_at_the_last_time():
-    for t in (float(TS[4]), float(TS[-1])):
-        ride = dropped(0.5 * 9.81 * t**2)
+    for t, ends in itertools.product((float(TS[4]), float(TS[-1])), ("ground", "either")):
+        ride = dropped(0.5 * 9.81 * t**2, system=Particle(ends=ends))
         assert ride.reason == "ground"
         np.testing.assert_allclose(ride.t_end, t, atol=1e-9)
         n = int(np.searchsorted(np.asarray(TS), t - 1e-9)) + 1

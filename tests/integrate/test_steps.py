@@ -11,6 +11,7 @@ import jaxkane as jk
 from jaxkane._integrate import diffrax_compat
 from jaxkane._integrate.integrate import solve
 from jaxkane._integrate.settings import settings_for
+from jaxkane._integrate.step_control import ClipToDiscontinuities
 from jaxkane._scalarjit.function import ScalarFunction
 
 
@@ -103,3 +104,10 @@ def test_the_last_time_and_the_first_have_derivatives(jacobian):
     slopes, (u_end, _) = jacobian(end, has_aux=True)(times)
     np.testing.assert_allclose(slopes[:, 1], u_end, rtol=1e-6)  # dq/dt at the end
     np.testing.assert_allclose(slopes[:, 0], -u_end, rtol=1e-6)  # where nothing depends on the time itself
+
+
+def test_a_step_ends_beside_a_kink_or_leaves_half_of_the_way_to_it():
+    clip = ClipToDiscontinuities(diffrax.PIDController(1e-6, 1e-6), jnp.array([0.5, 1.0]))
+    for length in (0.1, 0.3, 0.5 - 1e-9, 0.5, 0.7, 1.2):
+        end, _ = clip.init(None, jnp.array(0.0), jnp.array(2.0), jnp.zeros(1), jnp.array(length), None, None, 5)
+        assert abs(0.5 - end) < 1e-13 or end == min(length, 0.25)

@@ -10,7 +10,7 @@ from sympy_systems import FourBarLinkage
 
 import jaxkane as jk
 from jaxkane import best_dependent_speeds
-from jaxkane._kane.constraints import dependent_speeds_from, relative_condition
+from jaxkane._kane.constraints import dependent_speeds_from, projected, relative_condition
 
 HELD = 1e-9
 
@@ -30,6 +30,13 @@ def test_a_minute_of_a_four_bar_linkage():
     assert free.drift > 10 * HELD
     assert projected.drift < HELD * 1e-3
     assert projected.energy_balance < 1e-5
+
+
+def test_the_nearest_coordinates_that_meet_the_constraints():
+    """Of Euler parameters those of the same direction."""
+    entry = jk.catalog.CATALOG["SpinningTop"]
+    q = jnp.array(entry.q)
+    np.testing.assert_allclose(projected(entry.example(), 0.0, 1.01 * q), q, rtol=0, atol=1e-14)
 
 
 def top(**options):

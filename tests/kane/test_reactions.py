@@ -9,6 +9,7 @@ from sympy_systems import FIGURES, FourBarLinkage, RollingDiscDependent
 import jaxkane as jk
 from jaxkane import constraint_forces, constraint_multipliers
 from jaxkane._kane.kanes_method import KaneEquations
+from jaxkane._kane.reactions import Reactions
 from jaxkane.catalog import CATALOG
 
 RTOL = 1e-12
@@ -177,6 +178,26 @@ def test_the_multiplier_of_a_scalar_residual_is_a_force_along_it():
     (force,) = constraint_multipliers(system, 0.0, q, u)
     across = np.array([-np.sin(0.5), np.cos(0.5), 0.0])
     np.testing.assert_allclose(force * across, momentum_rate(system, q, u), rtol=RTOL, atol=RTOL)
+
+
+class Lift(jk.System):
+    """A particle that slides on a platform, which rises with the velocity t^2."""
+
+    coordinates, speeds, dependent_speeds = ("x", "y"), ("vx",), ("vy",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        P = O.moving(N.vector(q["x"], q["y"], 0.0), N.vector(u["vx"], u["vy"], 0.0))
+        return jk.Motion([jk.Body(2.0, 0.0, P, N)], [u["vy"] - t**2])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.weight(motion, -9.81 * motion.N.y)
+
+
+def test_a_moving_constraint_does_work():
+    t = jnp.array(0.5)
+    equations = Reactions(Lift(), t, jnp.array([0.3, 0.1]), jnp.array([0.7]), None, jnp.zeros(1))
+    np.testing.assert_allclose(equations.power_of_prescribed_motions(), 2.0 * (9.81 + 2 * t) * t**2, rtol=RTOL)
 
 
 @pytest.mark.slow

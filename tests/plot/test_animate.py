@@ -18,10 +18,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 import jaxkane as jk
 from jaxkane._animate._figures import record
-from jaxkane._animate._scene import project, upward_axis
+from jaxkane._animate._scene import _quaternions, project, upward_axis
 
 needs_a_browser = pytest.mark.skipif(browser.PROGRAM is None, reason=browser.WHY_NOT)
 NODE = shutil.which("node")
@@ -93,6 +94,12 @@ def test_bodies_and_points_are_where_the_description_says(swing):
         right, up, towards = np.asarray(place)
         np.testing.assert_allclose(x[0, shape.first], [right, -towards, up], atol=1e-12)
     assert {shape.label for shape in shapes(animation, "center")} == {"link1", "link2"}
+
+
+def test_quaternions_of_neighbours_are_close():
+    turns = Rotation.from_rotvec(np.linspace(0.0, 30.0, 200)[:, None] * [0.0, 0.0, 1.0]).as_matrix()
+    e = _quaternions(turns)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(e, axis=0), axis=1), 2.0 * np.sin(30.0 / 199 / 4), rtol=1e-10)
 
 
 def test_a_body_is_the_uniform_solid_of_its_inertia(swing):

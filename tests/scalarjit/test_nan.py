@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxkane._scalarjit.nan import nan_derivative_where, nan_where
+from jaxkane._scalarjit.nan import derivative_free_where_not_finite, nan_derivative_where, nan_where
 
 P = {"a": jnp.array(0.7), "b": jnp.array([0.2, -0.4]), "n": 3}
 MISSING = jnp.array([False, False, True, True])
@@ -91,6 +91,16 @@ def test_members_of_a_batch_are_told_apart():
         assert np.isnan(shared)
         assert np.isfinite(own[:2]).all()
         assert np.isnan(own[2]).all()
+
+
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_a_trial_value_that_is_not_finite_has_the_derivative_zero(mode):
+    def trial(x):
+        both = derivative_free_where_not_finite(lambda x: (jnp.stack([x**2, jnp.sqrt(x - 1.0)]), x**3), x)
+        return both[0][0] + both[1] + jnp.where(x > 1.0, both[0][1], 0.0)
+
+    np.testing.assert_allclose(mode(trial)(2.0), 4.0 + 12.0 + 0.5)
+    np.testing.assert_array_equal(mode(trial)(0.5), 0.0)
 
 
 def test_complex_and_single_precision():

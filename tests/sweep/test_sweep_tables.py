@@ -8,10 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
+from mechanisms import RodOnPin
 
 import jaxkane as jk
 from jaxkane.catalog import DoublePendulum, WhippleBicycle
-from jaxkane.sweep._members import Row, members_of
+from jaxkane.sweep._members import Row, members_of, start_of
 
 PENDULUM = DoublePendulum(mass=1.0, length=1.0)
 REST = jk.State(np.zeros(2), np.zeros(2))
@@ -87,6 +88,14 @@ def test_a_table_with_labels_and_a_function_of_its_own():
     np.testing.assert_allclose(by_system.q, swept.q, atol=1e-12)
     pandas = pytest.importorskip("pandas")
     np.testing.assert_array_equal(jk.sweep.sweep(PENDULUM, start, TS, table=pandas.DataFrame(table)).q, swept.q)
+
+
+def test_coordinates_that_follow_the_parameters_are_assembled():
+    start, lengths = jk.State([0.3, 0.95], [0.0]), [1.0, 1.2]
+    members, shared, _ = members_of(RodOnPin(1.0), start, None, jk.sweep.grid(length=lengths), TS)
+    for i, length in enumerate(lengths):
+        y, x = start_of(jax.tree.map(lambda column, i=i: column[i], members), shared, 0.0).q
+        np.testing.assert_allclose([y, x], [0.3, (length**2 - 0.3**2) ** 0.5], rtol=1e-12)
 
 
 @pytest.mark.slow

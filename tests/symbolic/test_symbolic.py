@@ -5,7 +5,7 @@ import types
 
 import numpy as np
 import pytest
-from mechanisms import Bob, Odd, case
+from mechanisms import Bob, Odd, RodOnPin, case
 
 import jaxkane as jk
 from jaxkane.catalog import CATALOG
@@ -234,6 +234,15 @@ def test_linear_models_on_constraints_are_those_of_stability():
     A, _ = at_numbers(model, bob)
     assert_close(A, exact_model.A, rtol)
     assert str(sp.simplify(model.A[1, 0])) == "-981/(100*length)"
+
+
+def test_a_linear_model_where_dependent_coordinates_move():
+    """A rod of 5 m, pushed aside by 3 m: (y', v') = (v, -g / x y), the mass along y is m l^2 / x^2."""
+    rod = RodOnPin(5.0)
+    at = {"y": 3, "x": 4, "push": "147/10", "length": 5}
+    A, B = at_numbers(jk.symbolic.linearize(rod, at, states=("y", "v")), rod)
+    assert_close(A, [[0.0, 1.0], [-9.8 / 4.0, 0.0]], 1e-12)
+    assert_close(B, [[0.0], [0.5 * 16.0 / 25.0]], 1e-12)
 
 
 @pytest.mark.slow

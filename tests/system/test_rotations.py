@@ -73,6 +73,13 @@ def test_euler_parameters_are_scalar_last_and_map_to_the_body():
     assert abs(float(rates @ e)) < 1e-16  # the norm is kept
 
 
+@pytest.mark.parametrize("angle", [0.0, 1e-3, 0.0099, 0.0101, 2.0])
+def test_rotation_vectors_are_smooth_where_the_series_ends(angle):
+    vector = angle * np.array([2.0, -1.0, 2.0]) / 3.0
+    e = jnp.stack(rotations.of_rotation_vector(jnp.asarray(vector)))
+    np.testing.assert_allclose(e, Rotation.from_rotvec(vector).as_quat(), rtol=1e-14)
+
+
 def test_bad_sequences_are_refused():
     N, _ = jk.inertial()
     with pytest.raises(ValueError, match="1, 2, 3"):

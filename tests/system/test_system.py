@@ -1,5 +1,6 @@
 """What makes a description pleasant to write: defaults, fields, named values, inertia about any point."""
 
+import contextlib
 import re
 from pathlib import Path
 
@@ -16,6 +17,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
+from jaxkane._system.parameters import ParameterInfo, check_parameter
 from jaxkane._system.system import NamedVector, units_of
 
 
@@ -55,6 +57,18 @@ def test_parameters_have_arrays_and_lists_as_defaults():
     Changed = type("Changed", (jk.System,), {"__annotations__": {"x": jax.Array}, "x": jk.parameter(default)})
     default[0] = 5.0
     np.testing.assert_array_equal(Changed().x, [1.0, 2.0])
+
+
+@pytest.mark.parametrize(
+    ("info", "allowed"),
+    [(ParameterInfo(True, ()), {0.5, 1.0, 2.0}), (ParameterInfo(False, (), "", (0.0, 1.0)), {0.0, 0.5, 1.0})],
+)
+def test_members_of_a_batch_may_be_what_one_number_may_be(info, allowed):
+    numbers = np.array([-1.0, 0.0, 0.5, 1.0, 2.0, np.nan, np.inf])
+    np.testing.assert_array_equal(info.allows(numbers), [x in allowed for x in numbers])
+    for x in numbers:
+        with contextlib.nullcontext() if x in allowed else pytest.raises(ValueError, match="x = "):
+            check_parameter("x", jnp.asarray(x), info)
 
 
 @pytest.mark.parametrize("value", [4, True, "left", (1, 2)])
