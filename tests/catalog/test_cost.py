@@ -48,7 +48,9 @@ def test_every_public_function_is_one_program_of_scalars(name, monkeypatch):
     entry, programs = CATALOG[name], []
     system, q, u = entry.example(), jnp.array(entry.q), jnp.array(entry.u)
     prepared = Program.__init__
-    monkeypatch.setattr(Program, "__init__", lambda self, *args: prepared(self, *args) or programs.append(self))
+    monkeypatch.setattr(
+        Program, "__init__", lambda self, *args, **options: prepared(self, *args, **options) or programs.append(self)
+    )
     jk.forget()
     names = f"{OF_STATES} {OF_CONSTRAINTS if system.dependent_speeds else ''}".split()
     for f in (getattr(jk, name) for name in names):
