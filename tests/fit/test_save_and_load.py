@@ -68,7 +68,7 @@ def test_to_look_at_a_fit_simulates_nothing(path, monkeypatch):
     def refuse(*arguments):
         raise AssertionError("a fit that is looked at was simulated")
 
-    for name in ("starts_of", "blocks_of", "costs_of", "trajectories_of"):
+    for name in ("starts_of", "blocks_of", "trajectories_of"):
         monkeypatch.setattr(problem, name, refuse)
     assert repr(again) == str(again)
     assert again.ok is again.identifiability.ok

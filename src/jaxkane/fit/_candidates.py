@@ -13,7 +13,6 @@ import numpy as np
 from .._common.lookup import refuse_unknown
 from .._system.system import System
 from ._bijections import Interval
-from ._covariance import parameter_values
 from ._declarations import CalibrationTerm, Delay, Free
 from ._model import Simulation, Unknowns
 from ._parameters import as_items, parameters_of
@@ -277,7 +276,7 @@ def mapped_point(source: Problem, at: Unknowns, problem: Problem, names: Sequenc
         to, of = (np.array([one.index(name) for name in names], dtype=int) for one in (targets, source_names))
         point = eqx.tree_at(lambda p: p.x, point, point.x.at[to].set(at.x[of]))
     else:
-        values = np.asarray(parameter_values(source.parameters, at.x))
+        values = np.asarray(source.parameters.values(at.x))
         point = problem.at({name: float(values[source_names.index(name)]) for name in names}, point)
     b = [(new.trial.index(pair), i) for i, pair in enumerate(old.trial) if pair in new.trial]
     z = [(new.start.index(name), i) for i, name in enumerate(old.start)]

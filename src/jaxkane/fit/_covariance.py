@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,7 +10,6 @@ import numpy as np
 import scipy.linalg
 from jaxtyping import Array
 
-from .._scalarjit.cache_key import jit
 from ._block_lsq import Blocks, Eliminated, eliminate
 from ._linearize import Linearization
 from ._model import Unknowns
@@ -125,13 +124,13 @@ def prior_rows(problem: Problem, point: Unknowns) -> tuple[np.ndarray, int]:
     there is none, and how many there are."""
     parameters, windows, nuisance = problem.parameters, problem.windows, problem.model.nuisance
     measured, owner = problem.active_windows, np.asarray(windows.trial)
-    z, b, x = (np.asarray(u, float) for u in (point.z, point.b[windows.trial], parameters.prior_residuals(point.x)))
+    z, b, x = (np.asarray(u, float) for u in (point.z, point.b, parameters.prior_residuals(point.x)))
     of_trial = np.asarray(windows.first) & np.isin(owner, owner[measured])
     counts = (of_trial if nuisance.has_defects else measured, of_trial, np.asarray(windows.very_first))
     deviations = [np.asarray(d, float) for d in (nuisance.start_deviation, nuisance.trial_deviation)]
-    residuals = (z / deviations[0], b / deviations[1], np.broadcast_to(x, (len(owner), len(x))))
+    residuals = (z / deviations[0], b[owner] / deviations[1], np.broadcast_to(x, (len(owner), len(x))))
     deviations.append(np.asarray(parameters.prior_deviation, float))
-    of_x = np.asarray(parameter_slopes(parameters, point.x), float) / deviations[2][:, None]
+    of_x = np.asarray(parameters.slopes(point.x), float) / deviations[2][:, None]
     slopes = np.asarray(scipy.linalg.block_diag(*(np.diag(1.0 / d) for d in deviations[:2]), of_x))
     n_z, n_next = z.shape[1], z.shape[1] if nuisance.has_defects else 0
     slopes = np.insert(slopes, [n_z] * n_next, 0.0, axis=1)
@@ -180,21 +179,9 @@ def prior_information(problem: Problem, point: Unknowns, eliminated: Eliminated)
 def intervals(parameters: Parameters, x: Array, half: np.ndarray) -> list[tuple[float, float]]:
     """Around every parameter an interval of half the width `half` (p,), inside its bounds: symmetric in the free
     numbers x (p,). What moves with others, as a body's values do, is taken as linear."""
-    values, slopes = np.asarray(parameter_values(parameters, x)), np.asarray(parameter_slopes(parameters, x))
+    values, slopes = np.asarray(parameters.values(x)), np.asarray(parameters.slopes(x))
     alone = (np.count_nonzero(slopes, axis=1) == 1) & (slopes.diagonal() != 0)
     in_x = np.where(alone & np.isfinite(half), half / np.where(alone, np.abs(slopes.diagonal()), 1.0), 0.0)
-    ends = [np.asarray(parameter_values(parameters, x + jnp.asarray(sign * in_x, x.dtype))) for sign in (-1, 1)]
+    ends = [np.asarray(parameters.values(x + jnp.asarray(sign * in_x, x.dtype))) for sign in (-1, 1)]
     low, high = (np.where(in_x > 0, end, values + s * half) for s, end in zip((-1, 1), ends, strict=True))
     return [(float(min(a, b)), float(max(a, b))) for a, b in zip(low, high, strict=True)]
-
-
-@jit
-def parameter_values(parameters: Parameters, x: Any) -> Any:
-    """`parameters.values(x)`, as one program."""
-    return parameters.values(x)
-
-
-@jit
-def parameter_slopes(parameters: Parameters, x: Any) -> Any:
-    """`parameters.slopes(x)`, as one program."""
-    return parameters.slopes(x)

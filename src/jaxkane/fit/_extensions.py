@@ -23,7 +23,6 @@ from ._candidates import (
     mapped_point,
 )
 from ._compare import Plausible, plausible_of
-from ._covariance import parameter_slopes, parameter_values
 from ._fit import minimize, solve, uninterrupted
 from ._linearize import Linearization
 from ._model import Unknowns
@@ -276,7 +275,7 @@ class RestrictedModel:
 
     @property
     def values(self) -> dict[str, float]:
-        values = np.asarray(parameter_values(self.problem.parameters, self.point.x))[self.places]
+        values = np.asarray(self.problem.parameters.values(self.point.x))[self.places]
         return dict(zip(self.names, values.tolist(), strict=True))
 
     def held_out_cost(self, folds: Sequence[Sequence[int]] | None) -> float:
@@ -296,7 +295,7 @@ def linearized_problem(problem: Problem, at: Linearization, point: Unknowns, b: 
     columns = [*range(first), *(first + i for i in b), *range(first + blocks.n_b, blocks.R.shape[-1])]
     R = blocks.R[:, :, jnp.asarray(columns, dtype=jnp.int32)]
     reduced = eliminate(Blocks(R, blocks.windows, blocks.n_z, blocks.n_next, len(b)), 0.0)
-    slopes = np.asarray(parameter_slopes(parameters, point.x)) / np.asarray(parameters.prior_deviation, float)[:, None]
+    slopes = np.asarray(parameters.slopes(point.x)) / np.asarray(parameters.prior_deviation, float)[:, None]
     priors = np.column_stack([slopes, np.asarray(parameters.prior_residuals(point.x))])
     return LinearizedProblem(np.asarray(reduced.R, float), priors, np.asarray(blocks.column_norms, float))
 
@@ -406,9 +405,9 @@ class SelectionRound:
             correlation=model.correlation,
             without=without,
         )
-        slopes, step = np.asarray(parameter_slopes(problem.parameters, point.x)), np.zeros(len(augmented.names))
+        slopes, step = np.asarray(problem.parameters.slopes(point.x)), np.zeros(len(augmented.names))
         step[x] = solved(*linearized.of(x))
-        values = np.asarray(parameter_values(problem.parameters, point.x)) + slopes @ step
+        values = np.asarray(problem.parameters.values(point.x)) + slopes @ step
         names = tuple(augmented.names[i] for i in new)
         cost = group.at.cost + float(np.sum(linearized.priors[x, -1] ** 2))
         extension = Extension(
@@ -470,7 +469,7 @@ class SelectionRound:
             change, criterion = bic_change(model.cost, fit.cost, k, self.fit.problem.size[0], correlation), "BIC"
             reason = "" if change < 0 else f"its BIC is higher by {change:.3g}"
         before = group.plausible.bound_violations(model.values)
-        slopes = np.asarray(parameter_slopes(problem.parameters, fit.point.x))
+        slopes = np.asarray(problem.parameters.slopes(fit.point.x))
         extension = dataclasses.replace(
             extension,
             values=after.values,

@@ -16,7 +16,7 @@ from .._integrate.trajectory import Trajectory
 from .._scalarjit.cache_key import jit
 from .._scalarjit.compat import process_allgather
 from ._block_lsq import Blocks
-from ._kalman import Filtered, filtered, information_of, minus_twice_log_likelihood
+from ._kalman import information_of
 from ._model import Model, Prediction, Unknowns
 from ._windows import Windows
 
@@ -63,7 +63,7 @@ def blocks_of(
             r, J, prediction = jacobian_of(model, window, start, start_dot, z, b, point.x)
         else:
             J, r, value, result = information_of(model, window, start, start_dot, z, b, point.x)
-            prediction = _of_filter(result, value)
+            prediction = Prediction(result.predicted, result.status, result.deviation, value, result.unknowns)
         links = by_next(model, window, r.shape[0])[:, :n_next]
         A = jnp.column_stack([J[:, :n_z], links, J[:, n_z:], r + links @ z_next[:n_next]])
         # The triangle says all that the (m, k) matrix says about least squares. QR of NaN is not everywhere NaN.
@@ -73,25 +73,6 @@ def blocks_of(
 
     R, prediction = map_windows(window_block, _arguments(windows, point, starts, starts_dot))
     return Blocks(R, by_trial, n_z, n_next, n_b), prediction
-
-
-@jit
-def costs_of(model: Model, windows: Windows, point: Unknowns, starts: Array) -> tuple[Array, Prediction]:
-    """Costs (W,) and predictions: `blocks_of` without derivatives."""
-
-    def window_cost(arguments):
-        window, z, z_next, b, start = arguments
-        if model.noise is not None:
-            result = filtered(model, window, start, b, point.x)
-            priors = model.priors(window, z, b, point.x)
-            value = minus_twice_log_likelihood(result, window) + jnp.sum(priors**2)
-            return value, _of_filter(result, value)
-        r, prediction = model.residuals(window, start, z, b, point.x)
-        if model.nuisance.has_defects:
-            r = r + by_next(model, window, r.shape[0]) @ z_next
-        return jnp.sum(r**2), prediction
-
-    return map_windows(window_cost, _arguments(windows, point, starts))
 
 
 def half_cost(model: Model, windows: Windows, by_trial: Array) -> Callable[[Unknowns], Array]:
@@ -123,10 +104,6 @@ def half_cost(model: Model, windows: Windows, by_trial: Array) -> Callable[[Unkn
 def trajectories_of(model: Model, windows: Windows, point: Unknowns, starts: Array) -> Trajectory:
     """The motions of all windows, stacked."""
     return map_windows(lambda now: model.simulate(now[0], now[4], now[3], point.x), _arguments(windows, point, starts))
-
-
-def _of_filter(result: Filtered, value: Array) -> Prediction:
-    return Prediction(result.predicted, result.status, result.deviation, value, result.unknowns)
 
 
 def _arguments(windows: Windows, point: Unknowns, *starts: Array) -> tuple[Any, ...]:
@@ -162,11 +139,6 @@ def blocks_by_all_processes(
     R, prediction = _by_all_processes(own, windows, point, starts, starts_dot)
     n_z, n_b = point.z.shape[1], point.b.shape[1]
     return Blocks(R, by_trial, n_z, n_z if model.nuisance.has_defects else 0, n_b), prediction
-
-
-def costs_by_all_processes(model: Model, windows: Windows, point: Unknowns, starts: Array) -> tuple[Array, Prediction]:
-    """`costs_of`, each process for a share of the windows."""
-    return _by_all_processes(lambda *share: costs_of(model, *share), windows, point, starts)
 
 
 def check_same(model: Model, windows: Windows) -> None:
@@ -218,19 +190,24 @@ class Linearization(eqx.Module):
     def cost(self) -> float:
         """Sum of squares, with process noise minus twice the log likelihood; NaN or infinite where a window could not
         be simulated."""
-        return float(self.blocks.cost if self.prediction.cost is None else jnp.sum(self.prediction.cost))
+        return self.squares if self.prediction.cost is None else float(np.sum(self.prediction.cost))
 
     @property
     def costs(self) -> np.ndarray:
         """The part of every window (W,) in the cost; infinite where it is not `good`."""
-        own = jnp.sum(self.blocks.R[:, :, -1] ** 2, axis=1) if self.prediction.cost is None else self.prediction.cost
-        return np.where(self.good, np.asarray(own), np.inf)
+        own = self._squares if self.prediction.cost is None else np.asarray(self.prediction.cost)
+        return np.where(self.good, own, np.inf)
 
     @property
     def squares(self) -> float:
         """The rows' sum of squares: what relative tolerances refer to, and what promises are counted from. It is the
         cost, but with process noise about twice the number of measurements, where the cost may have any sign."""
-        return float(self.blocks.cost)
+        return float(np.sum(self._squares))
+
+    @property
+    def _squares(self) -> np.ndarray:
+        """Of every window (W,)."""
+        return np.sum(np.asarray(self.blocks.R)[:, :, -1] ** 2, axis=1)
 
     @property
     def good(self) -> np.ndarray:

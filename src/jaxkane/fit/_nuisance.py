@@ -17,6 +17,7 @@ from ._model import Unknowns
 from ._problem import Problem
 
 
+@jax.jit
 def moved(point: Unknowns, x: Array, eliminated: Eliminated) -> Unknowns:
     """The point after a step x of the parameters, with the nuisance values that go with it."""
     z, b = eliminated.back_substitute(x)
@@ -131,6 +132,7 @@ def _by_owner(at: Linearization, owner: np.ndarray, n: int) -> np.ndarray:
     return np.bincount(owner, weights=at.costs, minlength=n)
 
 
+@jax.jit
 def _chosen(better: np.ndarray, owner: np.ndarray, new: Any, old: Any) -> tuple[Unknowns, Linearization]:
     """Of two points with the same parameters, and what they were linearized to, the first where a trial is better."""
     (tried, there), (point, at) = new, old

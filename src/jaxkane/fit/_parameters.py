@@ -15,6 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from .._common.lookup import as_names, hint, real_number, refuse_unknown
 from .._kane.rhs import output_names
+from .._scalarjit.cache_key import jit
 from .._system.parameters import ANY, ParameterInfo, declared, leaf_name, learned_part, names_of_leaf
 from .._system.system import System, unit_of, units_of
 from ._bijections import Interval, PossibleBody
@@ -123,15 +124,18 @@ class Parameters(eqx.Module):
         """Of every value the learned function that it belongs to, or "": such a number means nothing by itself."""
         return tuple(e.part for e in self.entries)
 
+    @jit
     def values(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
         """Parameters in their own units."""
         return self._all_values(x)[self.places]
 
+    @jit
     def inverse(self, values: Float[Array, " p"]) -> Float[Array, " p"]:
         """The x (p,) of parameters in their own units; NaN outside their bounds."""
         parts = self._parts(self._all_values(self.rest[self.places]).at[self.places].set(values))
         return jnp.concatenate([f.inverse(part) for f, part in zip(self.bijections, parts, strict=True)])[self.places]
 
+    @jit
     def slopes(self, x: Float[Array, " p"]) -> Float[Array, "p p"]:
         """d values / d x."""
         return jax.jacfwd(self.values)(x)
@@ -151,6 +155,7 @@ class Parameters(eqx.Module):
         split = np.split if isinstance(x, np.ndarray) else jnp.split
         return split(x, np.cumsum(self.sizes)[:-1])
 
+    @jit
     def apply(self, system: System, x: Float[Array, " p"]) -> tuple[System, dict[tuple[str, str], Array]]:
         """The system with these parameters; gains, offsets, delays and the noise's by ("gain of input", name)."""
         leaves, structure = jax.tree.flatten(system)
@@ -166,6 +171,7 @@ class Parameters(eqx.Module):
                 leaves[number] = flat.reshape(leaf.shape)
         return jax.tree.unflatten(structure, leaves), calibration
 
+    @jit
     def prior_residuals(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
         """(value - mean) / deviation; zero without a prior."""
         return (self.values(x) - self.prior_mean) / self.prior_deviation

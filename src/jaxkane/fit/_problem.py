@@ -27,12 +27,10 @@ from ._linearize import (
     blocks_by_all_processes,
     blocks_of,
     check_same,
-    costs_by_all_processes,
-    costs_of,
     starts_of,
     trajectories_of,
 )
-from ._model import Model, Nuisance, Prediction, Simulation, Unknowns
+from ._model import Model, Nuisance, Simulation, Unknowns
 from ._parameters import Parameters, as_items, parameters_of
 from ._process_noise import noise_of
 from ._trial import Trial, as_trials
@@ -309,7 +307,7 @@ class Problem:
 
         Where the constraints cannot be met there is nothing to check: a fit says of which windows.
         """
-        first = jax.tree.map(lambda x: x[0], self.windows)
+        first = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[0]), self.windows)
         with contextlib.suppress(NoConfiguration):
             self.model.consistent(first, point.z[0], point.x)  # which checks the system there
 
@@ -334,7 +332,7 @@ class Problem:
     def start(self) -> Unknowns:
         """No parameter changed, no bias, every window starts as it was measured."""
         p, T, W = len(self.parameters.entries), len(self.trials), len(self.slices)
-        zeros = lambda *shape: jnp.zeros(shape, self.windows.t.dtype)  # noqa: E731
+        zeros = lambda *shape: jnp.asarray(np.zeros(shape, self.windows.t.dtype))  # noqa: E731
         return Unknowns(zeros(p), zeros(T, len(self.model.nuisance.trial)), zeros(W, len(self.model.nuisance.start)))
 
     def at(self, values: Mapping[str, float], point: Unknowns | None = None) -> Unknowns:
@@ -358,7 +356,7 @@ class Problem:
     @property
     def active_windows(self) -> np.ndarray:
         """Whether a window (W,) holds a measurement that counts, or stands between such."""
-        own = np.asarray(jnp.any(self.windows.weight > 0, axis=(1, 2)))
+        own = np.any(np.asarray(self.windows.weight) > 0, axis=(1, 2))
         if not self.model.nuisance.has_defects:
             return own
         owner = np.asarray(self.windows.trial)
@@ -374,7 +372,7 @@ class Problem:
         """Numbers of residuals, priors and links among them, and of unknowns."""
         n, active, T = self.model.nuisance, self.active_windows, self.clusters
         finite = lambda x: int(np.isfinite(np.asarray(x)).sum())  # noqa: E731
-        residuals = int(jnp.sum(self.windows.weight > 0)) + finite(self.parameters.prior_deviation)
+        residuals = int(np.sum(np.asarray(self.windows.weight) > 0)) + finite(self.parameters.prior_deviation)
         residuals += (T if n.has_defects else int(active.sum())) * finite(n.start_deviation) + T * finite(
             n.trial_deviation
         )
@@ -393,19 +391,19 @@ class Problem:
         return Linearization(*blocks(self.model, self.windows, self.by_trial, point, *starts))
 
     def cost(self, point: Unknowns) -> float:
-        """Sum of squares, with process noise minus twice the log likelihood, without derivatives; NaN or infinite where
-        a window could not be simulated."""
-        costs = self._costs(point)
-        return float("nan") if costs is None else float(jnp.sum(costs[0]))
+        """Sum of squares, with process noise minus twice the log likelihood; NaN or infinite where a window could not
+        be simulated."""
+        at = self.linearize(point)
+        return float("nan") if at is None else at.cost
 
     def simulated(self, point: Unknowns) -> np.ndarray:
         """What the sensors would have measured (W, n_c, n_t), with process noise followed by its deviations (W, 2 n_c,
         n_t); NaN where that cannot be simulated."""
-        costs = self._costs(point)
-        if costs is None:
+        at = self.linearize(point)
+        if at is None:
             number = 1 if self.model.noise is None else 2
             return np.full(np.tile(self.windows.measured, (1, number, 1)).shape, np.nan)
-        return costs[1].with_deviations
+        return at.prediction.with_deviations
 
     def without_start(self, point: Unknowns) -> np.ndarray:
         """Whether the constraints can be met nowhere near the start of a window (W,)."""
@@ -415,13 +413,6 @@ class Problem:
             alone = dataclasses.replace(self, windows=windows)
             missing.append(alone._starts(Unknowns(point.x, point.b, z)) is None)
         return np.array(missing)
-
-    def _costs(self, point: Unknowns) -> tuple[Array, Prediction] | None:
-        starts = self._starts(point)
-        if starts is None:
-            return None
-        costs: Any = costs_by_all_processes if self.specification.processes else costs_of
-        return costs(self.model, self.windows, point, starts[0])
 
     def _starts(self, point: Unknowns) -> tuple[Array, Array] | None:
         try:
