@@ -147,6 +147,7 @@ def test_numbers_that_no_bicycle_has_are_refused_with_what_they_probably_are(mad
         made()
 
 
+@pytest.mark.slow
 def test_a_member_of_a_batch_with_such_a_number_is_invalid():
     swept = sweep(BENCHMARK, straight_ahead(BENCHMARK, 5.0), jnp.array([0.0, 0.1]), table={"zB": [-0.9, 0.9, -0.8]})
     assert swept.counts == {"completed": 2, "invalid": 1}
@@ -156,7 +157,10 @@ def test_a_member_of_a_batch_with_such_a_number_is_invalid():
     "ask",
     [
         lambda bicycle: jk.accelerations(bicycle, 0.0, jnp.zeros(8), jnp.zeros(5)),
-        lambda bicycle: jk.simulate(bicycle, straight_ahead(bicycle, 5.0), jnp.array([0.0, 0.1])),
+        pytest.param(
+            lambda bicycle: jk.simulate(bicycle, straight_ahead(bicycle, 5.0), jnp.array([0.0, 0.1])),
+            marks=pytest.mark.slow,
+        ),
         lambda bicycle: linearize(bicycle, straight_ahead(bicycle, 5.0), states=bicycle.lateral),
     ],
 )
@@ -205,7 +209,7 @@ def test_what_is_left_without_a_rider_is_a_body():
 
 
 def test_a_parameter_of_a_part_has_one_name():
-    """As Python writes it: in a fit, a sweep, an export and a copy with other parameters."""
+    """As Python writes it: in a fit, an export and a copy with other parameters."""
     name, bicycle = "extra[0].mass", BENCHMARK.with_parts(extra=[TRAILER])
     assert name in leaf_names(bicycle)
     assert name in jk.export.parameters(bicycle)
@@ -213,14 +217,19 @@ def test_a_parameter_of_a_part_has_one_name():
     assert len(find_leaves(bicycle, "extra[0]")[0]) == len(find_leaves(bicycle, "extra")[0]) == 11
     heavier = bicycle.with_parts(**{name: 30.0, "w": 1.1})
     assert (float(heavier.extra[0].mass), float(heavier.w), float(bicycle.extra[0].mass)) == (30.0, 1.1, 20.0)
-    swept = sweep(bicycle, jk.assemble(bicycle, {}), jnp.array([0.0, 0.01]), table={name: [20.0, 30.0]})
-    assert swept.counts == {"completed": 2}
     for wrong in ("extra.0.mass", "extra[1].mass"):
         for ask in (find_leaves, lambda b, name: b.with_parts(**{name: 30.0})):
             with pytest.raises(ValueError, match=r"did you mean 'extra\[0\]\.mass'"):
                 ask(bicycle, wrong)
     with pytest.raises(ValueError, match=r"Trailer\.mass = -1\.0 must be positive"):
         bicycle.with_parts(**{name: -1.0})
+
+
+@pytest.mark.slow
+def test_a_table_names_a_parameter_of_a_part():
+    bicycle = BENCHMARK.with_parts(extra=[TRAILER])
+    swept = sweep(bicycle, jk.assemble(bicycle, {}), jnp.array([0.0, 0.01]), table={"extra[0].mass": [20.0, 30.0]})
+    assert swept.counts == {"completed": 2}
 
 
 def test_arms_belong_to_a_rider_in_any_field():

@@ -92,6 +92,7 @@ class RoundedLoad(Part):
         return {"steer_torque": -self.missing * self.trail * lean}
 
 
+@pytest.mark.slow
 def test_sharps_motorcycle_has_the_eigenvalues_of_his_table():
     """40 of 40 to the printed digits, with the load of the front wheel that he rounds to 226 lb."""
     motorcycle = sharp_motorcycle()

@@ -25,7 +25,7 @@ def pendulum():
     return jk.catalog.DoublePendulum(mass=1.0, length=0.7), jk.State(jnp.array([1.0, -0.5]), jnp.zeros(2))
 
 
-@pytest.mark.parametrize("adjoint", ["forward", "reverse"])
+@pytest.mark.parametrize("adjoint", ["forward", pytest.param("reverse", marks=pytest.mark.slow)])
 def test_the_loop_of_known_times_is_that_of_diffrax(adjoint, monkeypatch):
     """The way back, for a release of diffrax whose insides are others."""
     system, state = pendulum()
@@ -92,7 +92,7 @@ def test_a_program_that_also_tells_what_is_true_has_derivatives(kernels):
     np.testing.assert_array_equal(jax.jit(jax.vmap(jax.grad(value)))(jnp.array([-1.0, 1.0])), [1.0, 2.0])
 
 
-@pytest.mark.parametrize("jacobian", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("jacobian", [jax.jacfwd, pytest.param(jax.jacrev, marks=pytest.mark.slow)])
 def test_the_last_time_and_the_first_have_derivatives(jacobian):
     system, state = pendulum()
 

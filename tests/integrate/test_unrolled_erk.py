@@ -38,7 +38,9 @@ def motion(solver, jump, args):
 
 
 # FSAL with a jump, after which the first stage is made anew; one that is neither FSAL nor SSAL.
-@pytest.mark.parametrize(("method", "jump"), [(diffrax.Tsit5, True), (diffrax.Dopri8, False)])
+@pytest.mark.parametrize(
+    ("method", "jump"), [(diffrax.Tsit5, True), pytest.param(diffrax.Dopri8, False, marks=pytest.mark.slow)]
+)
 def test_the_same_steps_numbers_and_derivatives(method, jump):
     rtol = 1e-11
     found = []

@@ -320,6 +320,7 @@ def test_a_mechanism_may_be_made_of_traced_numbers():
     np.testing.assert_allclose(jax.vmap(alpha)(jnp.array([1.0, 2.0])), [2 / 0.14, 4 / 0.18], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_a_loop_may_be_made_of_traced_numbers():
     def alpha(across):
         system = four_bar(across, dependent=("q2", "q3"))

@@ -308,6 +308,7 @@ class Skate(jk.System):
         return {"along": now.acceleration(motion["P"]).dot(motion.N.x), "rate": u[0]}
 
 
+@pytest.mark.slow
 def test_other_independent_speeds_keep_all_else():
     rtol = 1e-6
     skate, start = Skate(), {"x_dot": 1.0}
