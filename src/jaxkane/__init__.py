@@ -38,6 +38,7 @@ from ._kane.equations import kinetic_energy as kinetic_energy
 from ._kane.equations import mass_matrix as mass_matrix
 from ._kane.equations import partial_velocities as partial_velocities
 from ._scalarjit.cache_key import forget as forget
+from ._scalarjit.compat import switch_off_wrong_fusions as _switch_off_wrong_fusions
 from ._scalarjit.components import Scalar as Scalar
 from ._scalarjit.configure import Configuration as Configuration
 from ._scalarjit.configure import configure as configure
@@ -55,6 +56,8 @@ from ._system.parameters import parameter as parameter
 from ._system.system import State as State
 from ._system.system import System as System
 from ._version import __version__ as __version__
+
+_switch_off_wrong_fusions()
 
 # Rooms that a description and its motion do not need, and what they import (scipy, optax), are imported when named.
 if _typing.TYPE_CHECKING:

@@ -1,6 +1,7 @@
 """What the library uses of JAX and equinox beyond what they promise: what is gone is named, and results stay right."""
 
 import importlib
+import os
 import subprocess
 import sys
 
@@ -105,3 +106,29 @@ print("right")
 def test_without_what_programs_are_made_of_results_stay_right():
     run = subprocess.run([sys.executable, "-c", WITHOUT], capture_output=True, text=True, timeout=300, check=False)
     assert run.stdout.strip() == "right", run.stderr[-2000:]
+
+
+@pytest.mark.parametrize("flags", ["", "--xla_cpu_enable_fast_math=false"])
+def test_a_release_that_computes_wrongly_is_repaired_before_it_starts(flags):
+    code = (
+        "import os, jax; jax.__version_info__ = (0, 10, 2); import jaxkane; print(os.environ['XLA_FLAGS']); "
+        "assert jax.jit(lambda x: x + 1)(1) == 2; import importlib; importlib.reload(jaxkane); "
+        "print(os.environ['XLA_FLAGS'])"
+    )
+    env = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"} | ({"XLA_FLAGS": flags} if flags else {})
+    run = subprocess.run([sys.executable, "-W", "error", "-c", code], env=env, capture_output=True, text=True)
+    assert run.stderr == ""
+    assert run.stdout.splitlines() == [f"{flags} {internals.NO_FUSIONS}=".strip()] * 2
+
+
+def test_such_a_release_that_has_started_is_told(monkeypatch):
+    jax.block_until_ready(jnp.zeros(1))
+    monkeypatch.setenv("XLA_FLAGS", "")
+    monkeypatch.setattr(jax, "__version_info__", (0, 12, 0))
+    internals.switch_off_wrong_fusions()  # which is right
+    monkeypatch.setattr(jax, "__version_info__", (0, 11, 0))
+    with pytest.warns(UserWarning, match="Import jaxkane before anything is computed"):
+        internals.switch_off_wrong_fusions()
+    assert os.environ["XLA_FLAGS"] == ""
+    monkeypatch.setenv("XLA_FLAGS", f"{internals.NO_FUSIONS}=reduce")
+    internals.switch_off_wrong_fusions()  # it is the user's

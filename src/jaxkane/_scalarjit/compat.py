@@ -10,6 +10,7 @@ Each has a way back, so that where a release takes it away, results stay right a
 | the state of traces | motions are compiled for derivatives that nobody can take, a tenth slower at first |
 | `reset_cache`, equinox's switch of its checks | programs are kept only where the environment says so from the start |
 | `eval_context` | a sweep on a cluster may be refused, since programs that were first traced in a check differ |
+| whether JAX has started | a flag that repairs two releases may come too late, and nobody is told |
 | `process_allgather` | none: a fit by several processes raises ImportError |
 
 Jaxprs are read in this room alone: equation by equation by `interpret`, and by `jaxpr`, `graph` and `digest`.
@@ -21,6 +22,8 @@ from __future__ import annotations
 import contextlib
 import copy
 import importlib
+import os
+import warnings
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -42,6 +45,38 @@ except (ImportError, AttributeError) as error:
     missing: Any = None
     ClosedJaxpr = Jaxpr = Primitive = missing
     jaxpr_as_fun = dce_jaxpr = instantiate_zeros = is_undefined_primal = ad = batching = mlir = missing
+
+
+WRONG_FUSIONS = ((0, 10, 2), (0, 11, 0))
+NO_FUSIONS = "--xla_cpu_experimental_ynn_fusion_type"
+
+
+def switch_off_wrong_fusions() -> None:
+    """Repair two releases of JAX by a flag of XLA, which it reads when it starts.
+
+    On a CPU 0.10.2, the last for Python 3.11, gives products of matrices that are wrong by up to 0.8 % in batches of
+    more than 16 384 (jax issue 39103); it and 0.11.0 end the process on some programs (39257).
+
+    **Warns:** where JAX has started already.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    if jax.__version_info__ not in WRONG_FUSIONS or NO_FUSIONS in flags:
+        return
+    try:
+        from jax._src.xla_bridge import backends_are_initialized
+
+        has_started = backends_are_initialized()
+    except ImportError:
+        has_started = False
+    if has_started:
+        warnings.warn(
+            f"JAX {jax.__version__} has started, which may give wrong products of matrices in batches of more than "
+            "16 384 on a CPU (jax issue 39103). Import jaxkane before anything is computed, or set XLA_FLAGS to "
+            f'"{NO_FUSIONS}=" in the environment; or use JAX 0.12, on Python 3.12 or later.',
+            stacklevel=3,
+        )
+    else:
+        os.environ["XLA_FLAGS"] = f"{flags} {NO_FUSIONS}=".strip()
 
 
 def is_literal(v: Any) -> bool:
