@@ -7,6 +7,7 @@ import sys
 import tomllib
 from pathlib import Path
 
+import jax
 import pytest
 
 import jaxkane as jk
@@ -65,3 +66,28 @@ def test_files_of_tests_have_names_of_their_own():
     """pytest imports them by their names alone: two of one name end the whole run."""
     names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
     assert sorted(names) == sorted(set(names))
+
+
+@pytest.mark.slow
+def test_the_self_test():
+    run = subprocess.run([sys.executable, "-m", "jaxkane"], capture_output=True, text=True)
+    assert (run.returncode, run.stderr) == (0, "")
+    lines = run.stdout.splitlines()
+    assert f"jaxkane {jk.__version__}, jax {jax.__version__}" in lines[1]
+    assert [line.startswith("ok: ") for line in lines[-3:]] == [True] * 3
+
+
+def test_a_self_test_that_fails_says_so(monkeypatch, capsys):
+    from jaxkane import __main__ as program
+
+    monkeypatch.setattr(
+        program, "CHECKS", {"one": lambda: (0.5, 0.1), "two": lambda: 1 / 0, "three": lambda: (0.0, 0.1)}
+    )
+    monkeypatch.setattr(jk, "configure", lambda verbose: jk.Configuration(True, None, None, False))
+    assert program.main() == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(":")[0] for line in lines[-3:]] == ["FAILED", "FAILED", "ok"]
+    assert "one (5.0e-01, at most 1e-01" in lines[-3]
+    assert "ZeroDivisionError: division by zero" in lines[-2]
+    monkeypatch.setattr(program, "CHECKS", {})
+    assert program.main() == 0
