@@ -52,9 +52,9 @@ def derivatives_are_slopes() -> tuple[float, float]:
 def eigenvalues_are_the_published_ones() -> tuple[float, float]:
     """Weave of the benchmark bicycle at 5 m/s: Meijaard et al. (2007), doi 10.1098/rspa.2007.1857, table 2."""
     bicycle = jk.catalog.WhippleBicycle.benchmark()
-    found = jk.stability.eigenvalues(bicycle, np.array([5.0])).eigenvalues[0]
+    computed = jk.stability.eigenvalues(bicycle, np.array([5.0])).eigenvalues[0]
     published = -0.77534188219585 + 4.46486771378823j
-    return float(np.min(np.abs(np.asarray(found) - published))), 1e-10
+    return float(np.min(np.abs(np.asarray(computed) - published))), 1e-10
 
 
 CHECKS: dict[str, Callable[[], tuple[float, float]]] = {
