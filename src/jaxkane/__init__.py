@@ -65,6 +65,7 @@ if _typing.TYPE_CHECKING:
     from . import catalog as catalog
     from . import convert as convert
     from . import data as data
+    from . import estimate as estimate
     from . import export as export
     from . import fit as fit
     from . import joints as joints
@@ -76,7 +77,8 @@ if _typing.TYPE_CHECKING:
     from ._animate import Sketch as Sketch
     from ._animate import animate as animate
 
-_ROOMS = ("bicycles", "catalog", "convert", "data", "export", "fit", "joints", "plot", "stability", "sweep", "symbolic")
+_ROOMS = ("bicycles", "catalog", "convert", "data", "estimate", "export", "fit", "joints", "plot")
+_ROOMS += ("stability", "sweep", "symbolic")
 _OF_ANIMATE = ("Animation", "Sketch", "animate")
 
 

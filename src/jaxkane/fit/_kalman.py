@@ -11,70 +11,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from .._integrate.inputs import share_times
 from .._integrate.integrate import solve
-from .._kane.constraints import configuration_residual, has_configuration_constraints, projected
+from .._kane.constraints import has_configuration_constraints
 from .._system.system import System, packed, unpacked
-from ._process_noise import MODES, Disturbance, Noise
+from ..estimate._filter import brought_back, tangent
+from ..estimate._process_noise import MODES, Disturbance
+from ..estimate._square_root import root, update
+from ._process_noise import Noise
 from ._windows import Windows, state_names
-
-
-def root(A: Float[Array, "n k"]) -> tuple[Float[Array, "n n"], Float[Array, "k n"]]:
-    """S (n, n) = A Q with S S^T = A A^T, k >= n, and Q (k, n), whose columns are orthonormal.
-
-    Q is held when this is differentiated: dS = dA Q is one of the many dS with d(S S^T) = d(A A^T), since the rows of A
-    are combinations of the columns of Q, and unlike that of a triangle it exists where A has no full rank.
-    """
-    Q = jax.lax.stop_gradient(jnp.linalg.qr(jax.lax.stop_gradient(A).T)[0])
-    return A @ Q, Q
-
-
-class Update(NamedTuple):
-    """The update of a state m + S x, with x (n,) standard normal before, by the measurements of one instant.
-
-    - `innovation`, `deviation` (n_c,): measured less predicted, each after those before it, and its standard deviation;
-        zero and one where nothing was measured.
-    - `known` (n_c,): by how much those before it raise what is predicted of a measurement.
-    - `shift` (n,), `left` (n, n): x is Gaussian with this mean and the covariance left left^T after.
-    """
-
-    innovation: Float[Array, " n_c"]
-    deviation: Float[Array, " n_c"]
-    known: Float[Array, " n_c"]
-    shift: Float[Array, " n"]
-    left: Float[Array, "n n"]
-
-
-def update(
-    error: Float[Array, " n_c"], F: Float[Array, "n_c n"], sigma: Float[Array, " n_c"], measured: Bool[Array, " n_c"]
-) -> Update:
-    """Measurements with independent errors, one after the other.
-
-    `error`: measured less predicted at m; `F`: its sensitivity to x; `sigma`: the measurements' standard deviations;
-    `measured`: which there are.
-
-        s^2 = f f^T + sigma^2,   S+ = S (1 - f f^T / (s (s + sigma)))
-
-    (Potter's form of the update; Bierman, Factorization Methods for Discrete Sequential Estimation, 1977, Chapter V.)
-    """
-    n = F.shape[1]
-    shift, left = jnp.zeros(n, F.dtype), jnp.eye(n, dtype=F.dtype)
-    innovations, deviations, known = [], [], []
-    for c in range(F.shape[0]):
-        is_measured = measured[c]
-        f = jnp.where(is_measured, left.T @ F[c], 0.0)
-        r = jnp.where(is_measured, sigma[c], 1.0)
-        known.append(F[c] @ shift)
-        e = jnp.where(is_measured, error[c] - known[-1], 0.0)
-        s = jnp.sqrt(f @ f + r**2)
-        moved = left @ f
-        shift = shift + moved * e / s**2
-        left = left - jnp.outer(moved, f) / (s * (s + r))
-        innovations.append(e)
-        deviations.append(s)
-    return Update(jnp.stack(innovations), jnp.stack(deviations), jnp.stack(known), shift, left)
 
 
 class Step(NamedTuple):
@@ -147,7 +94,7 @@ def filtered(model: Any, window: Windows, start: Array, b: Array, x: Array, begi
     begin = _given_deviations(model, start.shape[0]) if begin is None else begin
     S = jnp.diag(begin)
     if has_configuration_constraints(system, t[0], start[: len(system.coordinates)]):
-        S = _tangent(system, t[0], start, S, model.moved)
+        S = tangent(system, t[0], start, S, model.moved)
 
     def go_on(known: tuple[Array, Array], now: Any) -> tuple[Any, Any]:
         before, t, y, weight = now
@@ -216,23 +163,6 @@ def _flow(model: Any, system: System, calibration: Any, window: Windows, v: Arra
     signals = share_times(model.signals(window, b, calibration))
     ride = solve(system, unpacked(system, v[:n]), ts, signals, settings, disturbance)
     return (jnp.concatenate([packed(ride.state()), b]), model.simulated(ride, b, calibration)), ride.status
-
-
-def brought_back(system: System, t: Array, v: Array, S: Array) -> tuple[Array, Array]:
-    """The nearest coordinates that meet the constraints, and deviations that are tangent to them there."""
-    n_q = len(system.coordinates)
-    if not has_configuration_constraints(system, t, v[:n_q]):
-        return v, S
-    v = v.at[:n_q].set(projected(system, t, v[:n_q]))
-    return v, _tangent(system, t, v, S, tuple(range(n_q)))
-
-
-def _tangent(system: System, t: Array, v: Array, S: Array, moved: tuple[int, ...]) -> Array:
-    """Deviations S (n, k) that meet the constraints to first order: `moved` coordinates by as little as that takes."""
-    n_q, at = len(system.coordinates), jnp.asarray(moved, dtype=jnp.int32)
-    G = jax.jacfwd(lambda q: configuration_residual(system, t, q))(v[:n_q])  # (h, n_q)
-    own = G[:, at]
-    return S.at[at].add(-own.T @ jnp.linalg.solve(own @ own.T, G @ S[:n_q]))
 
 
 def _given_deviations(model: Any, n: int) -> Array:

@@ -15,7 +15,8 @@ from .._common.lookup import not_there
 from .._kane.equations import _dependent_speeds
 from .._scalarjit.cache_key import jit
 from .._system.system import unpacked
-from ._kalman import brought_back, filtered, smoothed_moments
+from ..estimate._filter import brought_back
+from ._kalman import filtered, smoothed_moments
 from ._linearize import map_windows, starts_of
 from ._model import Model, Unknowns
 from ._problem import refuse_other

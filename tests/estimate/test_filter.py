@@ -1,0 +1,326 @@
+"""Filters of one time step: against filters that NumPy computes by covariances, and against chi squared."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from scipy import stats
+from systems import Cart
+
+import jaxkane as jk
+from jaxkane._kane.constraints import configuration_residual
+from jaxkane.estimate import Filter, begin, nees, predict, update
+
+H, Q, SIGMA = 0.1, 0.2, {"x": 0.02, "x_dot": 0.1}
+CART = Cart(mass=1.0, stiffness=4.0, damping=0.3)
+START, DEVIATION = np.array([0.4, 0.1]), {"x": 0.1, "x_dot": 0.2}
+METHODS = pytest.mark.parametrize("method", ["extended", "unscented"])
+ONE_QUICKLY = pytest.mark.parametrize("method", ["extended", pytest.param("unscented", marks=pytest.mark.slow)])
+
+
+def transition():
+    """Phi (2, 2), and what noise adds to the covariance.
+
+    Van Loan, Computing integrals involving the matrix exponential, 1978.
+    """
+    A = np.array([[0.0, 1.0], [-4.0, -0.3]])
+    M = np.zeros((4, 4))
+    M[:2, :2], M[2:, 2:], M[1, 3] = -A, A.T, Q
+    E = scipy.linalg.expm(M * H)
+    return E[2:, 2:].T, E[2:, 2:].T @ E[:2, 2:]
+
+
+def kalman(ys):
+    """Predicted and updated moments after each of the measurements (n, 2), and their normalized squares."""
+    (Phi, more), m, P = transition(), START, np.diag([0.01, 0.04])
+    for y in ys:
+        before = Phi @ m, Phi @ P @ Phi.T + more
+        seen = np.isfinite(y)
+        C, R = np.eye(2)[seen], np.diag(np.array([*SIGMA.values()])[seen] ** 2)
+        S, e = C @ before[1] @ C.T + R, y[seen] - C @ before[0]
+        K = before[1] @ C.T @ np.linalg.inv(S)
+        m, P = before[0] + K @ e, before[1] - K @ C @ before[1]
+        yield before, (m, P), e @ np.linalg.solve(S, e)
+
+
+def measured(n, seed=0):
+    ys = START + np.random.default_rng(seed).normal(size=(n, 2)) * [*SIGMA.values()]
+    ys[::3, 0], ys[4] = np.nan, np.nan
+    return ys
+
+
+def of_cart(method, **options):
+    filter = Filter(CART, SIGMA, noise={"x_dot": Q}, method=method, substeps=20, **options)
+    return filter, begin(filter, jk.State(jnp.asarray(START[:1]), jnp.asarray(START[1:])), DEVIATION)
+
+
+@ONE_QUICKLY
+def test_of_a_linear_motion_it_is_kalmans(method):
+    tolerance = 1e-8  # of the integration
+    filter, belief = of_cart(method)
+    ys = measured(8)
+    for y, (_, (m, P), squares) in zip(ys, kalman(ys), strict=True):
+        belief, innovation = update(filter, predict(filter, belief, H), y)
+        np.testing.assert_allclose(belief.mean[0], m, atol=tolerance)
+        np.testing.assert_allclose(belief.covariance(), P, atol=tolerance)
+        np.testing.assert_allclose(innovation.nis, squares, atol=100 * tolerance)
+        assert int(innovation.n) == np.isfinite(y).sum()
+        np.testing.assert_allclose(belief.deviation(), np.sqrt(P.diagonal()), atol=tolerance)
+
+
+@ONE_QUICKLY
+def test_states_before_are_smoothed_and_late_measurements_find_theirs(method):
+    """Rauch, Tung and Striebel, Maximum likelihood estimates of linear dynamic systems, 1965."""
+    tolerance, lag = 1e-8, 3
+    filter, first = of_cart(method, lag=lag)
+    ys, belief = measured(7), first
+    for y in ys:
+        belief, _ = update(filter, predict(filter, belief, H), y)
+    known, Phi = list(kalman(ys)), transition()[0]
+    m, P = known[-1][1]
+    for k in range(1, lag + 1):
+        (before, C), (at, D) = known[-k][0], known[-k - 1][1]
+        G = D @ Phi.T @ np.linalg.inv(C)
+        m, P = at + G @ (m - before), D + G @ (P - C) @ G.T
+        np.testing.assert_allclose(belief.mean[k], m, atol=tolerance)
+        np.testing.assert_allclose(belief.covariance(k), P, atol=tolerance)
+    np.testing.assert_allclose(belief.t, H * np.arange(7, 3, -1), atol=1e-12)
+
+    go = lambda belief, n: belief if n == 0 else go(predict(filter, belief, H), n - 1)  # noqa: E731
+    prompt = go(update(filter, go(first, 1), {"x": 0.43})[0], 2)
+    late = update(filter, go(first, 3), {"x": 0.43}, age=2)[0]
+    np.testing.assert_allclose(late.mean, prompt.mean, atol=1e-14)
+    np.testing.assert_allclose(late.covariance(), prompt.covariance(), atol=1e-14)
+
+
+class Pendulum(jk.System):
+    pull: jk.Scalar = jk.parameter(9.0, positive=True)  # gravity by length [1/s^2]
+    damping: jk.Scalar = jk.parameter(0.2)
+    coordinates = ("angle",)
+    speeds = ("rate",)
+    inputs = ("torque",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        B = N.rotate(2, q["angle"], u["rate"], "B")
+        return jk.Motion([jk.Body(1.0, (1.0, 1.0, 1.0), O.fixed(0.0 * B.x), B, name="bob")], frames={"B": B})
+
+    def loads(self, t, q, u, motion, inputs):
+        torque = inputs["torque"] - self.pull * jnp.sin(q["angle"]) - self.damping * u["rate"]
+        return jk.Torque(torque * motion["B"].y, motion["bob"])
+
+    def outputs(self, t, q, u, motion, now):
+        return {"height": 1.0 - jnp.cos(q["angle"])}
+
+
+def stepped(v, xi, torque, h):
+    """A step of the classical Runge-Kutta method by hand, of v = [angle, rate, pull]; `xi` (3,): noise of the rate."""
+
+    def rates(s, y):
+        e = xi @ np.array([1.0, 3**0.5 * (2 * s - 1), 5**0.5 * (1.5 * (2 * s - 1) ** 2 - 0.5)]) / np.sqrt(h)
+        return np.array([y[1], torque - v[2] * np.sin(y[0]) - 0.2 * y[1] + e])
+
+    y = v[:2]
+    k1 = rates(0.0, y)
+    k2 = rates(0.5, y + h / 2 * k1)
+    k3 = rates(0.5, y + h / 2 * k2)
+    return np.append(y + h / 6 * (k1 + 2 * k2 + 2 * k3 + rates(1.0, y + h * k3)), v[2])
+
+
+def jacobian(f, v, n_out):
+    """By complex steps, exact to rounding."""
+    return np.stack([np.imag(f(v + 1e-30j * e)) / 1e-30 for e in np.eye(len(v))], axis=1).reshape(n_out, -1)
+
+
+def sensed(v):
+    return np.array([v[1], 1.0 - np.cos(v[0])])
+
+
+def by_hand(method, m, P, torque, y, h, density, sigma, drift):
+    """One step of a filter by covariances: extended, or cubature with the noise among its points."""
+    flow = lambda z: stepped(z[:3], z[3:], torque, h)  # noqa: E731
+    D = np.diag([0.0, 0.0, drift * h])
+    if method == "extended":
+        A = jacobian(flow, np.append(m, np.zeros(3)), 3)
+        m, P = flow(np.append(m, np.zeros(3))), A[:, :3] @ P @ A[:, :3].T + density * A[:, 3:] @ A[:, 3:].T + D
+        C, expected = jacobian(sensed, m, 2), sensed(m)
+        across, own = P @ C.T, C @ P @ C.T
+    else:
+        S = scipy.linalg.block_diag(scipy.linalg.sqrtm(P).real, np.sqrt(density) * np.eye(3))
+        ends = np.array([flow(np.append(m, np.zeros(3)) + s * 6**0.5 * d) for s in (1, -1) for d in S.T])
+        m, P = ends.mean(axis=0), np.cov(ends.T, bias=True) + D
+        S = scipy.linalg.sqrtm(P).real
+        points = np.array([m + s * 3**0.5 * d for s in (1, -1) for d in S.T])
+        ys = np.array([sensed(v) for v in points])
+        expected, own = ys.mean(axis=0), np.cov(ys.T, bias=True)
+        across = (points - m).T @ (ys - expected) / 6
+    K = across @ np.linalg.inv(own + np.diag(sigma**2))
+    return m + K @ (y - expected), P - K @ (own + np.diag(sigma**2)) @ K.T
+
+
+@METHODS
+def test_of_a_pendulum_it_is_the_filter_by_hand(method):
+    """An unscented filter depends on which root of the covariance it takes: where all is nearly linear, little."""
+    tolerance = 1e-10 if method == "extended" else 1e-7
+    h, density, drift, sigma = 0.05, 0.01, 0.02, {"rate": 0.05, "height": 0.01}
+    filter = Filter(Pendulum(), sigma, noise={"rate": density}, drift={"pull": drift}, method=method)
+    deviation = {"angle": 0.02, "rate": 0.03, "pull": 0.05}
+    belief = begin(filter, jk.State(jnp.array([0.8]), jnp.array([-0.3])), deviation)
+    m, P = np.array([0.8, -0.3, 9.0]), np.diag([*deviation.values()]) ** 2
+    for i, y in enumerate(np.array([[-0.6, 0.29], [-0.9, 0.27], [-1.2, 0.23], [-1.4, 0.19]])):
+        torque = 0.3 * i
+        m, P = by_hand(method, m, P, torque, y, h, density, np.array([*sigma.values()]), drift)
+        belief, _ = update(filter, predict(filter, belief, h, {"torque": torque}), jnp.asarray(y))
+        np.testing.assert_allclose(belief.mean[0], m, rtol=tolerance, atol=tolerance)
+        np.testing.assert_allclose(belief.covariance(), P, rtol=1e3 * tolerance, atol=tolerance)
+
+
+def test_it_runs_in_loops_batches_and_derivatives():
+    filter = Filter(Pendulum(), {"rate": 0.05}, noise={"torque": 0.01}, drift={"pull": 0.0})
+    belief = begin(filter, jk.State(jnp.array([0.8]), jnp.array([-0.3])), {"angle": 0.1, "pull": 1.0})
+    ys = jnp.asarray(np.random.default_rng(1).normal(-0.5, 0.1, (2, 4, 1)))
+
+    def cost(damping, ys):
+        filter_at = eqx.tree_at(lambda f: f.system.damping, filter, damping)
+
+        def step(belief, y):
+            belief, innovation = update(filter_at, predict(filter_at, belief, 0.05), y)
+            return belief, innovation.nis + 2 * jnp.sum(jnp.log(innovation.deviation))
+
+        return jnp.sum(jax.lax.scan(step, belief, ys)[1])
+
+    costs, slopes = jax.jit(jax.vmap(jax.value_and_grad(cost), (None, 0)))(0.2, ys)
+    alone = [float(cost(0.2, y)) for y in ys]
+    np.testing.assert_allclose(costs, alone, rtol=1e-12)
+    d = 1e-5
+    numbers = [(float(cost(0.2 + d, y)) - float(cost(0.2 - d, y))) / (2 * d) for y in ys]
+    np.testing.assert_allclose(slopes, numbers, rtol=1e-6)
+
+
+def test_nothing_happens_in_no_time_and_without_measurements():
+    filter = Filter(Pendulum(), {"rate": 0.05}, noise={"rate": 0.01}, lag=1)
+    belief = begin(filter, jk.State(jnp.array([0.8]), jnp.array([-0.3])), {"angle": 0.1})
+    still = predict(filter, belief, 0.0)
+    jax.tree.map(np.testing.assert_array_equal, still, belief)
+    slope = jax.grad(lambda x: jnp.sum(predict(filter, dataclasses.replace(belief, mean=x), 0.0).mean))(belief.mean)
+    np.testing.assert_array_equal(slope, 1.0)
+    for wrong in (-0.1, np.nan):
+        assert np.isnan(predict(filter, belief, wrong).mean[0]).all()
+    same, innovation = update(filter, belief, {})
+    np.testing.assert_allclose(same.covariance(), belief.covariance(), atol=1e-16)
+    assert (float(innovation.nis), int(innovation.n), float(innovation.deviation[0])) == (0.0, 0, 1.0)
+
+
+@pytest.mark.slow
+@METHODS
+def test_the_filter_is_consistent(method):
+    """200 simulated motions, of which the truth is known: both squares are chi squared."""
+    n, steps, h, density, sigma = 200, 40, 0.05, 0.05, 0.05
+    rng = np.random.default_rng(3)
+    filter = Filter(Pendulum(), {"rate": sigma}, noise={"rate": density}, method=method)
+    belief = begin(filter, jk.State(jnp.array([0.5]), jnp.array([0.0])), {"angle": 0.1, "rate": 0.1})
+    truth = np.zeros((n, steps, 2))
+    for i in range(n):
+        v = np.array([0.5, 0.0, 9.0]) + np.append(rng.normal(0.0, 0.1, 2), 0.0)
+        for k in range(steps):
+            v = stepped(v, rng.normal(0.0, density**0.5, 3), 0.0, h)
+            truth[i, k] = v[:2]
+    ys = truth[:, :, 1:] + rng.normal(0.0, sigma, (n, steps, 1))
+
+    def step(belief, now):
+        y, at = now
+        belief, innovation = update(filter, predict(filter, belief, h), y)
+        return belief, (innovation.nis, nees(belief, at))
+
+    nis, errors = jax.jit(jax.vmap(lambda ys, truth: jax.lax.scan(step, belief, (ys, truth))[1]))(ys, truth)
+    for squares, freedom in ((nis, 1), (errors, 2)):
+        mean = float(np.mean(squares[:, -1]))
+        low, high = stats.chi2.ppf([0.0005, 0.9995], freedom * n) / n
+        assert low < mean < high
+    # White innovations: neighbours do not correlate.
+    e = np.sqrt(nis[:, 10:])
+    assert abs(np.corrcoef(e[:, 1:].ravel(), e[:, :-1].ravel())[0, 1]) < 0.05
+
+
+@pytest.mark.slow
+@METHODS
+def test_a_parameter_is_found_on_the_way(method):
+    system, ts = jk.catalog.DoublePendulum(mass=1.0, length=1.0), np.arange(0.0, 10.0, 0.02)
+    start = jk.State(jnp.array([1.0, -0.5]), jnp.zeros(2))
+    ride = jk.simulate(system, start, ts)
+    ys = np.asarray(ride.q) + np.random.default_rng(1).normal(0.0, 0.01, (len(ts), 2))
+    wrong = dataclasses.replace(system, length=1.2)
+    noise = {"theta1_dot": 1e-6, "theta2_dot": 1e-6}
+    filter = Filter(wrong, {"theta1": 0.01, "theta2": 0.01}, noise=noise, drift={"length": 0.0}, method=method)
+    belief = begin(filter, start, {"theta1": 0.05, "theta2": 0.05, "length": 0.3})
+    step = lambda belief, y: update(filter, predict(filter, belief, 0.02), y)  # noqa: E731
+    belief, innovation = jax.jit(lambda b, ys: jax.lax.scan(step, b, ys))(update(filter, belief, ys[0])[0], ys[1:])
+    assert filter.names[-1] == "length"
+    assert abs(float(belief.mean[0, -1]) - 1.0) < 2e-3
+    assert 1.8 < float(jnp.mean(innovation.nis)) < 2.3
+
+
+@pytest.mark.slow
+def test_constraints_are_kept():
+    """The rear wheel's contact and the front's: roll, steer and pitch depend on one another."""
+    bicycle = jk.catalog.WhippleBicycle.benchmark()
+    start = jk.assemble(bicycle, {"roll": 0.05, "steer": 0.1}, {"roll_rate": 0.5, "rear_wheel_rate": -4.6 / 0.3})
+    sensors = {"roll_rate": 0.01, "yaw_rate": 0.01, "steer": 0.01}
+    filter = Filter(bicycle, sensors, noise={"roll_rate": 0.01, "steer_torque": 0.01})
+    belief = begin(filter, start, {"roll": 0.1, "roll_rate": 0.1, "steer": 0.1, "steer_rate": 0.1})
+    truth = jk.simulate(bicycle, start, np.arange(0.0, 0.11, 0.01))
+    residual = lambda q: configuration_residual(bicycle, jnp.zeros(()), q)  # noqa: E731
+    for i in range(1, 11):
+        y = {name: float(truth[name][i]) for name in sensors}
+        belief, _ = update(filter, predict(filter, belief, 0.01), y)
+        q = belief.mean[0, :8]
+        np.testing.assert_allclose(residual(q), 0.0, atol=1e-10)
+        along = jax.vmap(lambda d, q=q: jax.jvp(residual, (q,), (d,))[1], in_axes=1)(belief.root[0, :8])
+        np.testing.assert_allclose(along, 0.0, atol=1e-10)
+    place = filter.names.index("roll")
+    assert abs(float(belief.mean[0, place] - truth["roll"][-1])) < 3 * float(belief.deviation()[place])
+    assert float(belief.deviation()[place]) < 0.1
+
+
+@pytest.mark.parametrize(
+    ("sensors", "options", "message"),
+    [
+        ({"rat": 0.1}, {}, "`sensors` names 'rat'; did you mean 'rate'"),
+        ({"rate": 0.0}, {}, "`sensors` of rate is 0.0: it must be positive and finite"),
+        ({"rate": -1.0}, {}, "it must be positive and finite"),
+        ({"rate": 0.1}, {"noise": {"angle": 0.1}}, "`noise` names 'angle'"),
+        ({"rate": 0.1}, {"noise": {"rate": float("nan")}}, "`noise` of rate is nan"),
+        ({"rate": 0.1}, {"drift": {"pul": 0.1}}, "`drift` names 'pul'; did you mean 'pull'"),
+        ({}, {}, "`sensors` names nothing"),
+        ({"rate": 0.1}, {"method": "particle"}, '`method` is "extended" or "unscented"'),
+        ({"rate": 0.1}, {"lag": -1}, "`lag` is a whole number of 0 at least"),
+        ({"rate": 0.1}, {"substeps": 0}, "`substeps` is a whole number of 1 at least"),
+    ],
+)
+def test_what_is_no_filter_is_named(sensors, options, message):
+    with pytest.raises(ValueError, match=message):
+        Filter(Pendulum(), sensors, **options)
+
+
+def test_what_is_no_measurement_is_named():
+    with pytest.raises(TypeError, match=r"`sensors` is a dict of numbers by name, got \['rate'\]"):
+        Filter(Pendulum(), ["rate"])
+    filter = Filter(Pendulum(), {"rate": 0.1})
+    state = jk.State(jnp.array([0.8]), jnp.array([-0.3]))
+    with pytest.raises(ValueError, match="`deviation` names 'torque'"):
+        begin(filter, state, {"torque": 0.1})
+    with pytest.raises(ValueError, match=r"the deviation of angle is -0\.1"):
+        begin(filter, state, {"angle": -0.1})
+    belief = begin(filter, state, {"angle": 0.1})
+    with pytest.raises(ValueError, match="'rat' is measured; did you mean 'rate'"):
+        update(filter, belief, {"rat": 0.1})
+    with pytest.raises(ValueError, match=r"has the shape \(2,\), not \(1,\)"):
+        update(filter, belief, jnp.zeros(2))
+    with pytest.raises(ValueError, match="keeps 0 states before"):
+        update(filter, belief, {"rate": 0.1}, age=1)
+    with pytest.raises(ValueError, match="torqe"):
+        predict(filter, belief, 0.1, {"torqe": 1.0})
