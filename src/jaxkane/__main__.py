@@ -30,7 +30,8 @@ def version_of(package: str) -> str:
 
 def swing(length: jax.typing.ArrayLike = 1.0) -> jk.Trajectory:
     state = jk.State(np.array([1.0, -0.5]), np.zeros(2))
-    return jk.simulate(jk.catalog.DoublePendulum(length=length), state, TS, adjoint="forward")
+    system = jk.catalog.DoublePendulum(length=length)  # pyright: ignore[reportCallIssue]
+    return jk.simulate(system, state, TS, adjoint="forward")
 
 
 def energy_is_kept() -> tuple[float, float]:

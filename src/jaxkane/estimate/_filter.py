@@ -300,7 +300,7 @@ def _sensed(filter: Filter, t: Array, v: Array, inputs: dict[str, Array]) -> Arr
     system = filter.system_at(v)
     state = unpacked(system, v[: len(filter.names) - len(filter.parameters)])
     values = values_of(system, state.x, inputs)
-    parts = [(system.coordinates, state.q), (system.speeds, state.u)]
+    parts: list[Any] = [(system.coordinates, state.q), (system.speeds, state.u)]
     parts += [(system.states, state.x)] if system.states else []
     by_name = {name: x for names, array in parts for name, x in zip(names, array, strict=True)}
     if system.dependent_speeds and {*system.dependent_speeds} & {*filter.sensors}:
