@@ -7,7 +7,7 @@ one graph, so that what two of them have in common is there once.
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +17,7 @@ import numpy as np
 from .._scalarjit.compat import MISSING, ClosedJaxpr, jaxpr_as_fun
 from .._scalarjit.components import as_vector, is_written_out
 from .._scalarjit.graph import Graph, NotScalarError, unrolled
-from .._scalarjit.jaxpr import cse, jacobian
+from .._scalarjit.jaxpr import Direction, cse, jacobian
 from .._system.parameters import ANY, ParameterInfo, declared, in_batches, leaf_name
 from .._system.system import System
 from .arguments import as_row, check_is_system, is_concrete
@@ -96,7 +96,7 @@ class Argument(NamedTuple):
 
 
 class Formulas:
-    """Functions of a system, each as arrays of nodes of one graph.
+    """Functions of a system, those of `FUNCTIONS` and `more`, each as arrays of nodes of one graph.
 
     `arguments`: what they read. An input node's operands are the argument's place in them, the element's place in it,
     and its size.
@@ -105,9 +105,10 @@ class Formulas:
     itself, and, when a function is asked for, one that there is not or whose operations are none of scalars.
     """
 
-    def __init__(self, system: System, dtype: str = "float64"):
+    def __init__(self, system: System, dtype: str = "float64", more: Mapping[str, Function] | None = None):
         check_is_system(system)
         self.system, self.name, self.dtype = system, type(system).__name__, str(jnp.dtype(dtype))
+        self.functions = {**FUNCTIONS, **(more or {})}
         if self.dtype not in ("float64", "float32"):
             raise ValueError(f"{self.name}: dtype is 'float64' or 'float32', got {dtype!r}.")
         batched = in_batches(system)
@@ -162,18 +163,20 @@ class Formulas:
         return tuple(name for a in self.of_kind(kind) for name in a.elements)
 
     def evaluate(self, function: str, *args: Any) -> tuple[Any, ...]:
-        """A function of `FUNCTIONS` at arrays that stand as `arguments` do."""
+        """A function at arrays that stand as `arguments` do."""
         t, q, u, w, u_dep, *parameters = args
         values = iter(parameters)
         leaves = [next(values) if is_float else x for x, is_float in zip(self.leaves, self.is_float, strict=True)]
         inputs = {name: w[i] for i, name in enumerate((*self.system.inputs, *self.system.states))}
-        return tuple(FUNCTIONS[function].evaluate(jax.tree.unflatten(self.structure, leaves), t, q, u, inputs, u_dep))
+        return tuple(
+            self.functions[function].evaluate(jax.tree.unflatten(self.structure, leaves), t, q, u, inputs, u_dep)
+        )
 
     def _program(self, function: str) -> ClosedJaxpr:
         """A function as a program of JAX, in which no other is called."""
-        if FUNCTIONS[function].needs_constraints and not self.system.dependent_speeds:
+        if self.functions[function].needs_constraints and not self.system.dependent_speeds:
             raise ValueError(f"{self.name} has no dependent speeds, so that there is no {function!r}. Leave it out.")
-        if FUNCTIONS[function].needs_states and not self.system.states:
+        if self.functions[function].needs_states and not self.system.states:
             raise ValueError(f"{self.name} has no states of the first order, so that there is no {function!r}.")
         specs = [jax.ShapeDtypeStruct(a.shape, self.dtype) for a in self.arguments]
         with jax.enable_x64(self.dtype == "float64"):
@@ -182,24 +185,27 @@ class Formulas:
     def _nodes(self, function: str) -> dict[str, np.ndarray]:
         """The outputs of a function by name, as nodes."""
         if function in JACOBIANS:
-            blocks = self.derivatives("rates", JACOBIANS[function])
+            blocks = self.derivatives("rates", self.directions(*JACOBIANS[function]))
             return {"jacobian": np.concatenate([*blocks.values()])}
         program = self.program(function)
         try:
             outputs = unrolled(program, self.inputs, self.graph)
         except NotScalarError as error:
             raise ValueError(self._refusal(function, error)) from None
-        return dict(zip(FUNCTIONS[function].outputs, outputs, strict=True))
+        return dict(zip(self.functions[function].outputs, outputs, strict=True))
 
-    def derivatives(self, function: str, kinds: tuple[str, ...]) -> dict[str, np.ndarray]:
-        """The derivatives (..., d) of a function's outputs by all numbers of some kinds, as nodes."""
-        directions = [(i, e) for i, a in enumerate(self.arguments) if a.kind in kinds for e in range(len(a.elements))]
+    def directions(self, *kinds: str) -> list[Direction]:
+        """All numbers of some kinds: the places of their arguments, and their own places in these."""
+        return [(i, e) for i, a in enumerate(self.arguments) if a.kind in kinds for e in range(len(a.elements))]
+
+    def derivatives(self, function: str, directions: Sequence[Direction]) -> dict[str, np.ndarray]:
+        """The derivatives (..., d) of a function's outputs by d numbers, as nodes."""
         try:
             with jax.enable_x64(self.dtype == "float64"):
                 outputs = jacobian(self.program(function), self.inputs, directions, self.graph)
         except NotScalarError as error:
             raise ValueError(self._refusal(function, error)) from None
-        return dict(zip(FUNCTIONS[function].outputs, outputs, strict=True))
+        return dict(zip(self.functions[function].outputs, outputs, strict=True))
 
     def by_jax(self, function: str, *args: Any) -> tuple[Any, ...]:
         """The values of a function by JAX, Jacobians among them, at arrays that stand as `arguments` do."""

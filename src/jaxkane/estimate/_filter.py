@@ -27,7 +27,7 @@ from .._scalarjit.cache_key import jit
 from .._system.parameters import parameters_in, with_parameters
 from .._system.system import State, System, packed, unpacked
 from ._process_noise import MODES, Disturbance
-from ._square_root import root
+from ._square_root import ordered, root
 from ._square_root import update as update_root
 
 Inputs = Mapping[str, Any] | None
@@ -211,7 +211,7 @@ def predict(filter: Filter, belief: Belief, dt: Any, inputs: Inputs = None) -> B
     of_drift = of_drift.at[places, places].set(jnp.sqrt(filter.drift * dt))
     stacked = jnp.concatenate([A[None], before])
     stacked = jnp.concatenate([stacked, jnp.zeros((m, n, n), dt.dtype).at[0].set(of_drift)], axis=2)
-    S = root(stacked.reshape(m * n, -1))[0].reshape(m, n, m * n)
+    S = _root(filter, stacked.reshape(m * n, -1)).reshape(m, n, m * n)
     v, top = brought_back(filter.system_at(v), t + dt, v, S[0])
     mean = jnp.concatenate([v[None], belief.mean[:-1]])
     after = Belief(jnp.concatenate([(t + dt)[None], belief.t[:-1]]), mean, S.at[0].set(top))
@@ -237,7 +237,12 @@ def update(
     values = {name: jnp.asarray(x, y.dtype) for name, x in checked_inputs(filter.system, inputs).items()}
     is_measured = jnp.isfinite(y)
     sigma = jnp.where(is_measured, filter.sigma.astype(y.dtype), 1.0)
-    h = lambda v: _sensed(filter, belief.t[age], v, values)  # noqa: E731
+
+    def h(v: Array) -> Array:
+        system = filter.system_at(v)
+        state = unpacked(system, v[: len(filter.names) - len(filter.parameters)])
+        return sensed(system, filter.sensors, belief.t[age], state.q, state.u, values_of(system, state.x, values))
+
     v, S, k = belief.mean[age], belief.root[age], belief.root.shape[2]
     if filter.method == "extended":
         along = lambda direction: jax.jvp(h, (v,), (direction,))  # noqa: E731
@@ -252,7 +257,7 @@ def update(
     known = update_root(jnp.where(is_measured, y - predicted, 0.0), H, sigma, is_measured)
     columns = columns.reshape(m * n, -1)
     mean = belief.mean + (columns @ known.shift).reshape(m, n)
-    S = root(columns @ known.left)[0].reshape(m, n, m * n)
+    S = _root(filter, columns @ known.left).reshape(m, n, m * n)
     v, top = brought_back(filter.system_at(mean[0]), belief.t[0], mean[0], S[0])
     after = Belief(belief.t, mean.at[0].set(v), S.at[0].set(top))
     nis = jnp.sum((known.innovation / known.deviation) ** 2)
@@ -295,20 +300,15 @@ def _flow(filter: Filter, t0: Array, dt: Array, v: Array, xi: Array, inputs: dic
     return jnp.concatenate([y, v[n:]])
 
 
-def _sensed(filter: Filter, t: Array, v: Array, inputs: dict[str, Array]) -> Array:
-    """What the sensors read (n_c,) of a state."""
-    system = filter.system_at(v)
-    state = unpacked(system, v[: len(filter.names) - len(filter.parameters)])
-    values = values_of(system, state.x, inputs)
-    parts: list[Any] = [(system.coordinates, state.q), (system.speeds, state.u)]
-    parts += [(system.states, state.x)] if system.states else []
-    by_name = {name: x for names, array in parts for name, x in zip(names, array, strict=True)}
-    if system.dependent_speeds and {*system.dependent_speeds} & {*filter.sensors}:
-        u_dep = dependent_speeds(system, t, state.q, state.u)
-        by_name |= dict(zip(system.dependent_speeds, u_dep, strict=True))
-    if not {*filter.sensors} <= by_name.keys():
-        by_name |= outputs_at(system, t, state.q, state.u, values)
-    return jnp.stack([by_name[name] for name in filter.sensors])
+def sensed(system: System, sensors: tuple[str, ...], t: Any, q: Array, u: Array, values: Mapping[str, Any]) -> Array:
+    """What the sensors read (n_c,) at a state, whose states of the first order stand among the `values` of inputs."""
+    by_name = dict(zip((*system.coordinates, *system.speeds), (*q, *u), strict=True))
+    by_name |= {name: values[name] for name in system.states}
+    if {*system.dependent_speeds} & {*sensors}:
+        by_name |= dict(zip(system.dependent_speeds, dependent_speeds(system, t, q, u), strict=True))
+    if not {*sensors} <= by_name.keys():
+        by_name |= outputs_at(system, t, q, u, values)
+    return jnp.stack([by_name[name] for name in sensors])
 
 
 def _as_measured(filter: Filter, measured: Any, dtype: Any) -> Array:
@@ -321,6 +321,10 @@ def _as_measured(filter: Filter, measured: Any, dtype: Any) -> Array:
     if measured.shape != (len(filter.sensors),):
         raise ValueError(f"update: `measured` has the shape {measured.shape}, not ({len(filter.sensors)},).")
     return measured
+
+
+def _root(filter: Filter, A: Array) -> Array:
+    return root(A)[0] if filter.method == "extended" else ordered(root(A)[0])
 
 
 def _widened(S: Array, k: int) -> Array:

@@ -19,6 +19,31 @@ def root(A: Float[Array, "n k"]) -> tuple[Float[Array, "n n"], Float[Array, "k n
     return A @ Q, Q
 
 
+def ordered(S: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """The root S Q of the same covariance that is a triangle but for the order of its rows: that of S, with the rows at
+    the end that those before them determine.
+
+    It follows from the covariance alone, but for signs of columns. A plain triangle does not where S has no full rank:
+    rounding errors choose its columns, and with them the points that an unscented filter takes.
+    """
+    n, size = len(S), jnp.linalg.norm(jax.lax.stop_gradient(S), axis=1)
+    columns = jnp.arange(n)
+
+    def reflect(i: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        M, is_done = carry
+        rest = jnp.where((columns >= i)[None], M[:n], 0.0)
+        remainder = jnp.linalg.norm(rest, axis=1)
+        row = jnp.argmax(jnp.where(is_done, -1, (remainder > 1e-3 * size).astype(int)))  # the first of the largest
+        a, norm = rest[row], remainder[row]
+        beta = jnp.where(a[i] > 0, -norm, norm)
+        v = a.at[i].add(-beta)
+        scale = jnp.where(norm > 0, 1.0 / jnp.where(norm > 0, beta * (beta - a[i]), 1.0), 0.0)
+        return M - scale * jnp.outer(M @ v, v), is_done.at[row].set(True)
+
+    M = jnp.concatenate([jax.lax.stop_gradient(S), jnp.eye(n, dtype=S.dtype)])
+    return S @ jax.lax.fori_loop(0, n, reflect, (M, jnp.zeros(n, bool)))[0][n:]
+
+
 class Update(NamedTuple):
     """The update of a state m + S x, with x (n,) standard normal before, by the measurements of one instant.
 

@@ -106,7 +106,7 @@ def write_file(path: str | Path, content: bytes) -> None:
     Path(path).write_bytes(content)
 
 
-def _variable_units(system: System) -> dict[str, str]:
+def variable_units(system: System) -> dict[str, str]:
     """Units of coordinates, speeds and inputs, where they are declared."""
     declared = units_of(system)
     names = (*system.coordinates, *system.speeds, *system.dependent_speeds, *system.inputs, *system.states)
@@ -125,7 +125,7 @@ def _meaning(formulas: Formulas, function: str) -> str:
     return f": {', '.join(formulas.names('u_dep'))}" if function == "dependent_speeds" else ""
 
 
-def _is_read(word: str, text: str) -> bool:
+def is_read(word: str, text: str) -> bool:
     """Whether source code reads a variable; members of other objects have the same names."""
     return re.search(rf"(?<![\w.>]){re.escape(word)}(?!\w)", text) is not None
 
@@ -190,16 +190,16 @@ C = Language(
 )
 
 
-def _six_a_line(texts: Sequence[str]) -> str:
+def six_a_line(texts: Sequence[str]) -> str:
     return ",\n    ".join(", ".join(texts[i : i + 6]) for i in range(0, len(texts), 6))
 
 
-def _in_comment(text: str) -> str:
+def in_comment(text: str) -> str:
     """A text that cannot end the comment in which it stands."""
     return text.replace("*/", "* /").replace("\\", "/")
 
 
-_COMPARE = """
+COMPARE = """
 /* Prints the largest difference, as a part of the largest expected number. */
 static int compare(const char *name, int n, const {type} *computed, const {type} *expected) {{
     double difference = 0.0, size = 0.0;
@@ -289,7 +289,7 @@ class _CModule:
         }
 
     def _comment(self) -> str:
-        title = _in_comment(_title(self.formulas))
+        title = in_comment(_title(self.formulas))
         return f"/* {title}\n   Every function is a formula of its arguments; {self.type} throughout. */\n"
 
     def _signature(self, function: str) -> str:
@@ -298,7 +298,7 @@ class _CModule:
         return f"void {self.name}_{function}({read}, const {self.name}_parameters *p{outputs})"
 
     def header(self) -> str:
-        guard, unit_of = f"{self.name.upper()}_H", _variable_units(self.formulas.system)
+        guard, unit_of = f"{self.name.upper()}_H", variable_units(self.formulas.system)
         lines = [self._comment(), f"#ifndef {guard}", f"#define {guard}", "", "#ifdef __cplusplus"]
         lines += ['extern "C" {', "#endif", "", "typedef struct {"]
         for a in self.formulas.of_kind("parameters"):
@@ -306,7 +306,7 @@ class _CModule:
             notes = f" {a.name}" if member != a.name else ""
             notes += f", {' x '.join(map(str, a.shape))}, row by row" if a.shape else ""
             notes += f" [{a.info.unit}]" if a.info.unit else ""
-            comment = f" /* {_in_comment(notes.strip(', '))} */" if notes else ""
+            comment = f" /* {in_comment(notes.strip(', '))} */" if notes else ""
             size = f"[{max(1, len(a.elements))}]" if a.shape else ""
             lines.append(f"    {self.type} {member}{size};{comment}")
         if not self.members:
@@ -317,7 +317,7 @@ class _CModule:
         for kind in ("q", "u", "inputs"):
             for i, name in enumerate(self.formulas.names(kind)):
                 unit = f" [{unit_of[name]}]" if unit_of.get(name) else ""
-                lines.append(_in_comment(f"   {kind}[{i}]: {name}{unit}"))
+                lines.append(in_comment(f"   {kind}[{i}]: {name}{unit}"))
             if not self.formulas.names(kind):
                 lines.append(f"   {kind}: none; may be null")
         lines += ["", "   What they write, matrices row by row; it must not overlap what they read: */", ""]
@@ -326,7 +326,7 @@ class _CModule:
                 f"{output} ({' x '.join(map(str, nodes.shape)) or 'a number'})"
                 for output, nodes in self.nodes[function].items()
             )
-            lines.append(f"/* {shapes}{_in_comment(_meaning(self.formulas, function))} */")
+            lines.append(f"/* {shapes}{in_comment(_meaning(self.formulas, function))} */")
             lines += [f"{self._signature(function)};", ""]
         return "\n".join([*lines, "#ifdef __cplusplus", "}", "#endif", "", "#endif", ""])
 
@@ -338,7 +338,7 @@ class _CModule:
         for x in self.formulas.values().values():
             numbers = ", ".join(map(self.constant, x.flat))
             texts.append(f"{{{numbers or '0'}}}" if x.shape else numbers)
-        default = f"const {self.name}_parameters {self.name}_default = {{\n    {_six_a_line(texts or ['0'])}\n}};\n"
+        default = f"const {self.name}_parameters {self.name}_default = {{\n    {six_a_line(texts or ['0'])}\n}};\n"
         parts = [self._comment(), f'#include "{header}"\n\n#include <math.h>\n', default, *helpers]
         return "\n".join([*parts, *(self._body(function) for function in self.functions)])
 
@@ -348,7 +348,7 @@ class _CModule:
         for output, elements in zip(by_output, outputs, strict=True):
             lines += [f"{output}[{i}] = {text};" for i, text in enumerate(elements)]
         text = "\n    ".join(lines)
-        unused = [f"(void){word};" for word in ("t", "q", "u", "inputs", "p", *by_output) if not _is_read(word, text)]
+        unused = [f"(void){word};" for word in ("t", "q", "u", "inputs", "p", *by_output) if not is_read(word, text)]
         return f"{self._signature(function)} {{\n    " + "\n    ".join([*unused, *lines]) + "\n}\n"
 
     def test(self, header: str) -> str:
@@ -368,12 +368,12 @@ class _CModule:
             for name, numbers in numbers_of.items():
                 calls.append(f'    wrong += compare("{name}", {numbers.size}, computed_{name}, {name});')
         tolerance = "1e-11" if self.formulas.dtype == "float64" else "1e-3"
-        lines.append(_COMPARE.format(type=self.type, tolerance=tolerance))
+        lines.append(COMPARE.format(type=self.type, tolerance=tolerance))
         return "\n".join([*lines, "int main(void) {", "    int wrong = 0;", *calls, "    return wrong;", "}", ""])
 
     def _array(self, name: str, numbers: np.ndarray) -> str:
         texts = [self.constant(x) for x in numbers.flat] or ["0"]
-        return f"static const {self.type} {name}[] = {{\n    {_six_a_line(texts)}\n}};"
+        return f"static const {self.type} {name}[] = {{\n    {six_a_line(texts)}\n}};"
 
 
 def _state_and_outputs(formulas: Formulas, functions: Iterable[str]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -458,7 +458,7 @@ def numpy(
 
 def _source(formulas: Formulas, functions: Sequence[str]) -> str:
     units = {a.name: a.info.unit for a in formulas.of_kind("parameters")}
-    unit_of = _variable_units(formulas.system)
+    unit_of = variable_units(formulas.system)
     bodies = [_function(formulas, function, unit_of) for function in functions]
     title = _title(formulas).replace("\\", "/").replace('"""', "'''")
     with_erf = any("_erf(" in body for body in bodies)
@@ -518,7 +518,7 @@ def _function(formulas: Formulas, function: str, unit_of: dict[str, str]) -> str
     lines.append(f'    """{", ".join(by_output)}{_meaning(formulas, function)}."""')
     for kind in ("q", "u", "inputs"):
         words = [names.of[kind, name] for name in formulas.names(kind)]
-        if any(_is_read(word, text) for word in words):
+        if any(is_read(word, text) for word in words):
             units = ", ".join(unit_of.get(name) or "-" for name in formulas.names(kind))
             right = f"np.asarray({kind}, np.{formulas.dtype})"
             if kind == "inputs":
@@ -526,7 +526,7 @@ def _function(formulas: Formulas, function: str, unit_of: dict[str, str]) -> str
             lines.append(f"    {', '.join(words)}{',' * (len(words) == 1)} = {right}  # [{units}]")
     for name in _names_of(formulas, "parameters"):
         word = names.of["parameters", name]
-        if _is_read(word, text):
+        if is_read(word, text):
             lines.append(f"    {word} = np.{formulas.dtype}(parameters[{name!r}])")
     lines += [f"    {line}" for line in body]
     for output, nodes, elements in zip(by_output, by_output.values(), outputs, strict=True):

@@ -18,9 +18,8 @@ from .._integrate.integrate import solve
 from .._kane.constraints import has_configuration_constraints
 from .._system.system import System, packed, unpacked
 from ..estimate._filter import brought_back, tangent
-from ..estimate._process_noise import MODES, Disturbance
+from ..estimate._process_noise import MODES, Disturbance, Noise
 from ..estimate._square_root import root, update
-from ._process_noise import Noise
 from ._windows import Windows, state_names
 
 

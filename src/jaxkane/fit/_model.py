@@ -18,8 +18,8 @@ from .._integrate.settings import Settings, settings_for
 from .._integrate.trajectory import Trajectory
 from .._kane.assemble import assemble
 from .._system.system import System, packed, unpacked
+from ..estimate._process_noise import Noise
 from ._parameters import Parameters
-from ._process_noise import Noise
 from ._windows import Windows, state_names
 
 

@@ -21,6 +21,7 @@ from .._kane.assemble import AssemblyProblem, NoConfiguration, euler_parameters
 from .._kane.constraints import has_configuration_constraints
 from .._kane.rhs import output_names
 from .._system.system import System
+from ..estimate._process_noise import noise_of
 from ._declarations import Prior
 from ._linearize import (
     Linearization,
@@ -32,7 +33,6 @@ from ._linearize import (
 )
 from ._model import Model, Nuisance, Simulation, Unknowns
 from ._parameters import Parameters, as_items, parameters_of
-from ._process_noise import noise_of
 from ._trial import Trial, as_trials
 from ._windows import Reach, Windows, WindowSlice, cut, state_names
 

@@ -184,14 +184,15 @@ class _FormulasAtMotion:
 
     def jacobian(self, kinds: tuple[str, ...]) -> Any:
         """The derivatives of (q_dot, u_dot)."""
-        return self.expressions(np.concatenate([*self.formulas.derivatives("rates", kinds).values()]))
+        blocks = self.formulas.derivatives("rates", self.formulas.directions(*kinds))
+        return self.expressions(np.concatenate([*blocks.values()]))
 
     def tangents(self, names: tuple[str, ...], dependent: tuple[str, ...]) -> Any:
         """T (n_q + n, n_free): how all coordinates and speeds move with the free ones, on the constraints."""
         sp = import_sympy()
         free = [x for x in names if x not in dependent]
         T = sp.Matrix(len(names), len(free), lambda i, j: int(names[i] == free[j]))
-        (h,) = self.formulas.derivatives("configuration_residuals", ("q",)).values()
+        (h,) = self.formulas.derivatives("configuration_residuals", self.formulas.directions("q")).values()
         check_dependent(self.formulas.system, dependent, len(h))
         if dependent:
             G = self.expressions(h)  # dh/dq

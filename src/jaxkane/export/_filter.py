@@ -1,0 +1,295 @@
+"""A Kalman filter with its model as one C99 header, for where the motion is measured. Compiles and runs nothing.
+
+The equations and their derivatives are written from a graph, as those of `jaxkane.export.c`; what stands around them,
+the steps of `jaxkane.estimate.predict` and `update`, is one text for all systems.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from string import Template
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .._kane.formulas import Formulas, Function
+from .._kane.kanes_method import motion_rates_by_matrix
+from .._kane.rhs import rates
+from .._scalarjit.backends.source import as_source
+from .._scalarjit.graph import NotScalarError, needed
+from .._version import __version__
+from ..estimate import Belief, Filter, predict, update
+from ..estimate._filter import sensed
+from ..estimate._process_noise import MODES
+from ._source import (
+    C_WORDS,
+    COMPARE,
+    HELPERS,
+    TYPES,
+    C,
+    identifiers,
+    in_comment,
+    is_read,
+    six_a_line,
+    variable_units,
+    write_file,
+)
+
+
+class ExportedFilter(NamedTuple):
+    """The files that `jaxkane.export.c_filter` has written."""
+
+    header: Path
+    test: Path
+
+
+def c_filter(
+    filter: Filter,
+    path: str | Path,
+    belief: Belief,
+    *,
+    name: str | None = None,
+    dtype: str = "float64",
+    dt: float = 0.01,
+) -> ExportedFilter:
+    """A Kalman filter with its model as one header of C99 that needs the mathematical library alone.
+
+        belief = jk.estimate.begin(filter, state, {"roll": 0.1, "roll_rate": 0.1})
+        jk.export.c_filter(filter, "generated/roll.h", belief)
+        # cc -std=c99 -O3 generated/roll_test.c -lm -o test && ./test
+
+    In C, with NaN for what was not measured:
+
+        roll_belief belief = roll_start;
+        roll_innovation innovation;
+        roll_predict(&belief, &roll_default, 0.01, inputs);
+        roll_update(&belief, &roll_default, measured, inputs, 0, &innovation);
+
+    These are `jaxkane.estimate.predict` and `update`, in arrays of fixed size on the stack: nothing is allocated or
+    kept. `roll_default` holds the parameters, the standard deviations of the sensors, and the spectral densities;
+    a copy of it may have others. The header says what is where, with units. A compiler must not be told that there is
+    no NaN (`-ffast-math`).
+
+    **Arguments:**
+
+    - `path`: of the header, "FOLDER/NAME.h", whose folder is made; beside it `NAME_test.c`, a program that
+        compares some steps with numbers that JAX computed.
+    - `belief`: what is known at the start, as `jaxkane.estimate.begin` gives it: `NAME_start`.
+    - `name`: what all names begin with; by default that of the file.
+    - `dtype`: "float64", or "float32" for `float`.
+    - `dt`: the time step of the test program [s].
+
+    **Returns:** the paths `header` and `test`.
+
+    **Raises:** `ValueError` for a belief of another filter, and for operations that cannot be written as formulas of
+    single numbers, as `jaxkane.export.c`.
+    """
+    if not isinstance(filter, Filter):
+        raise TypeError(f"c_filter exports a jaxkane.estimate.Filter, got {filter!r}.")
+    m, n = filter.lag + 1, len(filter.names)
+    if not isinstance(belief, Belief) or np.shape(belief.root) != (m, n, m * n):
+        raise ValueError("c_filter: `belief` is what jaxkane.estimate.begin gives for this filter.")
+    path = Path(path).with_suffix(".h")
+    text = _FilterText(filter, belief, name or path.stem, dtype)
+    files = ExportedFilter(path, path.with_name(f"{path.stem}_test.c"))
+    for file, content in zip(files, (text.header(), text.test(path.name, dt)), strict=True):
+        write_file(file, content.encode())
+    return files
+
+
+class _FilterText:
+    """The texts of the files of a filter."""
+
+    def __init__(self, filter: Filter, belief: Belief, name: str, dtype: str):
+        self.filter, self.belief, system = filter, belief, filter.system
+        more = {"all_rates": Function(("rate",), _all_rates), "sensed": Function(("z",), self._sensed)}
+        self.formulas = formulas = Formulas(system, dtype, more)
+        (self.name,) = identifiers([name], C_WORDS)
+        self.type = TYPES[formulas.dtype]
+        parameters = [a.name for a in formulas.of_kind("parameters")]
+        self.members = dict(zip(parameters, identifiers(parameters, C_WORDS), strict=True))
+        inputs = formulas.directions("inputs")
+        of_parameter = dict(zip(formulas.names("parameters"), formulas.directions("parameters"), strict=True))
+        self.of_input = dict(zip(system.inputs, inputs, strict=False))
+        self.rows = [*system.coordinates, *system.speeds, *system.states]  # what has a rate
+        self.estimated = [*formulas.directions("q"), *formulas.directions("u"), *inputs[len(system.inputs) :]]
+        self.estimated += [of_parameter[name] for name in filter.parameters]
+
+    def _sensed(self, system, t, q, u, w, _):
+        return (sensed(system, self.filter.sensors, t, q, u, w),)
+
+    def _words(self, is_disturbed: bool) -> dict[int, str]:
+        """What input nodes are called: what the filter estimates is in v, inputs in w, all else in *p."""
+        words = {}
+        for a, nodes in zip(self.formulas.arguments, self.formulas.inputs, strict=True):
+            for i, k in enumerate(nodes.flat):
+                word = f"p->{self.members[a.name]}" if a.kind == "parameters" else a.kind
+                words[int(k)] = word + f"[{i}]" * bool(a.shape)
+        node_of = lambda place: int(self.formulas.inputs[place[0]].flat[place[1]])  # noqa: E731
+        words |= {node_of(place): f"v[{i}]" for i, place in enumerate(self.estimated)}
+        for i, (name, place) in enumerate(self.of_input.items()):
+            noise = f" + e[{self.filter.noise.index(name)}]" if is_disturbed and name in self.filter.noise else ""
+            words[node_of(place)] = f"(w[{i}]{noise})" if noise else f"w[{i}]"
+        return words
+
+    def _model(self) -> str:
+        """What the system says, as functions: rates, what sensors read, residuals of constraints, derivatives."""
+        formulas, filter, n = self.formulas, self.filter, len(self.estimated)
+        is_extended = filter.method == "extended"
+        rates_of, sensed_of = formulas.nodes("all_rates"), formulas.nodes("sensed")
+        if is_extended:
+            of_inputs = [self.of_input[name] for name in filter.noise if name in self.of_input]
+            (slope,) = formulas.derivatives("all_rates", [*self.estimated, *of_inputs]).values()
+            by_input = iter(slope[:, n:].T)
+            number = lambda x: formulas.graph.constant(float(x), formulas.dtype)  # noqa: E731
+            columns = [
+                next(by_input) if name in self.of_input else [number(name == row) for row in self.rows]
+                for name in filter.noise
+            ]
+            rates_of = rates_of | {"slope": np.column_stack([slope[:, :n], *columns])}
+            (slope,) = formulas.derivatives("sensed", self.estimated).values()
+            sensed_of = sensed_of | {"slope": slope}
+        functions = {"rates": rates_of, "sensed": sensed_of}
+        (h,) = formulas.nodes("configuration_residuals").values()
+        if h.size:
+            (G,) = formulas.derivatives("configuration_residuals", formulas.directions("q")).values()
+            functions["constraints"] = {"h": h, "G": G}
+        nodes = needed(formulas.graph.nodes, [x for outputs in functions.values() for x in outputs.values()])
+        used = {formulas.graph.nodes[k].operation for k in nodes}
+        helpers = [text.format(type=self.type) for operation, text in HELPERS.items() if operation in used]
+        text = "\n".join([*helpers, *(self._function(*item) for item in functions.items())])
+        return re.sub(r"\b(larger|smaller)\(", rf"{self.name}_\1(", text)
+
+    def _function(self, function: str, outputs: dict[str, np.ndarray]) -> str:
+        is_disturbed = function == "rates" and self.filter.method == "unscented"
+        try:
+            lines, texts = as_source(self.formulas.graph, [*outputs.values()], self._words(is_disturbed), C)
+        except NotScalarError as error:
+            raise ValueError(f"{self.formulas.name}: the filter cannot be written in C: it holds {error}.") from None
+        for output, elements in zip(outputs, texts, strict=True):
+            for i, text in enumerate(elements):
+                name = self.rows[i] if is_disturbed and i < len(self.rows) else None
+                noise = f" + e[{self.filter.noise.index(name)}]" if name in self.filter.noise else ""
+                lines.append(f"{output}[{i}] = {text}{noise};")
+        text = "\n    ".join(lines)
+        read = ["t", "v", "w", *(["e"] if is_disturbed else []), "p"]
+        unused = [f"(void){word};" for word in (*read, *outputs) if not is_read(word, text)]
+        arguments = f"{self.type} t, const {self.type} *v, const {self.type} *w"
+        arguments += f", const {self.type} *e" * is_disturbed + f", const {self.name}_parameters *p"
+        arguments += "".join(f", {self.type} *{output}" for output in outputs)
+        body = "\n    ".join([*unused, *lines])
+        return f"static inline void {self.name}_{function}({arguments}) {{\n    {body}\n}}\n"
+
+    def header(self) -> str:
+        formulas, filter = self.formulas, self.filter
+        has_constraints = formulas.nodes("configuration_residuals")["h"].size
+        members = []
+        for a in formulas.of_kind("parameters"):
+            size = f"[{max(1, len(a.elements))}]" if a.shape else ""
+            unit = f" [{a.info.unit}]" if a.info.unit else ""
+            note = " (estimated: what stands in the mean counts)" if a.name in filter.parameters else ""
+            members.append(f"{self.type} {self.members[a.name]}{size}; /* {in_comment(a.name + unit + note)} */")
+        numbers = lambda x: six_a_line([C.constant(v, formulas.dtype) for v in np.ravel(x)] or ["0"])  # noqa: E731
+        default = [numbers(x) if not x.shape else f"{{{numbers(x)}}}" for x in formulas.values().values()]
+        constraints = "with_constraints" if has_constraints else "without_constraints"
+        text = _template("header", "common", constraints, filter.method, "end")
+        units = variable_units(filter.system) | {a.name: a.info.unit for a in formulas.of_kind("parameters")}
+
+        def listed(array: str, names: Sequence[str]) -> str:
+            unit = lambda name: f" [{units[name]}]" if units.get(name) else ""  # noqa: E731
+            lines = [in_comment(f"   {array}[{i}]: {name}{unit(name)}") for i, name in enumerate(names)]
+            return "\n".join(lines or [f"   {array}: none; may be null"])
+
+        return text.substitute(
+            title=in_comment(f"{formulas.name}: a Kalman filter, {filter.method}, written by jaxkane {__version__}"),
+            name=self.name,
+            NAME=self.name.upper(),
+            real=self.type,
+            s=C.suffix[formulas.dtype],
+            n=len(self.estimated),
+            rates=len(self.rows),
+            coordinates=len(filter.system.coordinates),
+            constraints=has_constraints,
+            sensors=len(filter.sensors),
+            noise=len(filter.noise),
+            noise_size=max(1, len(filter.noise)),
+            parameters=len(filter.parameters),
+            parameters_size=max(1, len(filter.parameters)),
+            times=filter.lag + 1,
+            substeps=filter.substeps,
+            modes=MODES,
+            of_mean=listed("mean", filter.names),
+            of_sensors=listed("measured", filter.sensors),
+            of_inputs=listed("inputs", filter.system.inputs),
+            of_noise=listed("density", filter.noise),
+            of_drift=listed("drift", filter.parameters),
+            members="\n    ".join(members or ["char none; /* there are no parameters */"]),
+            default=",\n    ".join(default or ["0"]),
+            sigma=numbers(filter.sigma),
+            density=numbers(filter.density),
+            drift=numbers(filter.drift),
+            start_t=numbers(self.belief.t),
+            start_mean=numbers(self.belief.mean),
+            start_root=numbers(self.belief.root),
+            model=self._model(),
+        )
+
+    def test(self, header: str, dt: float) -> str:
+        """A program that makes some steps, and compares what is known then."""
+        steps, after = self._steps(dt)
+        constant = lambda x: C.constant(x, self.formulas.dtype)  # noqa: E731
+
+        def array(name: str, x: np.ndarray) -> str:
+            numbers = six_a_line([constant(v) for v in np.ravel(x)] or ["0"])
+            return f"static const {self.type} {name}[] = {{\n    {numbers}\n}};"
+
+        n, k = after.mean.size, after.root.shape[2]
+        root = np.reshape(after.root, (n, k))
+        lines = [f"/* {in_comment(self.formulas.name)}: some steps of the filter. */", f'#include "{header}"\n']
+        lines += ["#include <stdio.h>", COMPARE.format(type=self.type, tolerance=f"{self._tolerance():.0e}")]
+        calls = []
+        for i, (inputs, measured, age) in enumerate(steps):
+            lines += [array(f"inputs_{i}", inputs), array(f"measured_{i}", measured)]
+            calls.append(f"{self.name}_predict(&belief, &{self.name}_default, {constant(dt)}, inputs_{i});")
+            update = f"{self.name}_update(&belief, &{self.name}_default, measured_{i}, inputs_{i}, {age}, &innovation)"
+            calls.append(f"wrong += {update};")
+        lines += [array("mean", after.mean), array("covariance", root @ root.T), ""]
+        steps_in_c = "\n    ".join(calls)
+        lines.append(_template("test").substitute(name=self.name, real=self.type, n=n, k=k, steps=steps_in_c))
+        return "\n".join(lines)
+
+    def _tolerance(self) -> float:
+        return 1e-11 if self.formulas.dtype == "float64" else 2e-3
+
+    def _steps(self, dt: float) -> tuple[list[tuple[np.ndarray, np.ndarray, int]], Belief]:
+        """Inputs, measurements and their age, of which one is a gap and one is late; and what is known afterwards."""
+        filter, belief, steps = self.filter, self.belief, []
+        for i in range(4):
+            inputs = 0.1 * np.sin(1.0 + i + np.arange(len(filter.system.inputs)))
+            given, age = dict(zip(filter.system.inputs, inputs, strict=True)), filter.lag * (i == 3)
+            belief = predict(filter, belief, dt, given)
+            nothing = jnp.full(len(filter.sensors), jnp.nan)
+            expected = np.asarray(update(filter, belief, nothing, given, age=age)[1].predicted)
+            measured = expected + np.asarray(filter.sigma) * np.cos(2.0 * i + np.arange(len(expected)))
+            if i == 1:
+                measured[-1] = np.nan
+            belief, _ = update(filter, belief, jnp.asarray(measured), given, age=age)
+            steps.append((inputs, measured, age))
+        return steps, jax.tree.map(np.asarray, belief)
+
+
+def _template(*sections: str) -> Template:
+    """Sections of `filter_template.h`, each of which follows a line `// name`."""
+    text = (Path(__file__).parent / "filter_template.h").read_text(encoding="utf-8")
+    parts = re.split(r"^// (\w+)\n", text, flags=re.MULTILINE)
+    by_name = dict(zip(parts[1::2], parts[2::2], strict=True))
+    return Template("".join(by_name[name] for name in sections))
+
+
+def _all_rates(system, t, q, u, w, _):
+    x_dot = [rates(system, t, q, u, w).x] if system.states else []
+    return (jnp.concatenate([*motion_rates_by_matrix(system, t, q, u, w), *x_dot]),)
