@@ -190,6 +190,18 @@ def test_the_program_beside_the_header_compares(method, tmp_path):
     assert "malloc" not in text
 
 
+@needs_compiler
+def test_two_filters_stand_in_one_program(tmp_path):
+    """Names of their own, from names that C does not allow."""
+    filter, belief = of_circle()
+    names = [jk.export.c_filter(filter, tmp_path / name, belief).header for name in ("a.h", "b-é.h")]
+    (tmp_path / "two.c").write_text(
+        "".join(f'#include "{path.name}"\n' for path in names) + "int main(void) {return 0;}"
+    )
+    subprocess.run([CC, *STRICT, tmp_path / "two.c", "-lm", "-o", tmp_path / "two"], check=True)
+    assert "b_e_belief b_e_start" in names[1].read_text()
+
+
 def test_what_cannot_be_exported_is_named(tmp_path):
     filter, belief = of_servo()
     with pytest.raises(TypeError, match=r"exports a jaxkane\.estimate\.Filter, got"):
