@@ -7,15 +7,18 @@ How to run them:
     JAXKANE_TEST_CACHE=FOLDER     keeps the compiled programs for the next run; by default they go with this one
     JAXKANE_TEST_CACHE=0          keeps none, and leaves XLA as a user has it
     pytest -m ""                  the slow ones too, and with XLA's optimizations
+    JAXKANE_VALIDATION=docs/validation.md pytest -m published    writes the table of published figures
 """
 
 import contextlib
 import gc
 import os
+import pathlib
 import shutil
 import tempfile
 
 import jax
+import numpy as np
 import psutil
 import pytest
 import touched
@@ -59,6 +62,44 @@ def pytest_collection_finish():
     """What has been imported stays."""
     gc.collect()
     gc.freeze()
+
+
+@pytest.fixture
+def published(request):
+    """`published(source, quantity, theirs, ours, atol)`: figures that a source prints, compared, and kept for the page
+    that lists them. Without figures, `theirs` says what was compared otherwise."""
+
+    def compare(source, quantity, theirs, ours=None, atol=0.0):
+        if ours is None:
+            row = [source, quantity, "", theirs, "", ""]
+        else:
+            theirs, ours, atol = np.ravel(theirs), np.ravel(ours), np.broadcast_to(atol, np.size(theirs))
+            worst = np.argmax(np.abs(ours - theirs) - atol)
+            assert np.all(np.abs(ours - theirs) <= atol), (theirs[worst], ours[worst], atol[worst])
+            k = int(np.argmax([len(str(x)) for x in theirs]))
+            digits = min(len(str(theirs[k]).partition(".")[2]), round(-np.log10(atol[k])))
+            row = [source, quantity, str(theirs.size), str(theirs[k]), f"{ours[k]:.{digits}f}", f"{atol[k]:.0e}"]
+        test = request.node.nodeid.split("[")[0]
+        request.node.user_properties.append(("published", (*row, test)))
+
+    return compare
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    """The table of what tests have compared by `published`, into the file that JAXKANE_VALIDATION names."""
+    if "JAXKANE_VALIDATION" not in os.environ or hasattr(config, "workerinput"):
+        return
+    reports = [report for name in ("passed", "failed") for report in terminalreporter.stats.get(name, [])]
+    rows = {row for report in reports for name, row in report.user_properties if name == "published"}
+    heads = ("source", "quantity", "figures", "for example: theirs", "ours", "within", "test")
+    lines = [heads, ["---"] * len(heads), *([*row[:-1], f"`{row[-1]}`"] for row in sorted(rows))]
+    path = pathlib.Path(os.environ["JAXKANE_VALIDATION"])
+    before, _, after = path.read_text(encoding="utf-8").partition(MARK)
+    table = "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    path.write_text(f"{before}{MARK}\n\n{table}\n{after[after.index(END) :] if END in after else ''}", encoding="utf-8")
+
+
+MARK, END = "<!-- begin: written by `JAXKANE_VALIDATION=docs/validation.md pytest -m published` -->", "\n<!-- end -->"
 
 
 @pytest.fixture(autouse=True, scope="module")

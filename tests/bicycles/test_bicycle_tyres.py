@@ -93,7 +93,8 @@ class RoundedLoad(Part):
 
 
 @pytest.mark.slow
-def test_sharps_motorcycle_has_the_eigenvalues_of_his_table():
+@pytest.mark.published
+def test_sharps_motorcycle_has_the_eigenvalues_of_his_table(published):
     """40 of 40 to the printed digits, with the load of the front wheel that he rounds to 226 lb."""
     motorcycle = sharp_motorcycle()
     jk.assemble(motorcycle, {})  # which refuses inertias that no body has
@@ -107,7 +108,13 @@ def test_sharps_motorcycle_has_the_eigenvalues_of_his_table():
     table = np.stack([capsize.real, weave.real, weave.imag, wobble.real, wobble.imag], axis=1)
     known = np.array([*SHARP.values()])
     last_digit = np.where(np.abs(known) < 10.0, 0.01, 0.1)
-    assert np.all(np.abs(table - known) <= 0.5 * last_digit)
+    published(
+        "Sharp (1971)",
+        "modes of a motorcycle, 10 to 160 ft/s, tables 1 to 3 [1/s]",
+        known,
+        table,
+        0.5 * last_digit.ravel(),
+    )
 
 
 @pytest.mark.slow

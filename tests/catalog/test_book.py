@@ -285,9 +285,10 @@ def random_example(name, rng):
     return system, rng.uniform(0.0, 5.0), q, u, inputs
 
 
+@pytest.mark.published
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("name", PRINTED)
-def test_printed_equations(name, seed):
+def test_printed_equations(name, seed, published):
     system, t, q, u, inputs = random_example(name, np.random.default_rng(seed))
     p = {key: float(value) for key, value in vars(system).items()}
     n = len(u)
@@ -305,6 +306,8 @@ def test_printed_equations(name, seed):
         np.testing.assert_allclose(row_f, row_b, rtol=0, atol=RTOL * (np.abs(row_A).max() + np.abs(row_b)))
     u_dot = accelerations(system, t, q, u, inputs)
     np.testing.assert_allclose(u_dot, np.linalg.solve(A, b), rtol=0, atol=RTOL * np.linalg.cond(A) * abs(u_dot).max())
+    what = "final equations of Examples 1 to 6, Exercises 5.1 to 5.8"
+    published("Kamman, Volume II, Unit 5", what, f"at random states, {RTOL:.0e}")
 
 
 def test_every_entry_has_its_printed_equations():
