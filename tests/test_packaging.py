@@ -62,6 +62,26 @@ def test_every_requirement_says_its_lowest_version_and_jax_its_ceiling():
     assert floors["jax"] == re.match(r"jax>=([\d.]+)", jax)[1]
 
 
+def test_the_recipe_asks_for_what_the_wheel_asks_for():
+    text = (ROOT / "recipe/recipe.yaml").read_text(encoding="utf-8")
+    recipe = yaml.safe_load(text)
+    asked = {line.replace(" ", "").replace("-base", "") for line in recipe["requirements"]["run"][1:]}
+    assert asked == {entry.replace(" ", "") for entry in PROJECT["dependencies"]}
+    assert recipe["context"] == {"version": jk.__version__, "python_min": PYTHONS[0]}
+
+
+def test_every_row_of_the_validation_page_is_a_test_and_every_such_test_a_row():
+    page = (ROOT / "docs/validation.md").read_text(encoding="utf-8")
+    rows = set(re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", page))
+    marked = r"@pytest\.mark\.published\n(?:@.*\n)*def (\w+)"
+    there = {
+        (path.relative_to(ROOT).as_posix(), name)
+        for path in (ROOT / "tests").rglob("test_*.py")
+        for name in re.findall(marked, path.read_text(encoding="utf-8"))
+    }
+    assert rows == there
+
+
 def test_files_of_tests_have_names_of_their_own():
     """pytest imports them by their names alone: two of one name end the whole run."""
     names = [path.name for path in (ROOT / "tests").rglob("test_*.py")]
