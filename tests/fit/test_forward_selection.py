@@ -122,6 +122,43 @@ def test_the_promise_is_that_of_a_fit(rubbing):
         assert row.held_out_cost == pytest.approx(cross_validate(anew).held_out.sum(), rel=0.05)
 
 
+class Impostor(Pendulum):
+    """With a parameter that does what dry friction and a spring do together, in another ratio."""
+
+    both: jk.Scalar = jk.parameter(0.0)
+
+    def loads(self, t, q, u, motion, inputs):
+        torque = self.both * (0.5 * jnp.tanh(u["rate"] / 0.1) + q["angle"])
+        return *as_loads(super().loads(t, q, u, motion, inputs)), jk.Torque(-torque * motion["B"].y, motion["bob"])
+
+
+def as_loads(loads):
+    return loads if isinstance(loads, tuple) else (loads,)
+
+
+@pytest.fixture(scope="module")
+def beams():
+    """A search without gravity's sine, so that a spring is one of its own, by one way and by two."""
+    trials = record(3, system=Pendulum(dry=0.4, spring=1.5))
+    without = fit(Impostor(), trials, ("damping",), **POSED)
+    return [forward_selection(without, ("both", "dry", "spring"), depth=2, beam=n) for n in (1, 2)]
+
+
+def test_a_beam_finds_what_an_impostor_hides(beams):
+    greedy, beam = beams
+    assert greedy.selected[0] == "both"
+    assert not greedy.alternatives or all("both" in one.names or len(one.names) == 1 for one in greedy.alternatives)
+    sets = [{*beam.selected}, *({*one.names} for one in beam.alternatives if one.is_as_good)]
+    assert {"dry", "spring"} in sets  # beside the impostor with one of them, which does the same
+    assert {"both", "dry"} in sets or {"both", "spring"} in sets
+    assert beam.fit.cost <= greedy.fit.cost * (1 + 1e-6)
+    assert "These data do not tell it from" in str(beam)
+    assert "Alternatives." in str(beam)
+    assert "predicts as well" in beam._repr_html_()
+    costs = [one.held_out_cost for one in beam.alternatives]
+    assert costs == sorted(costs)
+
+
 @pytest.mark.slow
 def test_what_is_not_there_is_not_taken():
     taken = 0
@@ -250,6 +287,7 @@ def test_one_trial_alone(rubbing):
         (("dry",), {"plausible": {"dry": 0.2}}, "a share is positive, and of a start that is not zero"),
         (("dry",), {"level": 0.0}, "`level` is a probability"),
         (("dry",), {"depth": 0}, "`depth` is a whole number of 1"),
+        (("dry",), {"beam": 0}, "`beam` is a whole number of 1"),
         (("dry",), {"refits": -1}, "`refits` is a whole number of 0"),
         ((Offset("angel"),), {}, "no input or channel 'angel'; did you mean 'angle'"),
         ((Gain("torque", of="start"),), {}, "no coordinate, independent speed or state 'torque'"),

@@ -257,7 +257,7 @@ class _FilterText:
             calls.append(f"{self.name}_predict(&belief, &{self.name}_default, {constant(dt)}, inputs_{i});")
             update = f"{self.name}_update(&belief, &{self.name}_default, measured_{i}, inputs_{i}, {age}, &innovation)"
             calls.append(f"wrong += {update};")
-        lines += [array("mean", after.mean), array("covariance", root @ root.T), ""]
+        lines += [array("mean", np.asarray(after.mean)), array("covariance", root @ root.T), ""]
         steps_in_c = "\n    ".join(calls)
         lines.append(_template("test").substitute(name=self.name, real=self.type, n=n, k=k, steps=steps_in_c))
         return "\n".join(lines)
@@ -291,5 +291,7 @@ def _template(*sections: str) -> Template:
 
 
 def _all_rates(system, t, q, u, w, _):
-    x_dot = [rates(system, t, q, u, w).x] if system.states else []
-    return (jnp.concatenate([*motion_rates_by_matrix(system, t, q, u, w), *x_dot]),)
+    rows = [*motion_rates_by_matrix(system, t, q, u, w)]
+    if system.states:
+        rows.append(jnp.asarray(rates(system, t, q, u, w).x))
+    return (jnp.concatenate(rows),)

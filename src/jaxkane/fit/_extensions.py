@@ -93,15 +93,26 @@ class Extension:
         )
 
 
+@dataclasses.dataclass(frozen=True)
+class Alternative:
+    """Candidates that were accepted together: their `names`, the sums of squares of their fit and of trials left out,
+    and whether they predict as well as the selected ones, to twice the standard error of the differences by fold."""
+
+    names: tuple[str, ...]
+    cost: float
+    held_out_cost: float
+    is_as_good: bool
+
+
 @dataclasses.dataclass(frozen=True, repr=False)
 class ForwardSelection:
     """The result of `forward_selection`; print it for the tables.
 
-    - `rounds`: the candidates of each round, the accepted ones first. `costs`, `held_out_costs`: the sums of squares
+    - `rounds`: the candidates of each round, the selected one first. `costs`, `held_out_costs`: the sums of squares
         with which each began, fitted and of trials left out in turn.
     - `selected`: the names of the selected candidates, in that order; `best`: the first one, or None. `fit`: with all
         of them; the one `before` where there is none.
-    - `level`: of the test.
+    - `alternatives`: what else was accepted, the best first. `level`: of the test.
     """
 
     before: Fit
@@ -109,6 +120,7 @@ class ForwardSelection:
     costs: tuple[float, ...]
     held_out_costs: tuple[float, ...]
     selected: tuple[str, ...]
+    alternatives: tuple[Alternative, ...]
     level: float
     fit: Fit
 
@@ -127,6 +139,13 @@ class ForwardSelection:
                 held_out = "one trial, nothing is left out"
             heading = f"Sum of squares{beside} {self.costs[i]:.6g}; {held_out}."
             tables.append((heading, [HEAD, *(extension.cells for extension in extensions)]))
+        if self.alternatives:
+            rows = [("accepted too", "cost", "held-out cost", "against what is selected")]
+            for one in self.alternatives:
+                held_out = "" if math.isnan(one.held_out_cost) else f"{one.held_out_cost:.5g}"
+                told = "predicts as well" if one.is_as_good else ""
+                rows.append((", ".join(one.names), f"{one.cost:.5g}", held_out, told))
+            tables.append(("Alternatives.", rows))
         return tables
 
     @property
@@ -137,10 +156,13 @@ class ForwardSelection:
         left_out = "" if math.isnan(held_out) else f" (of trials left out: {held_out:.5g} before)"
         best = [extensions[0] for extensions in self.rounds[: len(self.selected)]]
         names = [one.name if one.nested else f"{one.name} (not nested: by {one.criterion})" for one in best]
-        return f"Selected: {', '.join(names)}. Sum of squares {self.before.cost:.6g} -> {self.fit.cost:.6g}{left_out}."
+        text = f"Selected: {', '.join(names)}. Sum of squares {self.before.cost:.6g} -> {self.fit.cost:.6g}{left_out}."
+        as_good = [" and ".join(one.names) for one in self.alternatives if one.is_as_good]
+        return text + (f" These data do not tell it from {'; '.join(as_good)}." if as_good else "")
 
     def __str__(self) -> str:
-        return f"{text_tables(self.tables, (0, len(HEAD) - 1))}\n\n{self.conclusion}"
+        tables = "\n\n".join(text_tables([table], (0, len(table[1][0]) - 1)) for table in self.tables)
+        return f"{tables}\n\n{self.conclusion}"
 
     __repr__ = __str__
 
@@ -153,6 +175,7 @@ def forward_selection(
     candidates: Any,
     *,
     depth: int = 1,
+    beam: int = 1,
     refits: int | None = 3,
     level: float = 0.05,
     plausible: Mapping[str, Any] | None = None,
@@ -186,8 +209,10 @@ def forward_selection(
     - `fit`: one that has converged. `candidates`: a list of names of parameters, `Free`, `Gain`, `Offset`, `Delay`,
         `Inertia`, and `Candidate`, which may be several of these together, what every trial has its own of, or another
         system. Each starts where it changes nothing.
-    - `depth`: how many may be selected. `refits`: how many nested candidates are fitted in each round; None for all
-        that the data can distinguish, 0 for no fit at all. `level`: of the test.
+    - `depth`: how many may be selected. `beam`: how many ways are followed at once: with 1 the best candidate is taken,
+        and the others are tested beside it; with more, the best few are, and in the end what predicts best is selected.
+        `refits`: how many nested candidates are fitted in each round; None for all that the data can distinguish, 0 for
+        no fit at all. `level`: of the test.
     - `plausible`: by name, (lower, upper), or a share of the start such as 0.2. By default `Candidate.plausible`,
         three deviations of a prior, or two bounds, without their ends. A parameter that starts on a bound, as friction
         at zero, is searched for on both sides and plausible on one.
@@ -199,38 +224,91 @@ def forward_selection(
     already, and names that do not exist.
     """
     refuse_other(fit, Fit, "forward_selection", "forward_selection(fit(...), candidates)")
-    _check_arguments(fit, depth, refits, level)
-    rest = list(checked_candidates(fit, candidates))
-    order, plausible = tuple(candidate.name for candidate in rest), dict(plausible or {})
+    _check_arguments(fit, depth, beam, refits, level)
+    candidates = list(checked_candidates(fit, candidates))
+    order, plausible = tuple(candidate.name for candidate in candidates), dict(plausible or {})
     T, groups = len(fit.problem.trials), None
     if T >= 2:
         groups = folds_of((T if T <= 10 else 5) if folds is None else folds, T)
     elif folds is not None:
         raise ValueError("`folds`: one trial alone cannot be left out: cut it with `Trial.between`.")
-    model, selected, rounds = RestrictedModel.of(fit), [], []
+    ways, ended, accepted = [Way((), RestrictedModel.of(fit), ())], [], {}
     with tqdm(disable=not progress, desc="forward selection", unit=" step") as bar:
-        while rest and len(rounds) < depth:
-            round = SelectionRound(fit, model, tuple(selected), order, level / len(rest), plausible, groups, bar)
-            extensions, models = round.run(rest, refits)
-            rounds.append((model.cost, model.held_out_cost(groups), extensions))
-            best = extensions[0]
-            if not best.accepted:
-                break
-            selected += [c for c in rest if c.name == best.name]
-            rest = [c for c in rest if c.name != best.name]
-            model = models[best.name]
-    names = {name for _, _, extensions in rounds for one in extensions for name in one.values}
+        for _ in range(depth):
+            longer: dict[frozenset[str], Way] = {}
+            for way in ways:
+                rest = [c for c in candidates if c.name not in {one.name for one in way.selected}]
+                if not rest:
+                    ended.append(way)
+                    continue
+                round = SelectionRound(fit, way.model, way.selected, order, level / len(rest), plausible, groups, bar)
+                for other in way.extended(*round.run(rest, refits), candidates, groups):
+                    names = frozenset(c.name for c in other.selected)
+                    if len(other.selected) == len(way.selected):
+                        ended.append(other)
+                    elif names not in longer or other.rank(groups) < longer[names].rank(groups):
+                        longer[names] = accepted[names] = other
+            ways = sorted(longer.values(), key=lambda way: way.rank(groups))[:beam]
+    best = min([*ways, *ended], key=lambda way: way.rank(groups))
+    names = {name for way in (*ways, *ended) for _, _, round in way.rounds for one in round for name in one.values}
     refuse_unknown(plausible, (*fit.names, *names), "`plausible` names")
     after = fit
-    if selected:  # as a user would pose it
-        problem = fit.problem.with_specification(extended_specification(fit, selected))
-        start = mapped_point(model.problem, model.point, problem, model.names)
+    if best.selected:  # as a user would pose it
+        problem = fit.problem.with_specification(extended_specification(fit, best.selected))
+        start = mapped_point(best.model.problem, best.model.point, problem, best.model.names)
         after = solve(problem, LeastSquares(), start=start)
-    costs, held_out_costs, extensions = zip(*rounds, strict=True)
-    return ForwardSelection(fit, extensions, costs, held_out_costs, tuple(c.name for c in selected), level, after)
+    costs, held_out_costs, extensions = zip(*best.rounds, strict=True)
+    selected = tuple(c.name for c in best.selected)
+    others = sorted((way for names, way in accepted.items() if not names <= {*selected}), key=lambda w: w.rank(groups))
+    alternatives = tuple(way.beside(best, groups) for way in others)
+    return ForwardSelection(fit, extensions, costs, held_out_costs, selected, alternatives, level, after)
 
 
-def _check_arguments(fit: Fit, depth: Any, refits: Any, level: float) -> None:
+@dataclasses.dataclass(frozen=True)
+class Way:
+    """Candidates selected one after the other, and the rounds in which they were; each is (cost, held-out cost,
+    candidates)."""
+
+    selected: tuple[Candidate, ...]
+    model: RestrictedModel
+    rounds: tuple[tuple[float, float, tuple[Extension, ...]], ...]
+
+    def extended(
+        self,
+        extensions: tuple[Extension, ...],
+        models: Mapping[str, RestrictedModel],
+        candidates: Sequence[Candidate],
+        folds: Sequence[Sequence[int]] | None,
+    ) -> list[Way]:
+        """By each candidate that was accepted; where none was, this one, with the round in which it ended."""
+        before = self.model.cost, self.model.held_out_cost(folds)
+        accepted = [one for one in extensions if one.accepted]
+        if not accepted:
+            return [Way(self.selected, self.model, (*self.rounds, (*before, extensions)))]
+        ways = []
+        for one in accepted:
+            first = (one, *(other for other in extensions if other is not one))
+            candidate = next(c for c in candidates if c.name == one.name)
+            ways.append(Way((*self.selected, candidate), models[one.name], (*self.rounds, (*before, first))))
+        return ways
+
+    def rank(self, folds: Sequence[Sequence[int]] | None) -> float:
+        """By trials left out, as the last of its candidates was judged; with one trial by the sum of squares."""
+        if folds is None:
+            return self.model.cost
+        return self.rounds[-1][2][0].held_out_cost if self.selected else self.model.held_out_cost(folds)
+
+    def beside(self, best: Way, folds: Sequence[Sequence[int]] | None) -> Alternative:
+        names, is_as_good = tuple(c.name for c in self.selected), False
+        if folds is not None and best.selected:
+            by_fold = [way.model.linearized.costs_left_out(way.model.places, folds) for way in (self, best)]
+            difference = by_fold[0] - by_fold[1]
+            error = np.std(difference, ddof=1) * math.sqrt(len(folds))
+            is_as_good = bool(self.rank(folds) - best.rank(folds) < 2.0 * error)
+        return Alternative(names, self.model.cost, math.nan if folds is None else self.rank(folds), is_as_good)
+
+
+def _check_arguments(fit: Fit, depth: Any, beam: Any, refits: Any, level: float) -> None:
     if fit.problem.specification.noise is not None:
         raise ValueError(
             "forward_selection compares sums of squares of fits without process noise; this fit has process noise, "
@@ -241,7 +319,11 @@ def _check_arguments(fit: Fit, depth: Any, refits: Any, level: float) -> None:
             f"The fit has not converged ({fit.status}), and a score test is one at a minimum. Go on with "
             "`minimize(fit.problem, LeastSquares(), start=fit.point)`."
         )
-    for name, value, smallest in (("depth", depth, 1), ("refits", 0 if refits is None else refits, 0)):
+    for name, value, smallest in (
+        ("depth", depth, 1),
+        ("beam", beam, 1),
+        ("refits", 0 if refits is None else refits, 0),
+    ):
         if not isinstance(value, int) or value < smallest:
             raise ValueError(f"`{name}` is a whole number of {smallest} at least, got {value!r}.")
     check_level(level)
@@ -280,7 +362,7 @@ class RestrictedModel:
 
     def held_out_cost(self, folds: Sequence[Sequence[int]] | None) -> float:
         """The sum of squares of trials left out in turn, linearized; NaN without folds."""
-        return self.linearized.cost_left_out(self.places, folds) if folds is not None else math.nan
+        return float(np.sum(self.linearized.costs_left_out(self.places, folds))) if folds is not None else math.nan
 
 
 def without_priors(problem: Problem) -> Problem:
@@ -423,7 +505,7 @@ class SelectionRound:
         if self.folds is not None:
             degrees_of_freedom = model.degrees_of_freedom - len(new) - count
             optimism = _optimism(count, score.minimal_cost, degrees_of_freedom, model.correlation)
-            held_out_cost = linearized.cost_left_out(x, self.folds) + optimism
+            held_out_cost = float(np.sum(linearized.costs_left_out(x, self.folds))) + optimism
         return dataclasses.replace(
             extension,
             predicted_cost=model.cost - score.drop,

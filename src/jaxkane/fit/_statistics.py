@@ -184,14 +184,15 @@ class LinearizedProblem:
         x = solved(A, r)
         return x, float(np.sum((A @ x + r) ** 2))
 
-    def cost_left_out(self, places: Sequence[int], folds: Sequence[Sequence[int]]) -> float:
-        """Cross validation: the sum of squares of trials left out in turn, with these estimated from the others."""
-        places, total = list(places), 0.0
+    def costs_left_out(self, places: Sequence[int], folds: Sequence[Sequence[int]]) -> np.ndarray:
+        """Cross validation: the sums of squares (n_folds,) of trials left out in turn, with these estimated from the
+        others."""
+        places, costs = list(places), []
         for fold in folds:
             x, _ = dataclasses.replace(self, data=np.delete(self.data, list(fold), axis=0)).minimum(places)
             out = self.data[list(fold)]
-            total += float(np.sum((out[:, :, places] @ x + out[:, :, -1]) ** 2))
-        return total
+            costs.append(np.sum((out[:, :, places] @ x + out[:, :, -1]) ** 2))
+        return np.array(costs)
 
 
 def solved(A: np.ndarray, r: np.ndarray) -> np.ndarray:
