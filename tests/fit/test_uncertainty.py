@@ -339,6 +339,7 @@ def test_the_report_is_one_page_that_says_it_all(result, tmp_path):
     text = path.read_text()
     page = _Page(text)
     assert page.kinds["svg"] >= 6
+    assert text.count('<figure role="img" aria-label="') == page.kinds["figure"]
     assert not page.outside
     assert "Held-out score" in text
     for words in (*NAMES, "Ljung-Box", "variance accounted for", "correlation", "singular value", "jax 0", "run 3"):

@@ -344,6 +344,19 @@ def test_a_browser_shows_it_on_light_and_dark_pages(weaving, page, tmp_path, dar
 
 
 @needs_a_browser
+def test_a_phone_shows_all_of_its_controls(weaving, page, tmp_path):
+    page("Emulation.setDeviceMetricsOverride", width=390, height=844, deviceScaleFactor=1, mobile=False)
+    page.show(weaving.save(tmp_path / "ride.html"))
+    page.wait(LOOKED)
+    assert page.value("document.documentElement.scrollWidth") <= 390
+    assert (
+        page.value("Math.max(...[...document.querySelectorAll('#bar > *')].map(x => x.getBoundingClientRect().right))")
+        < 390
+    )
+    page("Emulation.setDeviceMetricsOverride", width=900, height=560, deviceScaleFactor=1, mobile=False)
+
+
+@needs_a_browser
 def test_a_browser_projects_as_the_library_does(weaving, page, tmp_path):
     """Within 0.05 pixels: places are kept in 32 bits and orientations in 16."""
     page.show(weaving.save(tmp_path / "ride.html"))

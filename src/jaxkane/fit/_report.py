@@ -113,7 +113,7 @@ class _Section:
         parts += [f"<p>{html.escape(paragraph)}</p>" for paragraph in self.paragraphs]
         items = "".join(f"<li>{html.escape(note)}</li>" for note in self.notes)
         parts += [f'<ul class="notes">{items}</ul>'] * bool(items)
-        parts += [wide(self.table), *map(_picture, self.figures())]
+        parts += [wide(self.table), *(_picture(figure, self.heading) for figure in self.figures())]
         parts += [f"<details><summary>Every trial</summary>{wide(self.details)}</details>"] * bool(self.details)
         return "".join(parts)
 
@@ -228,11 +228,11 @@ def _settings(fit: Fit) -> Iterator[tuple[str, str]]:
     yield "written", datetime.datetime.now().astimezone().isoformat(timespec="minutes")
 
 
-def _picture(figure: Any) -> str:
+def _picture(figure: Any, text: str) -> str:
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg")
     drawing = buffer.getvalue()
-    return f"<figure>{drawing[drawing.index('<svg') :]}</figure>"
+    return f'<figure role="img" aria-label="{html.escape(text)}">{drawing[drawing.index("<svg") :]}</figure>'
 
 
 def _figure(width: float, height: float) -> Any:
