@@ -5,6 +5,7 @@ import shutil
 import subprocess
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -208,3 +209,10 @@ def test_what_cannot_be_exported_is_named(tmp_path):
         jk.export.c_filter(Servo(), tmp_path / "f.h", belief)
     with pytest.raises(ValueError, match=r"what jaxkane\.estimate\.begin gives for this filter"):
         jk.export.c_filter(filter, tmp_path / "f.h", of_servo(lag=0)[1])
+    with pytest.raises(ValueError, match="not finite"):
+        jk.export.c_filter(filter, tmp_path / "f.h", jax.tree.map(lambda x: x * jnp.nan, belief))
+    with pytest.raises(ValueError, match="`dt` is a time step"):
+        jk.export.c_filter(filter, tmp_path / "f.h", belief, dt=-0.01)
+    with pytest.raises(TypeError, match="being traced"):
+        jax.jit(lambda belief: jk.export.c_filter(filter, tmp_path / "f.h", belief))(belief)
+    assert not [*tmp_path.iterdir()]

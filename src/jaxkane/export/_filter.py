@@ -16,6 +16,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from .._common.lookup import real_number
+from .._kane.arguments import is_concrete
 from .._kane.formulas import Formulas, Function
 from .._kane.kanes_method import motion_rates_by_matrix
 from .._kane.rhs import rates
@@ -85,7 +87,8 @@ def c_filter(
 
     **Returns:** the paths `header` and `test`.
 
-    **Raises:** `ValueError` for a belief of another filter, and for operations that cannot be written as formulas of
+    **Raises:** `TypeError` for what is no filter, or traced; `ValueError` for a belief of another filter or one that is
+    not finite, a `dt` that is not positive, and for operations that cannot be written as formulas of
     single numbers, as `jaxkane.export.c`.
     """
     if not isinstance(filter, Filter):
@@ -93,6 +96,14 @@ def c_filter(
     m, n = filter.lag + 1, len(filter.names)
     if not isinstance(belief, Belief) or np.shape(belief.root) != (m, n, m * n):
         raise ValueError("c_filter: `belief` is what jaxkane.estimate.begin gives for this filter.")
+    if not is_concrete(filter, belief):
+        raise TypeError(
+            "c_filter writes numbers, and these are being traced: call it outside of jax.jit, vmap and grad."
+        )
+    if not all(np.all(np.isfinite(x)) for x in (belief.t, belief.mean, belief.root)):
+        raise ValueError("c_filter: `belief` holds numbers that are not finite.")
+    if not 0 < real_number(dt, "c_filter: `dt`") < np.inf:
+        raise ValueError(f"c_filter: `dt` is a time step [s], positive and finite, got {dt!r}.")
     path = Path(path).with_suffix(".h")
     text = _FilterText(filter, belief, name or path.stem, dtype)
     files = ExportedFilter(path, path.with_name(f"{path.stem}_test.c"))
