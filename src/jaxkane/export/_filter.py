@@ -208,11 +208,16 @@ class _FilterText:
         default = [numbers(x) if not x.shape else f"{{{numbers(x)}}}" for x in formulas.values().values()]
         constraints = "with_constraints" if has_constraints else "without_constraints"
         text = _template("header", "common", constraints, filter.method, "end")
-        units = variable_units(filter.system) | {a.name: a.info.unit for a in formulas.of_kind("parameters")}
+        units = variable_units(filter.system)
+        of_parameter = {a.name: a.info.unit for a in formulas.of_kind("parameters")}
+        in_mean = [*(units.get(name) for name in self.rows), *(of_parameter[name] for name in filter.parameters)]
 
-        def listed(array: str, names: Sequence[str]) -> str:
-            unit = lambda name: f" [{units[name]}]" if units.get(name) else ""  # noqa: E731
-            lines = [in_comment(f"   {array}[{i}]: {name}{unit(name)}") for i, name in enumerate(names)]
+        def listed(array: str, names: Sequence[str], units: Sequence[str | None] | None = None) -> str:
+            units = [""] * len(names) if units is None else units
+            lines = [
+                in_comment(f"   {array}[{i}]: {name}{f' [{unit}]' if unit else ''}")
+                for i, (name, unit) in enumerate(zip(names, units, strict=True))
+            ]
             return "\n".join(lines or [f"   {array}: none; may be null"])
 
         return text.substitute(
@@ -233,9 +238,9 @@ class _FilterText:
             times=filter.lag + 1,
             substeps=filter.substeps,
             modes=MODES,
-            of_mean=listed("mean", filter.names),
-            of_sensors=listed("measured", filter.sensors),
-            of_inputs=listed("inputs", filter.system.inputs),
+            of_mean=listed("mean", filter.names, in_mean),
+            of_sensors=listed("measured", filter.sensors, [units.get(name) for name in filter.sensors]),
+            of_inputs=listed("inputs", filter.system.inputs, [units.get(name) for name in filter.system.inputs]),
             of_noise=listed("density", filter.noise),
             of_drift=listed("drift", filter.parameters),
             members="\n    ".join(members or ["char none; /* there are no parameters */"]),

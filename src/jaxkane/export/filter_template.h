@@ -13,7 +13,7 @@ $of_sensors
 
 $of_inputs
 
-   Spectral densities of the white noise:
+   Spectral densities of the white noise, in [unit^2 s] of an input, in [unit^2/s] of all else:
 
 $of_noise
 $of_drift
@@ -168,8 +168,8 @@ static inline void ${name}_project(${name}_belief *b, const ${name}_settings *s)
 }
 
 // with_constraints
-/* x of A x = b, in the place of b; A (constraints, constraints), positive definite, becomes its triangle where it is
-   `new`. */
+/* x of A x = b, in the place of b; A (constraints, constraints), positive definite, becomes its triangle where it
+   `is_new`. */
 static inline void ${name}_solve(int is_new, $real *A, $real *b) {
     enum { n = $constraints };
     int i, j, k;

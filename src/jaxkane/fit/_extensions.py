@@ -304,7 +304,8 @@ class Way:
             by_fold = [way.model.linearized.costs_left_out(way.model.places, folds) for way in (self, best)]
             difference = by_fold[0] - by_fold[1]
             error = np.std(difference, ddof=1) * math.sqrt(len(folds))
-            is_as_good = bool(self.rank(folds) - best.rank(folds) < 2.0 * error)
+            rounding = 1e-9 * best.rank(folds)  # two that are the same model differ by nothing else
+            is_as_good = bool(self.rank(folds) - best.rank(folds) <= 2.0 * error + rounding)
         return Alternative(names, self.model.cost, math.nan if folds is None else self.rank(folds), is_as_good)
 
 
