@@ -21,25 +21,12 @@ from .._kane.arguments import is_concrete
 from .._kane.formulas import Formulas, Function
 from .._kane.kanes_method import motion_rates_by_matrix
 from .._kane.rhs import rates
-from .._scalarjit.backends.source import as_source
-from .._scalarjit.graph import NotScalarError, needed
+from .._scalarjit.graph import NotScalarError
 from .._version import __version__
 from ..estimate import Belief, Filter, predict, update
 from ..estimate._filter import sensed
 from ..estimate._process_noise import MODES
-from ._source import (
-    C_WORDS,
-    COMPARE,
-    HELPERS,
-    TYPES,
-    C,
-    identifiers,
-    in_comment,
-    is_read,
-    six_a_line,
-    variable_units,
-    write_file,
-)
+from ._source import COMPARE, C, CText, in_comment, variable_units, write_file
 
 
 class ExportedFilter(NamedTuple):
@@ -112,35 +99,30 @@ def c_filter(
     return files
 
 
-class _FilterText:
+class _FilterText(CText):
     """The texts of the files of a filter."""
 
     def __init__(self, filter: Filter, belief: Belief, name: str, dtype: str):
         self.filter, self.belief, system = filter, belief, filter.system
         more = {"all_rates": Function(("rate",), _all_rates), "sensed": Function(("z",), self._sensed)}
-        self.formulas = formulas = Formulas(system, dtype, more)
-        (self.name,) = identifiers([name], C_WORDS)
-        self.type = TYPES[formulas.dtype]
-        parameters = [a.name for a in formulas.of_kind("parameters")]
-        self.members = dict(zip(parameters, identifiers(parameters, C_WORDS), strict=True))
+        formulas = Formulas(system, dtype, more)
+        super().__init__(formulas, name)
         inputs = formulas.directions("inputs")
         of_parameter = dict(zip(formulas.names("parameters"), formulas.directions("parameters"), strict=True))
         self.of_input = dict(zip(system.inputs, inputs, strict=False))
         self.rows = [*system.coordinates, *system.speeds, *system.states]  # what has a rate
         self.estimated = [*formulas.directions("q"), *formulas.directions("u"), *inputs[len(system.inputs) :]]
         self.estimated += [of_parameter[name] for name in filter.parameters]
+        places = [(len(formulas.arguments), i, len(filter.noise)) for i in range(len(filter.noise))]
+        self.noise = [formulas.graph.add("input", place, formulas.dtype) for place in places]
 
     def _sensed(self, system, t, q, u, w, _):
         return (sensed(system, self.filter.sensors, t, q, u, w),)
 
     def _words(self, is_disturbed: bool) -> dict[int, str]:
         """What input nodes are called: what the filter estimates is in v, inputs in w, all else in *p."""
-        words = {}
-        for a, nodes in zip(self.formulas.arguments, self.formulas.inputs, strict=True):
-            for i, k in enumerate(nodes.flat):
-                word = f"p->{self.members[a.name]}" if a.kind == "parameters" else a.kind
-                words[int(k)] = word + f"[{i}]" * bool(a.shape)
         node_of = lambda place: int(self.formulas.inputs[place[0]].flat[place[1]])  # noqa: E731
+        words = self.input_words | {k: f"e[{i}]" for i, k in enumerate(self.noise)}
         words |= {node_of(place): f"v[{i}]" for i, place in enumerate(self.estimated)}
         for i, (name, place) in enumerate(self.of_input.items()):
             noise = f" + e[{self.filter.noise.index(name)}]" if is_disturbed and name in self.filter.noise else ""
@@ -164,48 +146,35 @@ class _FilterText:
             rates_of = rates_of | {"slope": np.column_stack([slope[:, :n], *columns])}
             (slope,) = formulas.derivatives("sensed", self.estimated).values()
             sensed_of = sensed_of | {"slope": slope}
+        else:  # what disturbs a rate is added to it
+            (rate,) = rates_of.values()
+            noise = {name: e for name, e in zip(filter.noise, self.noise, strict=True) if name in self.rows}
+            add = lambda x, e: formulas.graph.add("add", (int(x), e), formulas.dtype)  # noqa: E731
+            disturbed = [add(x, noise[row]) if row in noise else x for row, x in zip(self.rows, rate, strict=True)]
+            rates_of = {"rate": np.array(disturbed)}
         functions = {"rates": rates_of, "sensed": sensed_of}
         (h,) = formulas.nodes("configuration_residuals").values()
         if h.size:
             (G,) = formulas.derivatives("configuration_residuals", formulas.directions("q")).values()
             functions["constraints"] = {"h": h, "G": G}
-        nodes = needed(formulas.graph.nodes, [x for outputs in functions.values() for x in outputs.values()])
-        used = {formulas.graph.nodes[k].operation for k in nodes}
-        helpers = [text.format(type=self.type) for operation, text in HELPERS.items() if operation in used]
+        helpers = self.helpers([x for outputs in functions.values() for x in outputs.values()])
         text = "\n".join([*helpers, *(self._function(*item) for item in functions.items())])
         return re.sub(r"\b(larger|smaller)\(", rf"{self.name}_\1(", text)
 
     def _function(self, function: str, outputs: dict[str, np.ndarray]) -> str:
         is_disturbed = function == "rates" and self.filter.method == "unscented"
+        read = ("t", "v", "w", *(["e"] if is_disturbed else []))
         try:
-            lines, texts = as_source(self.formulas.graph, [*outputs.values()], self._words(is_disturbed), C)
+            body = self.body((*read, "p"), outputs, self._words(is_disturbed))
         except NotScalarError as error:
             raise ValueError(f"{self.formulas.name}: the filter cannot be written in C: it holds {error}.") from None
-        for output, elements in zip(outputs, texts, strict=True):
-            for i, text in enumerate(elements):
-                name = self.rows[i] if is_disturbed and i < len(self.rows) else None
-                noise = f" + e[{self.filter.noise.index(name)}]" if name in self.filter.noise else ""
-                lines.append(f"{output}[{i}] = {text}{noise};")
-        text = "\n    ".join(lines)
-        read = ["t", "v", "w", *(["e"] if is_disturbed else []), "p"]
-        unused = [f"(void){word};" for word in (*read, *outputs) if not is_read(word, text)]
-        arguments = f"{self.type} t, const {self.type} *v, const {self.type} *w"
-        arguments += f", const {self.type} *e" * is_disturbed + f", const {self.name}_parameters *p"
-        arguments += "".join(f", {self.type} *{output}" for output in outputs)
-        body = "\n    ".join([*unused, *lines])
-        return f"static inline void {self.name}_{function}({arguments}) {{\n    {body}\n}}\n"
+        arguments = ", ".join([f"{self.type} t", *(f"const {self.type} *{word}" for word in read[1:])])
+        arguments += f", const {self.name}_parameters *p" + "".join(f", {self.type} *{output}" for output in outputs)
+        return f"static inline void {self.name}_{function}({arguments}) {body}"
 
     def header(self) -> str:
         formulas, filter = self.formulas, self.filter
         has_constraints = formulas.nodes("configuration_residuals")["h"].size
-        members = []
-        for a in formulas.of_kind("parameters"):
-            size = f"[{max(1, len(a.elements))}]" if a.shape else ""
-            unit = f" [{a.info.unit}]" if a.info.unit else ""
-            note = " (estimated: what stands in the mean counts)" if a.name in filter.parameters else ""
-            members.append(f"{self.type} {self.members[a.name]}{size}; /* {in_comment(a.name + unit + note)} */")
-        numbers = lambda x: six_a_line([C.constant(v, formulas.dtype) for v in np.ravel(x)] or ["0"])  # noqa: E731
-        default = [numbers(x) if not x.shape else f"{{{numbers(x)}}}" for x in formulas.values().values()]
         constraints = "with_constraints" if has_constraints else "without_constraints"
         text = _template("header", "common", constraints, filter.method, "end")
         units = variable_units(filter.system)
@@ -243,43 +212,35 @@ class _FilterText:
             of_inputs=listed("inputs", filter.system.inputs, [units.get(name) for name in filter.system.inputs]),
             of_noise=listed("density", filter.noise),
             of_drift=listed("drift", filter.parameters),
-            members="\n    ".join(members or ["char none; /* there are no parameters */"]),
-            default=",\n    ".join(default or ["0"]),
-            sigma=numbers(filter.sigma),
-            density=numbers(filter.density),
-            drift=numbers(filter.drift),
-            start_t=numbers(self.belief.t),
-            start_mean=numbers(self.belief.mean),
-            start_root=numbers(self.belief.root),
+            parameters_struct="\n".join(self.struct()),
+            default=self.default(),
+            sigma=self.numbers(filter.sigma),
+            density=self.numbers(filter.density),
+            drift=self.numbers(filter.drift),
+            start_t=self.numbers(self.belief.t),
+            start_mean=self.numbers(self.belief.mean),
+            start_root=self.numbers(self.belief.root),
             model=self._model(),
         )
 
     def test(self, header: str, dt: float) -> str:
         """A program that makes some steps, and compares what is known then."""
         steps, after = self._steps(dt)
-        constant = lambda x: C.constant(x, self.formulas.dtype)  # noqa: E731
-
-        def array(name: str, x: np.ndarray) -> str:
-            numbers = six_a_line([constant(v) for v in np.ravel(x)] or ["0"])
-            return f"static const {self.type} {name}[] = {{\n    {numbers}\n}};"
-
+        tolerance = "1e-11" if self.formulas.dtype == "float64" else "2e-3"
         n, k = after.mean.size, after.root.shape[2]
         root = np.reshape(after.root, (n, k))
         lines = [f"/* {in_comment(self.formulas.name)}: some steps of the filter. */", f'#include "{header}"\n']
-        lines += ["#include <stdio.h>", COMPARE.format(type=self.type, tolerance=f"{self._tolerance():.0e}")]
+        lines += ["#include <stdio.h>", COMPARE.format(type=self.type, tolerance=tolerance)]
         calls = []
         for i, (inputs, measured, age) in enumerate(steps):
-            lines += [array(f"inputs_{i}", inputs), array(f"measured_{i}", measured)]
-            calls.append(f"{self.name}_predict(&belief, &{self.name}_default, {constant(dt)}, inputs_{i});")
+            lines += [self.array(f"inputs_{i}", inputs), self.array(f"measured_{i}", measured)]
+            calls.append(f"{self.name}_predict(&belief, &{self.name}_default, {self.constant(dt)}, inputs_{i});")
             update = f"{self.name}_update(&belief, &{self.name}_default, measured_{i}, inputs_{i}, {age}, &innovation)"
             calls.append(f"wrong += {update};")
-        lines += [array("mean", np.asarray(after.mean)), array("covariance", root @ root.T), ""]
+        lines += [self.array("mean", np.asarray(after.mean)), self.array("covariance", root @ root.T), ""]
         steps_in_c = "\n    ".join(calls)
         lines.append(_template("test").substitute(name=self.name, real=self.type, n=n, k=k, steps=steps_in_c))
         return "\n".join(lines)
-
-    def _tolerance(self) -> float:
-        return 1e-11 if self.formulas.dtype == "float64" else 2e-3
 
     def _steps(self, dt: float) -> tuple[list[tuple[np.ndarray, np.ndarray, int]], Belief]:
         """Inputs, measurements and their age, of which one is a gap and one is late; and what is known afterwards."""

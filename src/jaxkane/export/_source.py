@@ -125,7 +125,7 @@ def _meaning(formulas: Formulas, function: str) -> str:
     return f": {', '.join(formulas.names('u_dep'))}" if function == "dependent_speeds" else ""
 
 
-def is_read(word: str, text: str) -> bool:
+def _is_read(word: str, text: str) -> bool:
     """Whether source code reads a variable; members of other objects have the same names."""
     return re.search(rf"(?<![\w.>]){re.escape(word)}(?!\w)", text) is not None
 
@@ -271,22 +271,74 @@ def c(
     return files
 
 
-class _CModule:
-    """The texts of the files for some functions of a system."""
+class CText:
+    """What all sources in C of a system share: its name, the struct of its parameters, numbers, bodies of functions."""
 
-    def __init__(self, formulas: Formulas, functions: tuple[str, ...], name: str):
-        self.formulas, self.functions = formulas, functions
+    def __init__(self, formulas: Formulas, name: str):
+        self.formulas = formulas
         (self.name,) = identifiers([name], C_WORDS)
         self.type = TYPES[formulas.dtype]
-        self.constant = lambda x: C.constant(x, formulas.dtype)
         parameters = [a.name for a in formulas.of_kind("parameters")]
         self.members = dict(zip(parameters, identifiers(parameters, C_WORDS), strict=True))
-        self.nodes = {function: formulas.nodes(function) for function in functions}
         self.input_words = {
             int(k): (f"p->{self.members[a.name]}" if a.kind == "parameters" else a.kind) + f"[{i}]" * bool(a.shape)
             for a, nodes in zip(formulas.arguments, formulas.inputs, strict=True)
             for i, k in enumerate(nodes.flat)
         }
+
+    def constant(self, x: Any) -> str:
+        return C.constant(x, self.formulas.dtype)
+
+    def struct(self) -> list[str]:
+        """The lines of the struct of the parameters."""
+        lines = ["typedef struct {"]
+        for a in self.formulas.of_kind("parameters"):
+            member = self.members[a.name]
+            notes = f" {a.name}" if member != a.name else ""
+            notes += f", {' x '.join(map(str, a.shape))}, row by row" if a.shape else ""
+            notes += f" [{a.info.unit}]" if a.info.unit else ""
+            comment = f" /* {in_comment(notes.strip(', '))} */" if notes else ""
+            size = f"[{max(1, len(a.elements))}]" if a.shape else ""
+            lines.append(f"    {self.type} {member}{size};{comment}")
+        if not self.members:
+            lines.append("    char none; /* there are no parameters */")
+        return [*lines, f"}} {self.name}_parameters;"]
+
+    def default(self) -> str:
+        """What initializes that struct with the system's own."""
+        texts = []
+        for x in self.formulas.values().values():
+            numbers = ", ".join(map(self.constant, x.flat))
+            texts.append(f"{{{numbers or '0'}}}" if x.shape else numbers)
+        return six_a_line(texts or ["0"])
+
+    def helpers(self, outputs: Sequence[np.ndarray]) -> list[str]:
+        """Functions that the formulas of these outputs call."""
+        used = {self.formulas.graph.nodes[k].operation for k in needed(self.formulas.graph.nodes, outputs)}
+        return [text.format(type=self.type) for operation, text in HELPERS.items() if operation in used]
+
+    def array(self, name: str, numbers: np.ndarray) -> str:
+        return f"static const {self.type} {name}[] = {{\n    {self.numbers(numbers)}\n}};"
+
+    def numbers(self, numbers: Any) -> str:
+        return six_a_line([self.constant(x) for x in np.ravel(numbers)] or ["0"])
+
+    def body(self, read: Sequence[str], by_output: dict[str, np.ndarray], words: dict[int, str]) -> str:
+        """Of a function that reads these arguments, in braces."""
+        lines, outputs = as_source(self.formulas.graph, list(by_output.values()), words, C)
+        for output, elements in zip(by_output, outputs, strict=True):
+            lines += [f"{output}[{i}] = {text};" for i, text in enumerate(elements)]
+        text = "\n    ".join(lines)
+        unused = [f"(void){word};" for word in (*read, *by_output) if not _is_read(word, text)]
+        return "{\n    " + "\n    ".join([*unused, *lines]) + "\n}\n"
+
+
+class _CModule(CText):
+    """The texts of the files for some functions of a system."""
+
+    def __init__(self, formulas: Formulas, functions: tuple[str, ...], name: str):
+        super().__init__(formulas, name)
+        self.functions, self.nodes = functions, {function: formulas.nodes(function) for function in functions}
 
     def _comment(self) -> str:
         title = in_comment(_title(self.formulas))
@@ -300,18 +352,7 @@ class _CModule:
     def header(self) -> str:
         guard, unit_of = f"{self.name.upper()}_H", variable_units(self.formulas.system)
         lines = [self._comment(), f"#ifndef {guard}", f"#define {guard}", "", "#ifdef __cplusplus"]
-        lines += ['extern "C" {', "#endif", "", "typedef struct {"]
-        for a in self.formulas.of_kind("parameters"):
-            member = self.members[a.name]
-            notes = f" {a.name}" if member != a.name else ""
-            notes += f", {' x '.join(map(str, a.shape))}, row by row" if a.shape else ""
-            notes += f" [{a.info.unit}]" if a.info.unit else ""
-            comment = f" /* {in_comment(notes.strip(', '))} */" if notes else ""
-            size = f"[{max(1, len(a.elements))}]" if a.shape else ""
-            lines.append(f"    {self.type} {member}{size};{comment}")
-        if not self.members:
-            lines.append("    char none; /* there are no parameters */")
-        lines += [f"}} {self.name}_parameters;", "", "/* The parameters that were exported. */"]
+        lines += ['extern "C" {', "#endif", "", *self.struct(), "", "/* The parameters that were exported. */"]
         lines += [f"extern const {self.name}_parameters {self.name}_default;", ""]
         lines += ["/* What the functions read:", "", "   t: time [s]"]
         for kind in ("q", "u", "inputs"):
@@ -332,35 +373,22 @@ class _CModule:
 
     def source(self, header: str) -> str:
         outputs = [nodes for by_output in self.nodes.values() for nodes in by_output.values()]
-        used = {self.formulas.graph.nodes[k].operation for k in needed(self.formulas.graph.nodes, outputs)}
-        helpers = [text.format(type=self.type) for operation, text in HELPERS.items() if operation in used]
-        texts = []
-        for x in self.formulas.values().values():
-            numbers = ", ".join(map(self.constant, x.flat))
-            texts.append(f"{{{numbers or '0'}}}" if x.shape else numbers)
-        default = f"const {self.name}_parameters {self.name}_default = {{\n    {six_a_line(texts or ['0'])}\n}};\n"
-        parts = [self._comment(), f'#include "{header}"\n\n#include <math.h>\n', default, *helpers]
-        return "\n".join([*parts, *(self._body(function) for function in self.functions)])
-
-    def _body(self, function: str) -> str:
-        by_output = self.nodes[function]
-        lines, outputs = as_source(self.formulas.graph, list(by_output.values()), self.input_words, C)
-        for output, elements in zip(by_output, outputs, strict=True):
-            lines += [f"{output}[{i}] = {text};" for i, text in enumerate(elements)]
-        text = "\n    ".join(lines)
-        unused = [f"(void){word};" for word in ("t", "q", "u", "inputs", "p", *by_output) if not is_read(word, text)]
-        return f"{self._signature(function)} {{\n    " + "\n    ".join([*unused, *lines]) + "\n}\n"
+        default = f"const {self.name}_parameters {self.name}_default = {{\n    {self.default()}\n}};\n"
+        parts = [self._comment(), f'#include "{header}"\n\n#include <math.h>\n', default, *self.helpers(outputs)]
+        read = ("t", "q", "u", "inputs", "p")
+        bodies = (self.body(read, by_output, self.input_words) for by_output in self.nodes.values())
+        return "\n".join([*parts, *map("{} {}".format, map(self._signature, self.functions), bodies)])
 
     def test(self, header: str) -> str:
         """A program that calls every function at one state, and compares."""
         state, expected = _state_and_outputs(self.formulas, self.functions)
         lines = [self._comment(), f'#include "{header}"\n\n#include <math.h>\n#include <stdio.h>\n']
-        lines += [self._array(kind, state[kind]) for kind in ("q", "u", "inputs")]
+        lines += [self.array(kind, state[kind]) for kind in ("q", "u", "inputs")]
         calls = []
         for function in self.functions:
             numbers_of = {f"{function}_{output}": numbers for output, numbers in expected[function].items()}
             for name, numbers in numbers_of.items():
-                lines.append(self._array(name, numbers))
+                lines.append(self.array(name, numbers))
                 lines.append(f"static {self.type} computed_{name}[{max(1, numbers.size)}];")
             outputs = "".join(f", computed_{name}" for name in numbers_of)
             t = self.constant(state["t"])
@@ -370,10 +398,6 @@ class _CModule:
         tolerance = "1e-11" if self.formulas.dtype == "float64" else "1e-3"
         lines.append(COMPARE.format(type=self.type, tolerance=tolerance))
         return "\n".join([*lines, "int main(void) {", "    int wrong = 0;", *calls, "    return wrong;", "}", ""])
-
-    def _array(self, name: str, numbers: np.ndarray) -> str:
-        texts = [self.constant(x) for x in numbers.flat] or ["0"]
-        return f"static const {self.type} {name}[] = {{\n    {six_a_line(texts)}\n}};"
 
 
 def _state_and_outputs(formulas: Formulas, functions: Iterable[str]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -518,7 +542,7 @@ def _function(formulas: Formulas, function: str, unit_of: dict[str, str]) -> str
     lines.append(f'    """{", ".join(by_output)}{_meaning(formulas, function)}."""')
     for kind in ("q", "u", "inputs"):
         words = [names.of[kind, name] for name in formulas.names(kind)]
-        if any(is_read(word, text) for word in words):
+        if any(_is_read(word, text) for word in words):
             units = ", ".join(unit_of.get(name) or "-" for name in formulas.names(kind))
             right = f"np.asarray({kind}, np.{formulas.dtype})"
             if kind == "inputs":
@@ -526,7 +550,7 @@ def _function(formulas: Formulas, function: str, unit_of: dict[str, str]) -> str
             lines.append(f"    {', '.join(words)}{',' * (len(words) == 1)} = {right}  # [{units}]")
     for name in _names_of(formulas, "parameters"):
         word = names.of["parameters", name]
-        if is_read(word, text):
+        if _is_read(word, text):
             lines.append(f"    {word} = np.{formulas.dtype}(parameters[{name!r}])")
     lines += [f"    {line}" for line in body]
     for output, nodes, elements in zip(by_output, by_output.values(), outputs, strict=True):

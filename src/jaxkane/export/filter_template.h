@@ -18,7 +18,8 @@ $of_inputs
 $of_noise
 $of_drift
 
-   Begin with a copy of ${name}_start. ${name}_default holds the parameters, standard deviations and densities. */
+   Begin with a copy of ${name}_start. ${name}_default holds the parameters, standard deviations and densities; of a
+   parameter that is estimated, what stands in the mean counts. */
 
 #ifndef ${NAME}_FILTER_H
 #define ${NAME}_FILTER_H
@@ -35,9 +36,7 @@ enum {
     ${name}_n_root = ${name}_n * ${name}_n_times
 };
 
-typedef struct {
-    $members
-} ${name}_parameters;
+$parameters_struct
 
 typedef struct {
     ${name}_parameters parameters;
