@@ -7,6 +7,7 @@ conditioning all states at once on all measurements.
 
 import dataclasses
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,7 +47,7 @@ T = np.sort(np.append(np.arange(0.0, 2.0, 0.1), [0.734, 1.61]))  # irregular
 N = T.size
 FREE = ("stiffness", "damping", SpectralDensity("x_dot"), NoiseScale("x"))
 OPTIONS = {"unknown": {"x": DEVIATION[0], "x_dot": DEVIATION[1]}, "noise": {"x_dot": Q}}
-TIGHT = Simulation(rtol=1e-10)
+TIGHT = Simulation(step=0.05, solver=diffrax.Dopri8())
 
 
 def transition(h, stiffness, damping, q):
@@ -296,6 +297,8 @@ def test_what_cannot_be_noise():
             posed(free)
     with pytest.raises(ValueError, match="least squares: give `noise`"):
         posed(NoiseScale("x"), noise=None)
+    with pytest.raises(ValueError, match="steps of one length"):
+        posed(simulation=Simulation(rtol=1e-8))
     for more in ({"window": 0.5}, {"window": 0.5, "defect_std": {}}):
         with pytest.raises(ValueError, match="two ways"):
             posed(**more)
@@ -527,3 +530,17 @@ def test_intervals_cover_under_process_noise(many):
     covered = many[2].sum(axis=0)
     print("of 100:", covered)
     assert np.all((covered >= 90) & (covered <= 99)), covered
+
+
+class Fenced(Cart):
+    def events(self, t, q, u):
+        return {"fence": jk.falling(q["x"] + 0.2)}
+
+
+def test_a_motion_that_an_event_ends_is_told():
+    """Also where a measurement, and no step, takes the mean over it."""
+    _, y = drawn(1)
+    with pytest.raises(ValueError, match=r"no finite residuals \(fence\)"):
+        fit(Fenced(), trial_of(y), "stiffness", **OPTIONS)
+    far = fit(Fenced(), trial_of(y).between(0.0, 0.5), "stiffness", steps=2, **OPTIONS)
+    assert np.isfinite(far.cost)

@@ -22,7 +22,7 @@ from .._scalarjit.nan import all_finite, derivative_free_where_not_finite, flat,
 from .._system.parameters import ANY, ParameterInfo, parameters_in
 from .._system.system import State, System, names_of, packed, units_of, unpacked
 from .diffrax_compat import UnrolledERK, saveat_and_adjoint
-from .events import EventPoint, Events, events_of, locate_event
+from .events import EventPoint, Events, EventValues, event_values, events_of, locate_event
 from .inputs import (
     Discontinuities,
     InputState,
@@ -52,7 +52,7 @@ def _is_rising(ts: Array) -> Array:
     return all_finite(ts) & jnp.all(ts[1:] >= ts[:-1]) & (ts[-1] > ts[0])
 
 
-def _is_valid(system: System, state: State, t: Array, signals: Any, rises: Array | None) -> Array:
+def is_valid(system: System, state: State, t: Array, signals: Any, rises: Array | None) -> Array:
     """Whether a motion can begin at `t`; `rises`: whether the times rise, None where that is known."""
     large = eqx.filter((system, state), _is_small, inverse=True)
     valid = all_finite(large) & (True if rises is None else rises) & inputs_are_valid(signals)
@@ -172,7 +172,7 @@ def solve(
     rises = None if settings.rising else _is_rising(ts)
     ts = ts if rises is None else jnp.where(rises, ts, jnp.arange(ts.shape[0], dtype=ts.dtype))
     times = times_of(ts[0], ts[1], ts[-1])
-    valid = _is_valid(system, state, times.start, signals, rises)
+    valid = is_valid(system, state, times.start, signals, rises)
     # What is not finite must not enter the solver, where it would spoil the gradient of what is shared. In its steps
     # what all members of a batch share remains shared, of which a kernel computes its part once.
     stepped = replace_invalid_parameters(system)
@@ -198,6 +198,46 @@ def solve(
     if problem.events.names:
         solution = _to_event(problem, solution)
     return _trajectory(problem, _filled(problem, solution, constrained and settings.project), origin)
+
+
+def one_step(
+    system: System, y: Array, t0: Array, t1: Array, signals: Any, settings: Settings, disturbance: Any = None
+) -> Array:
+    """The packed state after one step of the solver from `t0` to `t1`: the motion of `solve` without its checks, events
+    and outputs. NaN where an implicit solver finds no solution. `signals` for steps of one length."""
+    args = (system, signals, disturbance)
+    constrained = has_configuration_constraints(system, t0, unpacked(system, y).q)
+    rates = _rates(jnp.array(True), settings.stabilize if constrained else 0.0)
+    inputs = inputs_at(system, signals, t0, unpacked(system, y))
+    solver, term = _solver_for(settings, system, t0, y, inputs), diffrax.ODETerm(rates)
+    state = solver.init(term, t0, t1, y, args)
+    y1, _, _, _, result = solver.step(term, t0, t1, y, args, state, False)
+    return jnp.where(result == diffrax.RESULTS.successful, y1, jnp.nan)
+
+
+def _solver_for(settings: Settings, system: System, t: Array, y: Array, inputs: dict[str, Array]) -> Any:
+    solver: Any = settings.solver
+    is_native = isinstance(solver, diffrax.AbstractERK) and rates_are_native(system, t, y, inputs)
+    return UnrolledERK(solver) if is_native else solver
+
+
+def ends_between(system: System, t0: Array, y0: Array, t1: Array, y1: Array, signals: Any) -> Array:
+    """The status by what ends a motion between two packed states, one step apart: an event, or singular speeds."""
+    t0, y0, t1, y1 = jax.lax.stop_gradient((t0, y0, t1, y1))
+    status, events = jnp.int32(Status.COMPLETED), events_of(system, t0, unpacked(system, y0))
+    if not events.names and not system.dependent_speeds:
+        return status
+
+    def at(t: Array, y: Array) -> EventValues:
+        rates = vector_field(system, t, y, inputs_at(system, signals, t, unpacked(system, y)))
+        return event_values(system, t, y, rates if events.read_speeds else None)
+
+    before, after = at(t0, y0), at(t1, y1)
+    for i, direction in enumerate(events.directions):
+        a, b = before.values[i], after.values[i]
+        passes = jnp.where(direction * (b - a) >= 0, a * b < 0, False)
+        status = jnp.where(passes & (status == Status.COMPLETED), jnp.int32(Status.EVENT + i), status)
+    return jnp.where(before.bound * after.bound > 0, status, jnp.int32(Status.SINGULAR_SPEEDS))
 
 
 def _reads_samples(system: System) -> dict[str, Callable[..., Any]]:
@@ -249,13 +289,10 @@ def _integrated(problem: InitialValueProblem) -> Solution:
         return derivative_free_where_not_finite(problem.rates, t, y, args)
 
     forward = isinstance(settings.adjoint, diffrax.ForwardMode)
-    solver: Any = settings.solver
     inputs = inputs_at(problem.system, problem.signals, times.start, unpacked(problem.system, problem.start))
-    if isinstance(solver, diffrax.AbstractERK) and rates_are_native(stepped, times.start, problem.start, inputs):
-        solver = UnrolledERK(solver)
     solution = diffrax.diffeqsolve(
         diffrax.ODETerm(problem.rates if forward else trial_rates),
-        solver,
+        _solver_for(settings, stepped, times.start, problem.start, inputs),
         times.start,
         times.end,
         None,

@@ -13,11 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from .._integrate.inputs import share_times
-from .._integrate.integrate import solve
+from .._integrate.inputs import for_fixed_steps, inputs_at
+from .._integrate.integrate import ends_between, is_valid, one_step
+from .._integrate.status import Status
 from .._kane.constraints import has_configuration_constraints
-from .._system.system import System, packed, unpacked
-from ..estimate._filter import brought_back, tangent
+from .._kane.rhs import values_of
+from .._system.system import System, unpacked
+from ..estimate._filter import brought_back, sensed, tangent
 from ..estimate._process_noise import MODES, Disturbance, Noise
 from ..estimate._square_root import root, update
 from ._windows import Windows, state_names
@@ -94,74 +96,106 @@ def filtered(model: Any, window: Windows, start: Array, b: Array, x: Array, begi
     S = jnp.diag(begin)
     if has_configuration_constraints(system, t[0], start[: len(system.coordinates)]):
         S = tangent(system, t[0], start, S, model.moved)
+    motion = _Motion(model, system, calibration, window)
 
-    def go_on(known: tuple[Array, Array], now: Any) -> tuple[Any, Any]:
+    def go_on(known: tuple[Array, Array, Reached], now: Any) -> tuple[Any, Any]:
+        v, S, reached = known
         before, t, y, weight = now
-        v, S, h, F, back, status = _predicted(model, system, calibration, window, known, before, t)
+        v, S, back, reached = motion.predicted(v, S, before, t, reached)
+        along = lambda direction: jax.jvp(lambda v: motion.measured(v, t), (v,), (direction,))  # noqa: E731
+        h, F = jax.vmap(along, in_axes=1, out_axes=(None, 1))(S)
         measured = weight > 0
         sigma = factor / jnp.where(measured, weight, 1.0)
         new = update(jnp.where(measured, y - h, 0.0), F, sigma, measured)
         mean, after = brought_back(system, t, v + S @ new.shift, S @ new.left)
         step = Step(v, S, new.shift, new.left, back)
-        return (mean, after), (new.innovation, new.deviation, h + new.known, status, step)
+        return (mean, after, reached), (new.innovation, new.deviation, h + new.known, step)
 
-    carry = (jnp.concatenate([start, _fixed(model, b)]), S)
+    v = jnp.concatenate([start, _fixed(model, b)])
     # The first sample is met where the motion begins, after no time at all.
     times = (jnp.concatenate([t[:1], t[:-1]]), t)
-    (mean, _), (e, s, predicted, status, steps) = jax.lax.scan(go_on, carry, (*times, y, weight))
-    return Filtered(e.T, s.T, predicted.T, mean[start.shape[0] :], jnp.max(status), steps)
+    (mean, _, reached), out = jax.lax.scan(go_on, (v, S, motion.start(v)), (*times, y, weight))
+    e, s, predicted, steps = out
+    return Filtered(e.T, s.T, predicted.T, mean[start.shape[0] :], reached.status, steps)
 
 
-def _predicted(model: Any, system: System, calibration: Any, window: Windows, known: Any, t0: Array, t1: Array):
-    """Mean v and root S at t1, what is predicted there h (n_c,), its sensitivity F (n_c, n) in units of S, the rotation
-    of that unit, and the worst status; by steps of at most the window's."""
-    noise: Noise = model.noise
-    v, S = known
-    n, n_w, n_c, dtype = v.shape[0], len(noise.names), len(model.channels), v.dtype
-    density, named = noise.spectral_densities(calibration), (system.speeds, system.states)
-    lasts = density > 0
-    amplitude = jnp.where(lasts, jnp.sqrt(jnp.where(lasts, density, 1.0)), 0.0)
-    moving = t1 > t0
-    number = jnp.maximum(jnp.ceil((t1 - t0) / window.step - 1e-6), 1.0)
-    length = jnp.where(moving, (t1 - t0) / number, window.step)
-    of_noise = jnp.tile(jnp.diag(amplitude), (MODES, 1)).reshape(MODES * n_w, n_w)
-    xi_directions = jnp.zeros((MODES * n_w, MODES, n_w), dtype)
-    places = jnp.arange(MODES * n_w, dtype=jnp.int32)
-    xi_directions = xi_directions.at[places, places // max(n_w, 1)].set(of_noise)
-    xi_directions = jnp.concatenate([jnp.zeros((n, MODES, n_w), dtype), xi_directions])
+class Reached(NamedTuple):
+    """Where the last step ended: `t`, the packed state `y` before its measurements, and the `status`. An event ends a
+    motion that passes it from one such state to the next, by a step or by a measurement."""
 
-    def piece(i: Array, carry: Any) -> Any:
-        v, S, _, _, back, status = carry
-        i = i.astype(dtype)
-        t_start = t0 + i * length
-        t_end = jnp.where(moving & (i + 1 >= number), t1, t_start + length)
-
-        def flow(v: Array, xi: Array) -> Any:
-            return _flow(model, system, calibration, window, v, Disturbance(t_start, t_end, xi, noise.names, *named))
-
-        v_directions = jnp.concatenate([S.T, jnp.zeros((MODES * n_w, n), dtype)])
-        along = lambda *direction: jax.jvp(flow, (v, jnp.zeros((MODES, n_w), dtype)), direction, has_aux=True)  # noqa: E731
-        (v1, h), (A, g), code = jax.vmap(along, out_axes=(None, -1, None))(v_directions, xi_directions)
-        v1 = jnp.where(moving, v1, v)
-        A = jnp.where(moving, A, v_directions.T)
-        h, g = (jnp.where(moving, x[:, 1], x[:, 0]) for x in (h, g))  # (n_c,), (n_c, k)
-        S, Q = root(A)
-        return v1, S, h, g @ Q, back @ Q[:n], jnp.where(status > 0, status, code)
-
-    nothing = jnp.zeros(n_c, dtype), jnp.zeros((n_c, n), dtype), jnp.eye(n, dtype=dtype), jnp.zeros((), jnp.int32)
-    return jax.lax.fori_loop(jnp.int32(0), number.astype(jnp.int32), piece, (v, S, *nothing))
+    t: Array
+    y: Array
+    status: Array
 
 
-def _flow(model: Any, system: System, calibration: Any, window: Windows, v: Array, disturbance: Disturbance):
-    """v at the end of a step, what is measured at its two ends (n_c, 2); and the simulation's status."""
-    n = len(state_names(system))
-    b, ts = v[n:], jnp.stack([disturbance.t0, disturbance.t1])
-    settings = model.settings
-    if settings.step is not None:
-        settings = dataclasses.replace(settings, step=ts[1] - ts[0])
-    signals = share_times(model.signals(window, b, calibration))
-    ride = solve(system, unpacked(system, v[:n]), ts, signals, settings, disturbance)
-    return (jnp.concatenate([packed(ride.state()), b]), model.simulated(ride, b, calibration)), ride.status
+@dataclasses.dataclass(frozen=True)
+class _Motion:
+    """The motion of one trial, disturbed, and what is measured of it."""
+
+    model: Any
+    system: System
+    calibration: Any
+    window: Windows
+
+    def signals(self, b: Array) -> Any:
+        return for_fixed_steps(self.model.signals(self.window, b, self.calibration), self.model.settings.solver)
+
+    def start(self, v: Array) -> Reached:
+        y, t = v[: len(state_names(self.system))], self.window.t[0]
+        valid = is_valid(self.system, unpacked(self.system, y), t, self.signals(v[len(y) :]), None)
+        return Reached(t, y, jnp.where(valid, jnp.int32(Status.COMPLETED), jnp.int32(Status.INVALID)))
+
+    def predicted(self, v: Array, S: Array, t0: Array, t1: Array, reached: Reached):
+        """Mean v and root S at t1 from those at t0, and the rotation of the unit of S; by steps of at most the
+        window's. NaN where the motion has ended."""
+        noise: Noise = self.model.noise
+        n, n_w, dtype = v.shape[0], len(noise.names), v.dtype
+        density, named = noise.spectral_densities(self.calibration), (self.system.speeds, self.system.states)
+        lasts = density > 0
+        amplitude = jnp.tile(jnp.where(lasts, jnp.sqrt(jnp.where(lasts, density, 1.0)), 0.0), MODES)
+        number = jnp.maximum(jnp.ceil((t1 - t0) / self.window.step - 1e-6), 1.0)
+        moving = t1 > t0
+        length = jnp.where(moving, (t1 - t0) / number, self.window.step)
+        of_noise = jnp.concatenate([jnp.zeros((n, MODES * n_w), dtype), jnp.diag(amplitude)])
+
+        def piece(i: Array, carry: Any) -> Any:
+            v, S, back, reached = carry
+            done = i.astype(dtype)
+            t_start = t0 + done * length
+            t_end = jnp.where(done + 1 >= number, t1, t_start + length)
+
+            def flow(v: Array, xi: Array) -> Array:
+                disturbance = Disturbance(t_start, t_end, xi.reshape(MODES, n_w), noise.names, *named)
+                return self.moved(v, t_start, t_end, disturbance)
+
+            directions = jnp.concatenate([S.T, jnp.zeros((MODES * n_w, n), dtype)]), of_noise
+            along = lambda *direction: jax.jvp(flow, (v, jnp.zeros(MODES * n_w, dtype)), direction)  # noqa: E731
+            v1, A = jax.vmap(along, out_axes=(None, 1))(*directions)
+            reached = self.reached(v1, t_end, reached)
+            S, Q = root(A)
+            return jnp.where(reached.status > 0, jnp.nan, v1), S, back @ Q[:n], reached
+
+        times = jnp.where(moving, number, 0.0).astype(jnp.int32)
+        return jax.lax.fori_loop(jnp.int32(0), times, piece, (v, S, jnp.eye(n, dtype=dtype), reached))
+
+    def moved(self, v: Array, t0: Array, t1: Array, disturbance: Disturbance) -> Array:
+        """v after one step of integration."""
+        n = len(state_names(self.system))
+        b, settings = v[n:], self.model.settings
+        return jnp.concatenate([one_step(self.system, v[:n], t0, t1, self.signals(b), settings, disturbance), b])
+
+    def reached(self, v: Array, t: Array, before: Reached) -> Reached:
+        y = jax.lax.stop_gradient(v[: len(before.y)])
+        ended = ends_between(self.system, before.t, before.y, t, y, self.signals(v[len(y) :]))
+        status = jnp.where(jnp.all(jnp.isfinite(y)), ended, jnp.int32(Status.STEP_TOO_SMALL))
+        return Reached(t, y, jnp.where(before.status > 0, before.status, status))
+
+    def measured(self, v: Array, t: Array) -> Array:
+        """What the sensors read (n_c,)."""
+        n, system, model = len(state_names(self.system)), self.system, self.model
+        state, b = unpacked(system, v[:n]), v[n:]
+        values = values_of(system, state.x, inputs_at(system, self.signals(b), t, state))
+        return model.as_read(sensed(system, model.channels, t, state.q, state.u, values), b, self.calibration)
 
 
 def _given_deviations(model: Any, n: int) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import diffrax
@@ -259,12 +260,14 @@ class Model(eqx.Module):
         """What the sensors would have measured (n_c, n_t)."""
         rows = []
         for c in self.channels:
-            y = ride[c]
-            if ("delay of sensor", c) in calibration:
-                y = delayed_signal(ride.t, y, calibration["delay of sensor", c])
-            gain, bias = self._gain_and_bias("sensor", c, b, calibration)
-            rows.append(gain * y + bias)
-        return jnp.stack(rows)
+            delay = calibration.get(("delay of sensor", c))
+            rows.append(ride[c] if delay is None else delayed_signal(ride.t, ride[c], delay))
+        return self.as_read(rows, b, calibration)
+
+    def as_read(self, rows: Sequence[Array], b: Array, calibration: Calibration) -> Array:
+        """Of every channel (n_c, ...), with the gains and offsets of its sensor."""
+        factors = [self._gain_and_bias("sensor", c, b, calibration) for c in self.channels]
+        return jnp.stack([gain * y + bias for y, (gain, bias) in zip(rows, factors, strict=True)])
 
     def _gain_and_bias(self, of: str, name: str, b: Array, calibration: Calibration) -> tuple[Array, Array]:
         """Of an input or a sensor: the trial's own and that of all trials together."""

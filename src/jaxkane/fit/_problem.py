@@ -269,6 +269,11 @@ class Problem:
         nuisance = nuisance_of(spec, channels, sampled)
         noise = None
         if spec.noise is not None:
+            if simulation.rtol is not None or simulation.atol is not None:
+                raise ValueError(
+                    "With `noise` a filter goes by steps of one length: give Simulation(step=...), or nothing, and the "
+                    "step is halved until that changes nothing."
+                )
             deviations = jnp.concatenate([nuisance.start_deviation, nuisance.trial_deviation])
             noise = noise_of(system, spec.noise, deviations, spec.window)
         starts = start_assembly(system, trials, nuisance.start)
