@@ -10,6 +10,7 @@ from systems import POSED, PUSH, TRIAL, T, Track
 import jaxkane as jk
 from jaxkane.fit import (
     CrossValidation,
+    Free,
     Gain,
     LeastSquares,
     Offset,
@@ -23,6 +24,8 @@ from jaxkane.fit import (
     minimize,
     validate,
 )
+from jaxkane.fit._linearize import blocks_of
+from jaxkane.fit._nuisance import solve_nuisance
 from jaxkane.fit._validate import costs_by_trial
 
 
@@ -64,6 +67,40 @@ def test_trials_that_cannot_be_simulated_are_told_and_the_rest_is_kept(falling, 
     text = str(compare({"one": falling}, held_out=[FAR[0], *NEAR]))
     assert "3 of 4 trials" in text
     assert "not simulated" in text
+
+
+def test_trials_go_one_by_one_through_one_program():
+    """Of one, two and three windows, with priors: as all of them together; and nothing is compiled for more trials."""
+    long = np.linspace(0.0, 3.0, 31)
+    lengths = (31, 11, 21, 15)
+    trials = [
+        Trial(long[:n], {"x": 0.5 * long[:n] ** 2 + RNG.normal(0, 0.1, n)}, {"push": np.sin(long[:n])}, sigma=0.1)
+        for n in lengths
+    ]
+    options = {"window": 1.0, "unknown": {"x": 0.2, "x_dot": None}, "sensor_bias": {"x": 0.05}}
+    free = (Free("gain", prior=(1.5, 0.1)), "drift")
+    found = fit(Track(), trials, free, simulation=STEP, optimizer=LeastSquares(), **options)
+    held = validate(found, trials)
+    point, at = solve_nuisance(found.problem, found.point, steps=20, rtol=1e-6)
+    assert held.cost == pytest.approx(at.cost, rel=1e-9)
+    assert held.problem.size == found.problem.size
+    for name, y in found.fitted.items():
+        np.testing.assert_allclose(held.fitted[name]["x"], y["x"], atol=1e-6)
+    np.testing.assert_allclose(held.point.b, point.b, atol=1e-8)
+    compiled = blocks_of.jitted._cached._cache_size()
+    more = validate(found, [*trials, trials[1], trials[0]])
+    assert blocks_of.jitted._cached._cache_size() == compiled
+    assert more.history[1] > held.cost + min(costs_by_trial(found.problem, found.point)[:2])
+
+
+def test_a_trial_that_cannot_be_simulated_does_not_end_a_fit(falling):
+    found = fit(Falling(), [FAR[0], *NEAR, FAR[1]], FREE, simulation=STEP, optimizer=LeastSquares())
+    assert found.trial_names == ("near a", "near b", "near c")
+    assert found.estimates == pytest.approx(falling.estimates, rel=1e-6)
+    assert list(found.failed) == ["far (0)", "far (4)"]
+    assert found.notes[0].startswith("far (0) is left out: from 0 to 1 s there are no finite residuals")
+    with pytest.raises(ValueError, match=r"far: with the initial guess .* 2 of 2 windows"):
+        fit(Falling(), FAR, FREE, simulation=STEP)
 
 
 def test_a_trial_that_the_others_cannot_simulate_costs_infinity(falling):

@@ -13,10 +13,11 @@ from tqdm import tqdm
 from .._system.system import System
 from ._io import Checkpoint
 from ._model import Unknowns
-from ._nuisance import solve_nuisance, usable
+from ._nuisance import Unsimulated, solve_nuisance, usable
 from ._optimizers import Iterate, LeastSquares, Optimizer
 from ._problem import Problem, refuse_other, with_options
 from ._result import Fit
+from ._statistics import trial_names
 from ._trial import Trial
 
 
@@ -71,9 +72,11 @@ def fit(
         `GradientDescent()` or `BFGS()`, with their options.
     - `steps`, `start`, `checkpoint`, `callback`, `progress`: of its run, as in `minimize`.
 
-    **Returns:** a `Fit`.
+    **Returns:** a `Fit`. Trials that cannot be simulated with the initial guess are left out: its `failed` says by name
+    why, and so do its `notes`.
 
-    **Raises:** `ValueError` that names what is wrong with a trial, a channel, a parameter or a window.
+    **Raises:** `ValueError` that names what is wrong with a trial, a channel, a parameter or a window, and where no
+    trial can be simulated.
     """
     problem = Problem.of(system, trials, free, **options)
     run = {"steps": steps, "callback": callback, "progress": progress}
@@ -88,9 +91,21 @@ def solve(
     checkpoint: str | os.PathLike[str] | None = None,
     **run: Any,
 ) -> Fit:
-    """`minimize`, and again from where it ended while the steps of integration are too coarse there."""
+    """`minimize` without the trials that cannot be simulated, and again from where it ended while the steps of
+    integration are too coarse there."""
     method: Any = LeastSquares() if optimizer is None else optimizer
-    result = minimize(problem, method, start=start, checkpoint=checkpoint, **run)
+    names, failed = trial_names(problem), {}
+    while True:
+        try:
+            result = minimize(problem, method, start=start, checkpoint=checkpoint, **run)
+            break
+        except Unsimulated as error:
+            kept = [k for k in range(len(names)) if k not in error.reasons]
+            if not kept:
+                raise
+            failed |= {names[k]: why for k, why in error.reasons.items()}
+            start = None if start is None else problem.point_of(start, kept)
+            problem, names = problem.with_trials([problem.trials[k] for k in kept]), tuple(names[k] for k in kept)
     # The checkpoint has the first run only: what follows begins near its end.
     for _ in range(3):
         if not result.problem.chooses_steps or result.status != "converged" or not result.too_coarse:
@@ -102,7 +117,7 @@ def solve(
             method = dataclasses.replace(method, horizons=())
         again = minimize(problem, method, start=result.point, **run)
         result = dataclasses.replace(again, history=(*result.history, *again.history[1:]))
-    return result
+    return dataclasses.replace(result, failed=failed)
 
 
 def minimize(

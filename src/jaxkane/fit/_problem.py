@@ -263,6 +263,12 @@ class Problem:
 
     @classmethod
     def of_specification(cls, spec: ProblemSpec, trials: Sequence[Trial] | Trial) -> Problem:
+        problem = cls.with_first_steps(spec, trials)
+        return problem.finer(problem.start) if problem.chooses_steps else problem
+
+    @classmethod
+    def with_first_steps(cls, spec: ProblemSpec, trials: Sequence[Trial] | Trial) -> Problem:
+        """The problem whose steps of integration are those from sample to sample, and not yet `finer`."""
         system, simulation, trials = spec.system, spec.simulation or Simulation(), as_trials(trials)
         channels = checked_trials(system, trials)
         sampled = tuple(name for name in system.inputs if any(name in trial.inputs for trial in trials))
@@ -305,7 +311,7 @@ class Problem:
             check_same(model, windows)
         problem = cls(model, windows, windows.by_trial, trials, slices, spec)
         problem.check_system(problem.start)
-        return problem.finer(problem.start) if problem.chooses_steps else problem
+        return problem
 
     def check_system(self, point: Unknowns) -> None:
         """Refuse a description that contradicts itself, and bodies that cannot be, where the first window starts.
@@ -458,6 +464,33 @@ class Problem:
     def with_trials(self, trials: Sequence[Trial] | Trial) -> Problem:
         """The same specification with other trials."""
         return Problem.of_specification(self.specification, trials)
+
+    def point_of(self, point: Unknowns, trials: Sequence[int]) -> Unknowns:
+        """A point of this problem, as one of the problem with these of its trials."""
+        z = point.z[np.flatnonzero(np.isin(np.asarray(self.windows.trial), trials))]
+        return Unknowns(point.x, point.b[np.asarray(trials)], z)
+
+    def by_trials(self) -> list[Problem]:
+        """A problem of every trial, for all of which one program is compiled: a trial of fewer windows repeats its last
+        one, which counts nothing."""
+        owner, problems = np.asarray(self.windows.trial), []
+        most = np.bincount(owner).max()
+        for k, trial in enumerate(self.trials):
+            own = np.flatnonzero(owner == k)
+            i, counts = np.append(own, np.full(most - len(own), own[-1])), jnp.arange(most) < len(own)
+            windows = jax.tree.map(lambda x, i=i: x[i], self.windows)
+            windows = dataclasses.replace(
+                windows,
+                weight=jnp.where(counts[:, None, None], windows.weight, 0.0),
+                linked=jnp.where(counts, windows.linked, 0.0),
+                first=windows.first & counts,
+                very_first=windows.very_first & counts,
+                trial=jnp.zeros_like(windows.trial),
+            )
+            slices = tuple((0, *self.slices[j][1:]) for j in i)
+            one = {"windows": windows, "by_trial": windows.by_trial, "trials": (trial,), "slices": slices}
+            problems.append(dataclasses.replace(self, **one))
+        return problems
 
     def with_specification(self, spec: ProblemSpec) -> Problem:
         """Another specification with the same trials, of which the same count, and the same steps of integration."""

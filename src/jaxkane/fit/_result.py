@@ -56,7 +56,7 @@ class Fit:
     - `nuisance`: by trial, values of the biases and of the windows' starts by name; with process noise, starts that
         were given a deviation are part of the filter (`jaxkane.fit.smoothed`).
     - `step_error`: by how much halving the step of integration moves the residuals.
-    - `failed`: by name, trials that could not be simulated and are not among these, with the reason (`validate`).
+    - `failed`: by name, trials that could not be simulated and are not among these, with the reason.
     - `notes`: what a reader should know, in words.
     """
 

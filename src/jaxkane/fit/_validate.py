@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from tqdm import tqdm
 
+from ._block_lsq import Blocks
 from ._fit import minimize, uninterrupted
+from ._linearize import Linearization
 from ._model import Unknowns
 from ._nuisance import Unsimulated, solve_nuisance
 from ._optimizers import LeastSquares
@@ -20,10 +25,12 @@ from ._tables import Rows, text_table
 from ._trial import Trial
 
 
-def validate(fit: Fit, trials: Sequence[Trial] | Trial) -> Fit:
+def validate(fit: Fit, trials: Sequence[Trial] | Trial, *, progress: bool = False) -> Fit:
     """The parameters of a fit on other trials, of which only starts and biases are estimated (held-out data).
 
         jk.fit.validate(result, validation_trials).variance_accounted_for
+
+    The trials are simulated one by one, by a program that is compiled once for all of them. `progress`: a bar.
 
     **Returns:** a `Fit` of these trials, with the status "validated": its `cost`, `variance_accounted_for`, `tests` and
     report are those of these trials; its parameters were not fitted to them, and have no errors (NaN). Trials that
@@ -32,29 +39,55 @@ def validate(fit: Fit, trials: Sequence[Trial] | Trial) -> Fit:
     **Raises:** `ValueError` as `fit` does, for trials that do not suit the system, and where none can be simulated.
     """
     refuse_other(fit, Fit, "validate", "validate(fit(...), trials)")
-    problem, failed = fit.problem.with_trials(trials), {}
-    names = trial_names(problem)
+    problem = Problem.with_first_steps(fit.problem.specification, trials)
+    names, failed = trial_names(problem), {}
     while True:
-        first = dataclasses.replace(problem.start, x=fit.point.x)
-        if problem.chooses_steps:
-            problem = problem.finer(first)
-        try:
-            point, at = solve_nuisance(problem, first, steps=20, rtol=1e-6)
-            break
-        except Unsimulated as error:
-            failed |= {names[k]: why for k, why in error.reasons.items()}
-            left = [k for k in range(len(names)) if k not in error.reasons]
-            if not left:
-                name, why = next(iter(failed.items()))
-                raise ValueError(
-                    f"None of these trials can be simulated with these parameters: {name}, {why}."
-                ) from None
-            problem, names = fit.problem.with_trials([problem.trials[k] for k in left]), [names[k] for k in left]
+        validated = {}
+        ones = tqdm(problem.by_trials(), disable=not progress, desc="validation", unit=" trial")
+        for name, one in zip(names, ones, strict=True):
+            try:
+                validated[name] = _validated(fit, one)
+            except Unsimulated as error:
+                failed[name] = error.reasons[0]
+        if not validated:
+            name, why = next(iter(failed.items()))
+            raise ValueError(f"None of these trials can be simulated with these parameters: {name}, {why}.")
+        if len(validated) == len(names):
+            return dataclasses.replace(_joined(fit, problem, [*validated.values()]), failed=failed)
+        kept = [one.problem.trials[0] for one in validated.values()]
+        problem, names = Problem.with_first_steps(fit.problem.specification, kept), tuple(validated)
+
+
+def _validated(fit: Fit, problem: Problem) -> Fit:
+    """Of one trial. **Raises:** `Unsimulated` where its motion cannot be followed with these parameters."""
+    first = dataclasses.replace(problem.start, x=fit.point.x)
+    if problem.chooses_steps:
+        problem = problem.finer(first)
+    point, at = solve_nuisance(problem, first, steps=20, rtol=1e-6)
     try:
         before = solve_nuisance(problem, problem.start)[1].cost
     except Unsimulated:  # with the initial guesses, which is no fault of the fit
         before = float("nan")
-    return dataclasses.replace(Fit.of(problem, point, at, (before, at.cost), "validated", fit.method), failed=failed)
+    return uninterrupted(Fit.of(problem, point, at, (before, at.cost), "validated", fit.method))
+
+
+def _joined(fit: Fit, problem: Problem, fits: Sequence[Fit]) -> Fit:
+    """One fit of all trials from one of each, of whose windows the last may count nothing."""
+    counts = np.bincount(np.asarray(problem.windows.trial))
+
+    def joined(of: Callable[[Fit], Any]) -> Any:
+        """Arrays by window (W, ...)."""
+        rows = [jax.tree.map(lambda x, n=n: x[:n], of(one)) for one, n in zip(fits, counts, strict=True)]
+        return jax.tree.map(lambda *xs: jnp.concatenate(xs), *rows)
+
+    problem = problem.with_steps(joined(lambda one: one.problem.windows.step))
+    b, z = jnp.concatenate([one.point.b for one in fits]), joined(lambda one: one.point.z)
+    R, prediction = joined(lambda one: (one.linearization.blocks.R, one.linearization.prediction))
+    blocks = fits[0].linearization.blocks
+    at = Linearization(Blocks(R, problem.by_trial, blocks.n_z, blocks.n_next, blocks.n_b), prediction)
+    history = tuple(float(sum(costs)) for costs in zip(*(one.history for one in fits), strict=True))
+    errors = np.concatenate([one.step_errors[:n] for one, n in zip(fits, counts, strict=True)])
+    return Fit(problem, Unknowns(fit.point.x, b, z), at, errors, history, "validated", fit.method)
 
 
 @dataclasses.dataclass(frozen=True)
