@@ -5,7 +5,18 @@ import pytest
 from scipy import stats
 from systems import Track
 
-from jaxkane.fit import Free, LeastSquares, Problem, Simulation, Trial, laplace, minimize, profile
+from jaxkane.fit import (
+    Free,
+    LeastSquares,
+    Problem,
+    Simulation,
+    Trial,
+    bootstrap,
+    cross_validate,
+    laplace,
+    minimize,
+    profile,
+)
 from jaxkane.fit._covariance import jackknife_covariance
 from jaxkane.fit._statistics import autocorrelations, wald_test
 
@@ -129,3 +140,95 @@ def test_neighbours_are_measurements_that_follow_each_other():
     # Pairs by pairs: pieces that are short do not lose what has no neighbour.
     assert autocorrelations(walk.reshape(-1, 4), 2) == pytest.approx([0.9, 0.81], abs=0.03)
     assert autocorrelations([np.full(3, np.nan), np.zeros(5)], 1) == 0.0
+
+
+FRICTION = 0.4  # [m/s^2], dry, which the model does not have
+
+
+def rubbing(n, rng):
+    """Motions (n, n_t) of x'' = gain push + drift - friction sign(x') from rest, with pushes (n, n_t) of random size
+    and rate; what friction does to the estimates differs from motion to motion."""
+    size, rate, phase = rng.uniform(0.8, 2.0, (n, 1)), rng.uniform(1.5, 3.5, (n, 1)), rng.uniform(0, 6, (n, 1))
+    fine = 40
+    times = np.linspace(t[0], t[-1], fine * (t.size - 1) + 1)
+    push = size * np.sin(rate * t + phase)
+    x, v, out = np.zeros(n), np.zeros(n), [np.zeros(n)]
+    for i in range(times.size - 1):
+        k, s = divmod(i + 0.5, fine)
+        force = push[:, int(k)] + (push[:, int(k) + 1] - push[:, int(k)]) * s / fine
+        a = TRUTH["gain"] * force + TRUTH["drift"] - FRICTION * np.tanh(v / 0.02)
+        h = times[i + 1] - times[i]
+        v, x = v + h * a, x + h * (v + h * a)
+        if (i + 1) % fine == 0:
+            out.append(x)
+    return push, np.stack(out, axis=1)
+
+
+@pytest.mark.slow
+def test_intervals_that_hold_where_friction_is_left_out():
+    """Of 100 sets of eight trials. The next run lies in the intervals by held-out scatter, and not in confidence
+    intervals. These are about what all runs have in common: the estimates from very many."""
+    rng, T, sets, sigma = np.random.default_rng(3), 8, 100, 0.003
+
+    def fitted(n):
+        push, x = rubbing(n, rng)
+        trials = [
+            Trial(t, {"x": y + sigma * rng.normal(size=t.size)}, {"push": u}, sigma=sigma, initial={"x": 0, "x_dot": 0})
+            for u, y in zip(push, x, strict=True)
+        ]
+        options = {"unknown": ("x_dot",), "simulation": Simulation(step=0.1)}
+        return minimize(Problem.of(Track(), trials, ("gain", "drift"), **options), LeastSquares(damping=1e-9))
+
+    many = fitted(800).estimates
+    hits = dict.fromkeys(("next run by scatter", "next run by confidence", "clustered", "bootstrap"), 0.0)
+    for _ in range(sets):
+        found, following = fitted(T), fitted(1).estimates
+        scatter, confidence = cross_validate(found, T).intervals(), found.intervals()
+        percentiles = bootstrap(found, n=500).intervals()
+        for name, value in many.items():
+            for which, (low, high), at in (
+                ("next run by scatter", scatter[name], following[name]),
+                ("next run by confidence", confidence[name], following[name]),
+                ("clustered", confidence[name], value),
+                ("bootstrap", percentiles[name], value),
+            ):
+                hits[which] += (low <= at <= high) / sets / 2
+    assert found.uses_clustered_errors
+    assert 0.9 <= hits["next run by scatter"] <= 0.99, hits
+    assert hits["next run by confidence"] < 0.75, hits
+    assert 0.88 <= hits["clustered"] <= 0.99, hits
+    assert 0.85 <= hits["bootstrap"] <= 0.99, hits
+
+
+def test_the_bootstrap_of_many_trials_scatters_as_the_jackknife():
+    rng = np.random.default_rng(5)
+    trials = [trial(k, correlated, 1.0, rng) for k in range(60)]
+    options = {"unknown": ("x_dot",), "simulation": Simulation(step=0.1)}
+    problem = Problem.of(Track(), trials, (Free("gain", prior=(1.2, 0.05)), "drift"), **options)
+    found = minimize(problem, LeastSquares(damping=1e-9))
+    draws = bootstrap(found, n=4000)
+    assert draws.clusters == ("trial", 60)
+    for name, error in found.clustered_errors.items():
+        assert np.std(draws.values[name]) == pytest.approx(error, rel=0.12)
+        assert np.mean(draws.values[name]) == pytest.approx(found.estimates[name], abs=0.2 * error)
+        np.testing.assert_allclose(draws.intervals()[name], found.intervals()[name], atol=0.5 * error)
+    again = bootstrap(found, n=4000)
+    np.testing.assert_array_equal(again.values["gain"], draws.values["gain"])
+    assert "Bootstrap of 60 trials" in repr(draws)
+    with pytest.raises(ValueError, match="3 trials say nothing of how 2 parameters scatter"):
+        bootstrap(minimize(problem.with_trials(trials[:3]), LeastSquares()))
+
+
+def test_intervals_by_scatter_are_those_of_a_mean():
+    """With one parameter and trials alike, each trial has an estimate of its own, and that of all is their mean."""
+    rng, T = np.random.default_rng(6), 5
+    push = np.sin(2.0 * t)
+    steps = np.array([(2 * push[i] + push[i + 1]) / 6 for i in range(t.size - 1)])
+    v = np.concatenate([[0.0], np.cumsum((push[1:] + push[:-1]) / 2 * 0.1)])
+    y = np.concatenate([[0.0], np.cumsum(v[:-1] * 0.1 + steps * 0.01)])
+    own = 1.2 + 0.1 * rng.normal(size=T)
+    trials = [Trial(t, {"x": g * y}, {"push": push}, sigma=0.01, initial={"x": 0.0, "x_dot": 0.0}) for g in own]
+    problem = Problem.of(Track(), trials, "gain", simulation=Simulation(step=0.1))
+    low, high = cross_validate(minimize(problem, LeastSquares(damping=1e-9))).intervals(0.9)["gain"]
+    half = stats.t.ppf(0.95, T - 1) * np.std(own, ddof=1) * (1 + 1 / T) ** 0.5
+    assert (low, high) == pytest.approx((own.mean() - half, own.mean() + half), abs=1e-6)

@@ -108,7 +108,7 @@ def test_a_trial_that_the_others_cannot_simulate_costs_infinity(falling):
     costs = costs_by_trial(both, dataclasses.replace(both.start, x=falling.point.x))
     assert np.isinf(costs[3])
     np.testing.assert_allclose(costs[:3], costs_by_trial(falling.problem, falling.point), rtol=1e-6)
-    left_out = CrossValidation(("a", "b"), *(np.array([1.0, 1.0]) for _ in range(3)), np.array([1.0, np.inf]),
+    left_out = CrossValidation(falling, ("a", "b"), *(np.array([1.0, 1.0]) for _ in range(3)), np.array([1.0, np.inf]),
                                np.array([2.0, 2.0]), {})  # fmt: skip
     assert left_out.conclusion == "b cannot be simulated with the parameters of the others."
 

@@ -50,8 +50,10 @@ from ._result import trajectories as trajectories
 from ._smoother import Smoothed as Smoothed
 from ._smoother import smoothed as smoothed
 from ._statistics import ResidualTest as ResidualTest
+from ._studies import Bootstrap as Bootstrap
 from ._studies import MultiStart as MultiStart
 from ._studies import Profile as Profile
+from ._studies import bootstrap as bootstrap
 from ._studies import check_signs as check_signs
 from ._studies import multi_start as multi_start
 from ._studies import profile as profile

@@ -84,22 +84,30 @@ def clusters_of(problem: Problem) -> tuple[str, int]:
     return "", 0
 
 
-def cluster_robust_covariance(
-    problem: Problem, point: Unknowns, at: Linearization, directions: np.ndarray
-) -> np.ndarray:
-    """The cluster-robust covariance (k, k) along directions (p, k) of the free numbers, by `clusters_of`; NaN where
-    there are too few. What every cluster has of its own is eliminated: by trial its starts and biases, by window its
-    start. The parameters' priors, and by window those of the biases, are part of no cluster."""
+class Clusters(NamedTuple):
+    """What clusters of data say about n unknowns: the `information` (G, k, k) and the `scores` (G, k) of each, about
+    those at `places` (G, k); `of_priors` (n, n): the information of priors, which are part of no cluster."""
+
+    information: np.ndarray
+    scores: np.ndarray
+    places: np.ndarray
+    of_priors: np.ndarray
+
+
+def clustered(problem: Problem, point: Unknowns, at: Linearization, directions: np.ndarray) -> Clusters | None:
+    """The clusters of `clusters_of`, about biases that they share and, at the end, about the free numbers along
+    directions (p, k); None where there are too few. What every cluster has of its own is eliminated: by trial its
+    starts and biases, by window its start. The priors of parameters, and by window those of biases, are part of no
+    cluster."""
     kind, _ = clusters_of(problem)
-    k = directions.shape[1]
     if not kind:
-        return np.full((k, k), np.nan)
+        return None
     blocks, owner, measured = at.blocks, np.asarray(problem.windows.trial), problem.active_windows
     clusters, n_own = owner, 0
     if kind == "window":  # each a trial of its own, whose biases are shared with others
         clusters, n_own = np.arange(len(owner), dtype=np.int32), blocks.n_b
         blocks = Blocks(blocks.R, jnp.asarray(clusters[:, None]), blocks.n_z, 0, 0)
-    p = directions.shape[0]
+    p, k = directions.shape
 
     def squares(rows: np.ndarray) -> np.ndarray:
         """Of clusters, information (G, c, c) about what is shared and along the directions, bordered by the scores."""
@@ -116,7 +124,32 @@ def cluster_robust_covariance(
     P = np.zeros((n, n))
     np.add.at(P, (places[:, :, None], places[:, None, :]), of_priors[:, :-1, :-1])
     used, data = np.unique(clusters[measured]), data - of_priors
-    return jackknife_covariance(data[used, :-1, :-1], data[used, :-1, -1], places[used], P)[-k:, -k:]
+    return Clusters(data[used, :-1, :-1], data[used, :-1, -1], places[used], P)
+
+
+def cluster_robust_covariance(
+    problem: Problem, point: Unknowns, at: Linearization, directions: np.ndarray
+) -> np.ndarray:
+    """The cluster-robust covariance (k, k) along directions (p, k) of the free numbers; NaN where clusters are too
+    few."""
+    clusters, k = clustered(problem, point, at, directions), directions.shape[1]
+    return np.full((k, k), np.nan) if clusters is None else jackknife_covariance(*clusters)[-k:, -k:]
+
+
+def bootstrap_steps(clusters: Clusters, weights: np.ndarray) -> np.ndarray:
+    """By how much the unknowns (R, n) move where each cluster counts as often as the `weights` (R, G) say, linearized.
+
+    - (sum_g w_g N_g + P)^-1 sum_g (w_g - 1) s_g
+    """
+    G, n = len(clusters.places), len(clusters.of_priors)
+    information, scores = np.zeros((G, n, n)), np.zeros((G, n))
+    g = np.arange(G)[:, None]
+    information[g[:, :, None], clusters.places[:, :, None], clusters.places[:, None, :]] = clusters.information
+    scores[g, clusters.places] = clusters.scores
+    N = clusters.of_priors + np.einsum("rg,gij->rij", weights, information)
+    scale = np.sqrt(np.maximum(np.diagonal(information.sum(axis=0) + clusters.of_priors), np.finfo(float).tiny))
+    inverse = np.linalg.pinv(N / np.outer(scale, scale), rcond=1e-13, hermitian=True)
+    return -np.einsum("rij,rj->ri", inverse, (weights - 1) @ scores / scale) / scale
 
 
 def prior_rows(problem: Problem, point: Unknowns) -> tuple[np.ndarray, int]:

@@ -229,7 +229,7 @@ def autocorrelated_residuals(correlation: float) -> Iterator[str]:
         yield (
             f"The residuals are not noise: neighbours correlate by {correlation:.2f}. The formal standard errors are "
             f"too small by a factor of about {((1 + correlation) / max(1 - correlation, 0.01)) ** 0.5:.1f}; compare "
-            "`clustered_errors`."
+            "`clustered_errors`. Where another run will lie, `cross_validate(fit).intervals()` says."
         )
 
 

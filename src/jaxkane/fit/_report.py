@@ -150,7 +150,10 @@ def _sections_of_studies(
         usage = "save_report(fit, path, cross_validation=True)"
         refuse_other(left_out, CrossValidation, "`cross_validation=`", usage)
         conclusion = left_out.conclusion[0].upper() + left_out.conclusion[1:]
-        yield _Section("Cross validation", [conclusion], details=left_out.rows)
+        scatter = [(name, f"{low:.5g}", f"{high:.5g}") for name, (low, high) in left_out.intervals().items()]
+        of_next = "Where the estimate from the next run would lie, by the scatter from fold to fold (95 %):"
+        table = [("parameter", "from", "to"), *scatter]
+        yield _Section("Cross validation", [conclusion, of_next], table=table, details=left_out.rows)
     if forward_selection:
         usage = "save_report(fit, path, forward_selection=forward_selection(fit, candidates))"
         refuse_other(forward_selection, ForwardSelection, "`forward_selection=`", usage)

@@ -1,4 +1,4 @@
-"""Studies that fit again: multiple starts, profile likelihoods, and a check of signs."""
+"""Studies of a fit: multiple starts, profile likelihoods, the bootstrap, and a check of signs."""
 
 from __future__ import annotations
 
@@ -8,12 +8,14 @@ from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.stats import qmc
+from scipy.stats import norm, qmc
 from tqdm import tqdm
 
 from .._common.lookup import hint, real_number
+from ._covariance import bootstrap_steps, clustered
 from ._diagnostics import poorly_fitted_channels
 from ._fit import minimize, uninterrupted
 from ._model import Unknowns
@@ -21,6 +23,7 @@ from ._nuisance import solve_nuisance
 from ._optimizers import LeastSquares, Optimizer
 from ._problem import Problem, refuse_other
 from ._result import Fit
+from ._statistics import t_quantile
 from ._tables import text_table
 from ._windows import Windows
 
@@ -217,6 +220,61 @@ def _crossings(values: np.ndarray, costs: np.ndarray, limit: float) -> tuple[flo
         share = (limit_height - height[inside]) / (height[above] - height[inside])
         ends.append(float(values[inside] + share * (values[above] - values[inside])))
     return ends[0], ends[1]
+
+
+@dataclasses.dataclass(frozen=True, repr=False)
+class Bootstrap:
+    """Estimates from trials (or windows) that are drawn at random, as often as there are, some repeatedly.
+
+    - `values`: by name, estimates (n,); `clusters`: what was drawn, "trial" or "window", and how many there are.
+    """
+
+    values: dict[str, np.ndarray]
+    clusters: tuple[str, int]
+
+    def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """Confidence intervals by name: percentiles, those that Student's distribution makes of `level` where the
+        clusters are few (Hesterberg, What teachers should know about the bootstrap, 2015). They follow a distribution
+        that is not symmetric.
+
+        **Raises:** `ValueError` for a level that is not between 0 and 1.
+        """
+        G = self.clusters[1]
+        tail = float(norm.cdf(-((G / (G - 1)) ** 0.5) * t_quantile(level, G - 1)))
+        ends = {name: np.quantile(values, [tail, 1 - tail]) for name, values in self.values.items()}
+        return {name: (float(low), float(high)) for name, (low, high) in ends.items()}
+
+    def __repr__(self) -> str:
+        rows = [
+            ("parameter", "2.5 %", "97.5 %"),
+            *((name, f"{a:.5g}", f"{b:.5g}") for name, (a, b) in self.intervals().items()),
+        ]
+        return f"Bootstrap of {self.clusters[1]} {self.clusters[0]}s\n{text_table(rows)}"
+
+
+def bootstrap(fit: Fit, *, n: int = 2000, seed: int = 0) -> Bootstrap:
+    """How estimates scatter where other trials of the same kind had been measured: a block bootstrap, by trial where
+    there are enough, else by window. Nothing is fitted again: each draw is one step of Gauss and Newton from the fit.
+
+    **Arguments:** `n`: draws; `seed`: of the generator.
+
+    **Raises:** `ValueError` with fewer trials (or windows) than parameters and two.
+    """
+    refuse_other(fit, Fit, "bootstrap", "bootstrap(fit(...))")
+    directions = fit.identifiability.directions
+    clusters = clustered(fit.problem, fit.point, fit.linearization, directions)
+    if clusters is None:
+        raise ValueError(
+            f"bootstrap: {fit.problem.clusters} trials say nothing of how {len(fit.names)} parameters scatter; two "
+            "more trials are needed than parameters. Cut long ones with `Trial.between`, or fit in windows."
+        )
+    rng, G = np.random.default_rng(seed), len(clusters.places)
+    weights = rng.multinomial(G, np.full(G, 1 / G), size=n)
+    steps = bootstrap_steps(clusters, weights)[:, -directions.shape[1] :] @ directions.T
+    x = jnp.asarray(np.asarray(fit.point.x) + steps, fit.point.x.dtype)
+    values = np.array(jax.vmap(fit.parameters.values)(x), float)
+    values[:, np.isinf(np.array([*fit.clustered_errors.values()]))] = np.nan
+    return Bootstrap(dict(zip(fit.names, values.T, strict=True)), fit.clusters)
 
 
 def check_signs(fit: Fit) -> tuple[str, ...]:

@@ -13,6 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ._block_lsq import Blocks
+from ._covariance import intervals
 from ._fit import minimize, uninterrupted
 from ._linearize import Linearization
 from ._model import Unknowns
@@ -20,7 +21,7 @@ from ._nuisance import Unsimulated, solve_nuisance
 from ._optimizers import LeastSquares
 from ._problem import Problem, refuse_other
 from ._result import Fit
-from ._statistics import trial_names
+from ._statistics import t_quantile, trial_names
 from ._tables import Rows, text_table
 from ._trial import Trial
 
@@ -95,12 +96,14 @@ class CrossValidation:
     """Trials left out in turn: sums of squares of each, its own starts and biases estimated with fixed parameters; of
     fits with process noise, minus twice the log likelihoods.
 
-    - `trials`: their names; `n`: numbers of residuals; `at_start`, `fitted`, `held_out` (T,): with the parameters of
-        the start, of the fit of all, and of the fit of the others; infinite where these cannot simulate a trial.
+    - `fit`: that of all trials. `trials`: their names; `n`: numbers of residuals; `at_start`, `fitted`, `held_out`
+        (T,): with the parameters of the start, of the fit of all, and of the fit of the others; infinite where these
+        cannot simulate a trial.
     - `spread` (T,): sums of squares of the measurements about the mean of each channel, in their `sigma`.
     - `estimates`: by parameter, of each fold.
     """
 
+    fit: Fit
     trials: tuple[str, ...]
     n: np.ndarray
     at_start: np.ndarray
@@ -118,6 +121,24 @@ class CrossValidation:
         if self.cost_name != "sum of squares":
             return float("nan")
         return float(1 - self.held_out.sum() / self.spread.sum())
+
+    def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
+        """By name, where the estimate from other data lies that are as many as those of one fold: prediction intervals
+        by the scatter from fold to fold, inside a parameter's bounds.
+
+            estimate +- t s (1 + 1/K)^1/2,   s: of K estimates,   K estimate - (K - 1) (without the fold)   of each
+
+        t is Student's with K - 1 degrees of freedom. Where a model lacks something, each run has estimates of its own,
+        and the next run does not lie in a confidence interval, which is about their mean. (The pseudo-values are
+        Tukey's, 1958.)
+
+        **Raises:** `ValueError` for a level that is not between 0 and 1.
+        """
+        without = np.array([self.estimates[name] for name in self.fit.names])
+        K = without.shape[1]
+        own = K * np.array([*self.fit.estimates.values()])[:, None] - (K - 1) * without
+        half = t_quantile(level, K - 1) * np.std(own, axis=1, ddof=1) * (1 + 1 / K) ** 0.5
+        return dict(zip(self.fit.names, intervals(self.fit.parameters, self.fit.point.x, half), strict=True))
 
     @property
     def conclusion(self) -> str:
@@ -166,6 +187,7 @@ def cross_validate(fit: Fit, folds: int | Sequence[Sequence[int]] | None = None)
     owner = np.asarray(fit.problem.windows.trial)
     counts = np.asarray(jnp.sum(fit.problem.windows.weight > 0, axis=(1, 2)))
     return CrossValidation(
+        fit=fit,
         trials=fit.trial_names,
         n=np.array([counts[owner == k].sum() for k in range(T)]),
         at_start=costs_by_trial(fit.problem, fit.problem.start),
