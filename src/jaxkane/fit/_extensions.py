@@ -6,7 +6,7 @@ import dataclasses
 import html
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -209,8 +209,9 @@ def forward_selection(
     - `fit`: one that has converged. `candidates`: a list of names of parameters, `Free`, `Gain`, `Offset`, `Delay`,
         `Inertia`, and `Candidate`, which may be several of these together, what every trial has its own of, or another
         system. Each starts where it changes nothing.
-    - `depth`: how many may be selected. `beam`: how many ways are followed at once: with 1 the best candidate is taken,
-        and the others are tested beside it; with more, the best few are, and in the end what predicts best is selected.
+    - `depth`: how many may be selected. `beam`: how many branches are followed at once: with 1 the best candidate is
+        taken, and the others are tested beside it; with more, the best few are, and in the end what predicts best is
+        selected.
         `refits`: how many nested candidates are fitted in each round; None for all that the data can distinguish, 0 for
         no fit at all. `level`: of the test.
     - `plausible`: by name, (lower, upper), or a share of the start such as 0.2. By default `Candidate.plausible`,
@@ -232,25 +233,27 @@ def forward_selection(
         groups = folds_of((T if T <= 10 else 5) if folds is None else folds, T)
     elif folds is not None:
         raise ValueError("`folds`: one trial alone cannot be left out: cut it with `Trial.between`.")
-    ways, ended, accepted = [Way((), RestrictedModel.of(fit), ())], [], {}
+    branches, ended, accepted = [Branch((), RestrictedModel.of(fit), ())], [], {}
     with tqdm(disable=not progress, desc="forward selection", unit=" step") as bar:
         for _ in range(depth):
-            longer: dict[frozenset[str], Way] = {}
-            for way in ways:
-                rest = [c for c in candidates if c.name not in {one.name for one in way.selected}]
+            longer: dict[frozenset[str], Branch] = {}
+            for branch in branches:
+                rest = [c for c in candidates if c.name not in {one.name for one in branch.selected}]
                 if not rest:
-                    ended.append(way)
+                    ended.append(branch)
                     continue
-                round = SelectionRound(fit, way.model, way.selected, order, level / len(rest), plausible, groups, bar)
-                for other in way.extended(*round.run(rest, refits), candidates, groups):
+                level_of_each = level / len(rest)
+                round = SelectionRound(fit, branch.model, branch.selected, order, level_of_each, plausible, groups, bar)
+                for other in branch.extended(*round.run(rest, refits), candidates, groups):
                     names = frozenset(c.name for c in other.selected)
-                    if len(other.selected) == len(way.selected):
+                    if len(other.selected) == len(branch.selected):
                         ended.append(other)
                     elif names not in longer or other.rank(groups) < longer[names].rank(groups):
                         longer[names] = accepted[names] = other
-            ways = sorted(longer.values(), key=lambda way: way.rank(groups))[:beam]
-    best = min([*ways, *ended], key=lambda way: way.rank(groups))
-    names = {name for way in (*ways, *ended) for _, _, round in way.rounds for one in round for name in one.values}
+            branches = sorted(longer.values(), key=lambda branch: branch.rank(groups))[:beam]
+    best = min([*branches, *ended], key=lambda branch: branch.rank(groups))
+    tested = [one for branch in (*branches, *ended) for round in branch.rounds for one in round.candidates]
+    names = {name for one in tested for name in one.values}
     refuse_unknown(plausible, (*fit.names, *names), "`plausible` names")
     after = fit
     if best.selected:  # as a user would pose it
@@ -259,19 +262,28 @@ def forward_selection(
         after = solve(problem, LeastSquares(), start=start)
     costs, held_out_costs, extensions = zip(*best.rounds, strict=True)
     selected = tuple(c.name for c in best.selected)
-    others = sorted((way for names, way in accepted.items() if not names <= {*selected}), key=lambda w: w.rank(groups))
-    alternatives = tuple(way.beside(best, groups) for way in others)
+    others = [branch for names, branch in accepted.items() if not names <= {*selected}]
+    others.sort(key=lambda branch: branch.rank(groups))
+    alternatives = tuple(branch.beside(best, groups) for branch in others)
     return ForwardSelection(fit, extensions, costs, held_out_costs, selected, alternatives, level, after)
 
 
+class Round(NamedTuple):
+    """The sums of squares with which a round began, fitted and of trials left out, and its candidates, the selected one
+    first."""
+
+    cost: float
+    held_out_cost: float
+    candidates: tuple[Extension, ...]
+
+
 @dataclasses.dataclass(frozen=True)
-class Way:
-    """Candidates selected one after the other, and the rounds in which they were; each is (cost, held-out cost,
-    candidates)."""
+class Branch:
+    """Candidates selected one after the other, and the rounds in which they were."""
 
     selected: tuple[Candidate, ...]
     model: RestrictedModel
-    rounds: tuple[tuple[float, float, tuple[Extension, ...]], ...]
+    rounds: tuple[Round, ...]
 
     def extended(
         self,
@@ -279,29 +291,31 @@ class Way:
         models: Mapping[str, RestrictedModel],
         candidates: Sequence[Candidate],
         folds: Sequence[Sequence[int]] | None,
-    ) -> list[Way]:
+    ) -> list[Branch]:
         """By each candidate that was accepted; where none was, this one, with the round in which it ended."""
         before = self.model.cost, self.model.held_out_cost(folds)
         accepted = [one for one in extensions if one.accepted]
         if not accepted:
-            return [Way(self.selected, self.model, (*self.rounds, (*before, extensions)))]
-        ways = []
+            return [Branch(self.selected, self.model, (*self.rounds, Round(*before, extensions)))]
+        branches = []
         for one in accepted:
             first = (one, *(other for other in extensions if other is not one))
             candidate = next(c for c in candidates if c.name == one.name)
-            ways.append(Way((*self.selected, candidate), models[one.name], (*self.rounds, (*before, first))))
-        return ways
+            branches.append(
+                Branch((*self.selected, candidate), models[one.name], (*self.rounds, Round(*before, first)))
+            )
+        return branches
 
     def rank(self, folds: Sequence[Sequence[int]] | None) -> float:
         """By trials left out, as the last of its candidates was judged; with one trial by the sum of squares."""
         if folds is None:
             return self.model.cost
-        return self.rounds[-1][2][0].held_out_cost if self.selected else self.model.held_out_cost(folds)
+        return self.rounds[-1].candidates[0].held_out_cost if self.selected else self.model.held_out_cost(folds)
 
-    def beside(self, best: Way, folds: Sequence[Sequence[int]] | None) -> Alternative:
+    def beside(self, best: Branch, folds: Sequence[Sequence[int]] | None) -> Alternative:
         names, is_as_good = tuple(c.name for c in self.selected), False
         if folds is not None and best.selected:
-            by_fold = [way.model.linearized.costs_left_out(way.model.places, folds) for way in (self, best)]
+            by_fold = [branch.model.linearized.costs_left_out(branch.model.places, folds) for branch in (self, best)]
             difference = by_fold[0] - by_fold[1]
             error = np.std(difference, ddof=1) * math.sqrt(len(folds))
             rounding = 1e-9 * best.rank(folds)  # two that are the same model differ by nothing else
