@@ -47,7 +47,7 @@ def pytest_configure(config):
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
     kept = os.environ[CACHE]
     jk.configure(cache=False if kept == "0" else kept, verbose=False)
-    if kept != "0" and config.option.markexpr in ("not slow", "slow"):
+    if kept != "0" and config.option.markexpr == "not slow":
         # What runs for milliseconds need not be optimized for seconds; native kernels are written as ever.
         jax.config.update("jax_disable_most_optimizations", True)
     jax.config.update("jax_numpy_dtype_promotion", "strict")

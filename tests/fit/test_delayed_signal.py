@@ -1,13 +1,15 @@
-"""Sensors that report late, beside what their formulas say, and their derivatives beside differences."""
+"""Sensors that report late, or through a low-pass filter: their formulas, and derivatives beside differences."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.integrate
+from systems import Track
 
-from jaxkane.fit import _model
+from jaxkane.fit import Delay, Gain, LowPass, Offset, Simulation, Trial, _model, fit, forward_selection
 
-delayed_signal = jax.jit(_model.delayed_signal)
+delayed_signal, low_passed = jax.jit(_model.delayed_signal), jax.jit(_model.low_passed)
 T = jnp.linspace(0.0, 1.0, 41)
 
 
@@ -37,3 +39,63 @@ def test_a_last_time_that_is_repeated():
     assert jnp.isfinite(slope)
     two = delayed_signal(T[:2], jnp.array([1.0, 3.0]), jnp.array(0.5 * T[1]))
     np.testing.assert_allclose(two, [0.0, 2.0], atol=1e-12)
+
+
+def test_a_low_pass_is_that_of_its_equation():
+    t = T + 0.004 * jnp.sin(40.0 * T)
+    y, time_constant = jnp.sin(6.0 * t), 0.08
+    slope = (y[1] - y[0]) / (t[1] - t[0])
+    rate = lambda at, x: (np.interp(at, t, y) - x) / time_constant  # noqa: E731
+    exact = scipy.integrate.solve_ivp(
+        rate, (0.0, t[-1]), [y[0] - time_constant * slope], t_eval=t, rtol=1e-10, atol=1e-12, max_step=0.005
+    )
+    np.testing.assert_allclose(low_passed(t, y, jnp.array(time_constant)), exact.y[0], atol=1e-7)
+    np.testing.assert_allclose(low_passed(t, y, jnp.array(0.0)), y, atol=1e-14)
+    for at in (0.0, 1e-4, 0.05):  # derivatives, from both sides of zero
+        ends = [low_passed(t, y, jnp.array(at + d)) for d in (-1e-6, 1e-6)]
+        found = jax.jacfwd(low_passed, 2)(t, y, jnp.array(at))
+        np.testing.assert_allclose(found, (ends[1] - ends[0]) / 2e-6, atol=1e-4)
+    repeated = low_passed(jnp.append(t, t[-1]), jnp.append(y, y[-1]), jnp.array(0.05))
+    np.testing.assert_allclose(repeated[:-1], low_passed(t, y, jnp.array(0.05)), atol=1e-14)
+    assert repeated[-1] == repeated[-2]
+
+
+def tracks(order):
+    """Motions that are seen through a low-pass filter of 0.12 s."""
+    rng, t, trials = np.random.default_rng(order), np.linspace(0.0, 3.0, 121), []
+    for k in range(6):
+        push = np.sin((2.0 + k) * t + k)
+        rates = lambda at, s, push=push: [  # noqa: E731
+            s[1], 1.2 * np.interp(at, t, push), (s[0] - s[2]) / 0.12, (s[2] - s[3]) / 0.12
+        ]  # fmt: skip
+        moved = scipy.integrate.solve_ivp(rates, (0.0, 3.0), [0.0] * 4, t_eval=t, rtol=1e-9, atol=1e-11).y
+        seen = moved[1 + order] + 0.001 * rng.normal(size=t.size)
+        trials.append(Trial(t, {"x": seen}, {"push": push}, sigma=0.001, initial={"x": 0.0, "x_dot": 0.0}))
+    return trials
+
+
+@pytest.mark.parametrize("order", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_a_low_pass_is_selected_and_found(order):
+    before = fit(Track(gain=1.0), tracks(order), "gain", simulation=Simulation(step=0.025))
+    candidates = [Gain("x"), Offset("x"), Delay("x"), LowPass("x"), LowPass("x", order=2)][-3 if order == 1 else 0 :]
+    search = forward_selection(before, candidates, refits=None)
+    name = ("time constant of x", "time constant (twice) of x")[order - 1]
+    assert search.selected == (name,)
+    low, high = search.fit.intervals()[name]
+    assert high - low < 0.02
+    assert low < 0.12 < high
+    assert search.fit.variance < 1.3
+
+
+def test_what_is_no_low_pass_is_refused():
+    trials = tracks(1)[:1]
+    for item, said in (
+        (LowPass("push"), "no channel 'push'"),
+        (LowPass("x", of="input"), "`of` is 'sensor', or None"),
+        (LowPass("x", order=3), "`order` is 1 or 2"),
+        ((LowPass("x"), LowPass("x")), "twice"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            fit(Track(), trials, item)
+    with pytest.raises(ValueError, match=r"LowPass\('x'\): a filter of process noise .* `jaxkane.sensors.low_pass`"):
+        fit(Track(), trials, LowPass("x"), noise={"x_dot": 0.1})

@@ -13,6 +13,7 @@ from ._declarations import Delay as Delay
 from ._declarations import Free as Free
 from ._declarations import Gain as Gain
 from ._declarations import Inertia as Inertia
+from ._declarations import LowPass as LowPass
 from ._declarations import NoiseScale as NoiseScale
 from ._declarations import Offset as Offset
 from ._declarations import SpectralDensity as SpectralDensity

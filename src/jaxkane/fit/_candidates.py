@@ -34,7 +34,7 @@ class Candidate:
 
     **Arguments:**
 
-    - `name`: for tables. `free`: parameters, as in `fit`: names, `Free`, `Gain`, `Offset`, `Delay`, `Inertia`. With the
+    - `name`: for tables. `free`: parameters, as in `fit`: names, `Free`, `Gain`, `Offset`, `Delay`, `LowPass`, `Inertia`. With the
         system's values of them nothing changes.
     - `system`: another one, with the free parameters of the fit under the same names; by default the fit's. Where its
         motion is the same as long as nothing else is free, it is tested by linearization, else by a fit.

@@ -122,6 +122,24 @@ class Delay(CalibrationTerm):
 
 
 @dataclasses.dataclass(frozen=True)
+class LowPass(CalibrationTerm):
+    """A low-pass filter of a sensor, in its electronics or in what logs it, with one time constant [s] in all trials.
+
+        time_constant dx/dt = simulated - x
+
+    `what`: the channel. `order`: 1, or 2 for the same filter twice, which is critically damped. What is simulated is
+    taken as linear between the samples. Each window begins as if its first slope had lasted: a time constant should be
+    short beside a window. Time constant 0 changes nothing; the rest as in `Free`. A filter with parameters of its own
+    is a state of the system: `jaxkane.sensors.low_pass_second_order`.
+    """
+
+    bounds: tuple[float | None, float | None] | None = (0.0, None)
+    scale: float | None = 0.02
+    unit: str = "s"
+    order: Literal[1, 2] = 1
+
+
+@dataclasses.dataclass(frozen=True)
 class SpectralDensity(Named):
     """The spectral density of the process noise of a speed, a state or an input: see `noise` in `fit`.
 

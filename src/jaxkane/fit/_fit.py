@@ -42,7 +42,8 @@ def fit(
     **Arguments:**
 
     - `system`: with initial guesses of its parameters. `trials`: one `Trial` or several.
-    - `free`: what to find: names, paths, functions to leaves, `Free`, `Gain`, `Delay` and `Inertia`.
+    - `free`: what to find: names, paths, functions to leaves, `Free`, `Gain`, `Offset`, `Delay`, `LowPass`
+        and `Inertia`.
     - `unknown`: coordinates, independent speeds and states of the first order whose value at the start of every window
         is to be found too; dependent ones follow from them (`assemble`). What is measured and not among them starts at
         its first sample, with the error of that. Four unknown Euler parameters are three degrees of freedom.

@@ -8,6 +8,7 @@ from typing import Any
 
 import diffrax
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -20,7 +21,7 @@ from .._integrate.trajectory import Trajectory
 from .._kane.assemble import assemble
 from .._system.system import System, packed, unpacked
 from ..estimate._process_noise import Noise
-from ._parameters import Parameters
+from ._parameters import LOW_PASSES, Parameters
 from ._windows import Windows, state_names
 
 
@@ -102,8 +103,31 @@ def delayed_signal(t: Float[Array, " n"], y: Float[Array, " n"], delay: Array) -
     return jnp.where(at < t[0], before, jnp.where(at > t[-1], after, inside))
 
 
+def low_passed(t: Float[Array, " n"], y: Float[Array, " n"], time_constant: Array) -> Float[Array, " n"]:
+    """x with time_constant dx/dt = y - x, for y linear between samples, and begun as if its first slope had lasted:
+
+        x_k+1 = y_k+1 - T s_k + a_k (x_k - y_k + T s_k),   s_k: slopes,   a_k = exp(-h_k / T)
+
+    Below T = 0 it goes on as it is at T = 0, y - T s. The last time may be repeated.
+    """
+    h, T = jnp.diff(t), time_constant
+    ramp = T * jnp.where(h > 0, jnp.diff(y) / jnp.where(h > 0, h, 1.0), 0.0)  # (n - 1,)
+    lasts = T > 0
+    a = jnp.where(lasts, jnp.exp(-h / jnp.where(lasts, T, 1.0)), 0.0)
+    a = jnp.where(h > 0, a, 1.0)
+
+    def go_on(x: Array, now: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
+        a, ramp, y, y_next = now
+        x = y_next - ramp + a * (x - y + ramp)
+        return x, x
+
+    first = y[0] - ramp[0]
+    return jnp.concatenate([first[None], jax.lax.scan(go_on, first, (a, ramp, y[:-1], y[1:]))[1]])
+
+
 Calibration = dict[tuple[str, str], Array]
-"""Gains, offsets and delays that all trials have in common, by what they are of: ("gain of input", name)."""
+"""Gains, offsets, delays and time constants that all trials have in common, by what they are of: ("gain of input",
+name)."""
 
 
 class Unknowns(eqx.Module):
@@ -260,8 +284,12 @@ class Model(eqx.Module):
         """What the sensors would have measured (n_c, n_t)."""
         rows = []
         for c in self.channels:
+            y = ride[c]
+            for times, kind in enumerate(LOW_PASSES, start=1):
+                for _ in range(times if (f"{kind} of sensor", c) in calibration else 0):
+                    y = low_passed(ride.t, y, calibration[f"{kind} of sensor", c])
             delay = calibration.get(("delay of sensor", c))
-            rows.append(ride[c] if delay is None else delayed_signal(ride.t, ride[c], delay))
+            rows.append(y if delay is None else delayed_signal(ride.t, y, delay))
         return self.as_read(rows, b, calibration)
 
     def as_read(self, rows: Sequence[Array], b: Array, calibration: Calibration) -> Array:

@@ -19,7 +19,19 @@ from .._scalarjit.cache_key import jit
 from .._system.parameters import ANY, ParameterInfo, declared, leaf_name, learned_part, names_of_leaf
 from .._system.system import System, unit_of, units_of
 from ._bijections import Interval, PossibleBody
-from ._declarations import CalibrationTerm, Free, Inertia, Named, NoiseScale, Offset, Prior, SpectralDensity, Where
+from ._declarations import (
+    CalibrationTerm,
+    Delay,
+    Free,
+    Inertia,
+    LowPass,
+    Named,
+    NoiseScale,
+    Offset,
+    Prior,
+    SpectralDensity,
+    Where,
+)
 
 
 def one_leaf(system: System, name: str, shape: tuple[int, ...] = ()) -> int:
@@ -74,7 +86,7 @@ class Entry:
         """Whether its initial guess says of what size it is: not of a learned number, of the size of noise, nor of what
         has no zero of its own, as a delay."""
         kind = self.role[0].partition(" of ")[0] if self.role else ""
-        return not self.part and kind not in ("spectral density", "noise scale", "offset", "delay")
+        return not self.part and kind not in ("spectral density", "noise scale", "offset", "delay", *LOW_PASSES)
 
 
 class Parameters(eqx.Module):
@@ -276,15 +288,24 @@ def parameters_of(
 
 def _of_all_trials(system: System, item: CalibrationTerm, noise: Mapping[str, float] | None):
     kind, where = type(item).__name__.lower(), where_of(system, item)
-    if noise is not None and (kind, where) == ("delay", "sensor"):
+    if isinstance(item, LowPass):
+        if item.order not in (1, 2):
+            raise ValueError(f"LowPass({item.what!r}): `order` is 1 or 2, got {item.order!r}.")
+        kind = LOW_PASSES[item.order - 1]
+    if noise is not None and where == "sensor" and isinstance(item, (Delay, LowPass)):
+        state = "delayed" if isinstance(item, Delay) else "low_pass"
         raise ValueError(
-            f"Delay({item.what!r}): a filter of process noise compares each measurement with the motion at its time. "
-            "Let the sensor's delay be a state of the system, `jaxkane.sensors.delayed`."
+            f"{type(item).__name__}({item.what!r}): a filter of process noise compares each measurement with the "
+            f"motion at its time. Let it be a state of the system, `jaxkane.sensors.{state}`."
         )
     label = f"{kind} of {'start of ' if where == 'start' else ''}{item.what}"
     unit = item.unit or (units_of(system).get(item.what, "") if isinstance(item, Offset) else "")
     entry = Entry(item.name or label, unit, role=(f"{kind} of {where}", item.what))
     return _scalar(entry, item, item.start, ANY)
+
+
+LOW_PASSES = ("time constant", "time constant (twice)")
+"""Kinds of `LowPass`, by their order."""
 
 
 def _of_noise(
@@ -322,9 +343,10 @@ def where_of(system: System, item: CalibrationTerm) -> Where:
     **Raises:** `ValueError` where there is nothing of that name.
     """
     title, kind, of = type(system).__name__, type(item).__name__, item.of
-    if of not in (None, "input", "sensor", "start") or (kind, of) == ("Delay", "start"):
-        known = "'input' or 'sensor'" if kind == "Delay" else "'input', 'sensor' or 'start'"
-        raise ValueError(f"{kind}({item.what!r}): `of` is {known}, or None; got {of!r}.")
+    wheres = {"Delay": ("input", "sensor"), "LowPass": ("sensor",)}.get(kind, ("input", "sensor", "start"))
+    if of not in (None, *wheres):
+        raise ValueError(f"{kind}({item.what!r}): `of` is {' or '.join(map(repr, wheres))}, or None; got {of!r}.")
+    of = wheres[0] if len(wheres) == 1 else of
     if of in (None, "input") and item.what in system.inputs:
         return "input"
     starts = (*system.coordinates, *system.speeds, *system.states) if of != "input" else ()
