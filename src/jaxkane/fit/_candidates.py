@@ -34,8 +34,8 @@ class Candidate:
 
     **Arguments:**
 
-    - `name`: for tables. `free`: parameters, as in `fit`: names, `Free`, `Gain`, `Offset`, `Delay`, `LowPass`, `Inertia`. With the
-        system's values of them nothing changes.
+    - `name`: for tables. `free`: parameters, as in `fit`: names, `Free`, `Gain`, `Offset`, `Delay`, `LowPass`,
+        `Inertia`. With the system's values of them nothing changes.
     - `system`: another one, with the free parameters of the fit under the same names; by default the fit's. Where its
         motion is the same as long as nothing else is free, it is tested by linearization, else by a fit.
     - `unknown`: additional unknown starts, as those of its states.
