@@ -207,8 +207,8 @@ def forward_selection(
     **Arguments:**
 
     - `fit`: one that has converged. `candidates`: a list of names of parameters, `Free`, `Gain`, `Offset`, `Delay`,
-        `LowPass`, `Inertia`, and `Candidate`, which may be several of these together, what every trial has its own of, or another
-        system. Each starts where it changes nothing.
+        `LowPass`, `Inertia`, and `Candidate`, which may be several of these together, what every trial has its own of,
+        or another system. Each starts where it changes nothing.
     - `depth`: how many may be selected. `beam`: how many branches are followed at once: with 1 the best candidate is
         taken, and the others are tested beside it; with more, the best few are, and in the end what predicts best is
         selected.
