@@ -1,5 +1,10 @@
 """Steps of integration that follow the motion, at the start of a fit and at its end; an evidence by quadrature."""
 
+import dataclasses
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.linalg
@@ -8,6 +13,7 @@ import scipy.special
 from scipy import stats
 from systems import Cart
 
+import jaxkane as jk
 from jaxkane.fit import BFGS, Free, GradientDescent, LeastSquares, Problem, Simulation, Trial, fit, laplace, minimize
 
 H, SIGMA = 0.25, 0.001
@@ -144,3 +150,53 @@ def test_no_method_converges_where_nothing_can_be_simulated(beyond, method):
     assert np.isfinite(found.cost)
     assert found.cost < found.history[0]
     assert 0.0 < found.estimates["stiffness"] < 0.5
+
+
+class Sticky(Cart):
+    """For which a hundredth of a second is long: friction that grows with the cube of the rate."""
+
+    def loads(self, t, q, u, motion, inputs):
+        friction = -300.0 * u["x_dot"] ** 3
+        return (*super().loads(t, q, u, motion, inputs), jk.Force(friction * motion.N.x, motion["cart"]))
+
+
+@pytest.fixture(scope="module")
+def stiff():
+    """Motions that no step from sample to sample can follow, and what error control makes of a fit of them."""
+    times, trials = np.arange(0.0, 2.0, 0.05), []
+    for k in range(3):
+        push = (3.0 + k) * np.sin(2.0 * times + k)
+        truth = Sticky(mass=1.0, stiffness=6.0, damping=0.5)
+        start = jk.State(q=[0.1], u=[0.8])
+        ride = jk.simulate(truth, start, jnp.asarray(times), {"push": jk.Samples(times, push)}, rtol=1e-9)
+        measured = {"x": np.asarray(ride["x"]) + 1e-4 * np.random.default_rng(k).normal(size=times.size)}
+        trials.append(Trial(times, measured, {"push": push}, sigma=1e-4, initial={"x": 0.1, "x_dot": 0.8}))
+    guess = Sticky(mass=1.0, stiffness=4.0, damping=0.5)
+    by_error = fit(guess, trials, "stiffness", simulation=Simulation(rtol=1e-8))
+    return guess, trials, by_error
+
+
+@pytest.mark.parametrize(
+    "how", [None, Simulation(step=0.05 / 16, solver=diffrax.Kvaerno5())], ids=["halved", "implicit"]
+)
+def test_stiff_motions_are_fitted(stiff, how):
+    guess, trials, by_error = stiff
+    coarse = Problem.of(guess, trials, "stiffness", simulation=Simulation(step=0.05))
+    assert not coarse.linearize(coarse.start).good.any()  # from sample to sample none reaches its end
+    found = fit(guess, trials, "stiffness", simulation=how)
+    assert found.status == "converged"
+    assert found.failed == {}
+    error = by_error.standard_errors["stiffness"]
+    assert found.estimates["stiffness"] == pytest.approx(by_error.estimates["stiffness"], abs=0.3 * error)
+    assert by_error.estimates["stiffness"] == pytest.approx(6.0, abs=3.5 * error)
+
+
+def test_what_falls_from_the_guess_is_fitted_with_the_steps_of_others(stiff):
+    """One start is far off, so that the step finds no end there whatever it is; it is as short as those of others."""
+    guess, trials, _ = stiff
+    problem = Problem.of(guess, trials, "stiffness")
+    steps = np.asarray(problem.windows.step)
+    assert np.all(steps < 0.05 / 3)
+    windows = eqx.tree_at(lambda w: w.start, problem.windows, problem.windows.start.at[1, 1].set(1e6))
+    again = dataclasses.replace(problem, windows=windows).with_steps(jnp.full(3, 0.05)).finer(problem.start)
+    assert float(again.windows.step[1]) == pytest.approx(np.min(steps))

@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 from jaxtyping import Array
 
 from .._scalarjit.compat import (
@@ -81,6 +82,8 @@ def settings_for(
             f"{type(solver).__name__} estimates no error, which the steps would follow: give them, as in step=1e-3."
         )
     default = 1e-8 if ts.dtype == jnp.float64 else 1e-5
+    if step is not None:
+        solver = _for_one_length(solver, default)
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(
             "adjoint=BacksolveAdjoint() solves the motion backwards, without its events, inputs and samples: its "
@@ -104,6 +107,16 @@ def settings_for(
         stabilize=float(stabilize),
         rising=rising,
     )
+
+
+def _for_one_length(solver: Any, tolerance: float) -> Any:
+    """An implicit solver for steps of one length. As diffrax makes it, it takes the tolerances of its equations from
+    those of the steps, and leaves what converges slowly to a shorter step: here Newton's method solves them."""
+    of_steps = type(diffrax.with_stepsize_controller_tols(diffrax.VeryChord)().rtol)
+    if not isinstance(getattr(getattr(solver, "root_finder", None), "rtol", None), of_steps):
+        return solver
+    changed = {"root_finder": optx.Newton(rtol=tolerance, atol=tolerance), "root_find_max_steps": 50}
+    return dataclasses.replace(solver, **{name: x for name, x in changed.items() if hasattr(solver, name)})
 
 
 def _check_types(solver: Any, adjoint: Any, **flags: Any) -> None:

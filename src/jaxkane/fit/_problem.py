@@ -235,8 +235,9 @@ STEP_TOLERANCE = 0.05, 0.25
 """By how much halving the step of integration may move all residuals together, of a window and of all windows: it
 bounds the bias of an estimate in its standard errors."""
 
-HALVINGS = 8
-"""Of a step between two samples, at most: what needs more is stiff or chaotic."""
+HALVINGS, STIFF_HALVINGS = 8, 5
+"""Of a step between two samples, at most: what needs more is stiff or chaotic; and while the motion does not reach its
+end."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -555,14 +556,19 @@ class Problem:
             after = problem.with_steps(half).simulated(point)
             distance = self._distance(before, after)
             going &= ~(distance <= self.step_tolerance)
-            # Where halving does not reduce the difference, no step is fine enough: the motion is chaotic, or ends.
-            going &= (halvings < 2) | (np.isfinite(distance) & (distance <= last / 2))
+            # Where halving does not reduce the difference, no step is fine enough: the motion is chaotic. Where a
+            # motion ends, it may have been stiff for the step.
+            falls = np.isfinite(distance) & (distance <= last / 2)
+            going &= (halvings < 2) | falls | (~np.isfinite(distance) & (halvings < STIFF_HALVINGS))
             if not going.any():
                 break
             problem = problem.with_steps(jnp.where(jnp.asarray(going), half, problem.windows.step))
             before, last = np.where(going[:, None, None], after, before), distance
         lost = ~np.all(np.isfinite(np.where(self._weights(before) > 0, before, 0.0)), axis=(1, 2))
-        return problem.with_steps(jnp.where(jnp.asarray(lost), first, problem.windows.step))
+        # What does not reach its end from the initial guess may do so from a better one: with steps as short as others
+        # need.
+        halvings = 0.0 if lost.all() else np.max(np.log2(np.asarray(first / problem.windows.step))[~lost])
+        return problem.with_steps(jnp.where(jnp.asarray(lost), first / 2.0**halvings, problem.windows.step))
 
     def _distance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """The norm (W,) of a difference of simulations, in standard deviations; infinite where one of the two ended
