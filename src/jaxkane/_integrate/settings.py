@@ -72,18 +72,18 @@ def settings_for(
     **Raises:** `ValueError` or `TypeError` for options that are no such, and for those that contradict one another.
     """
     _check_types(solver, adjoint, project=project, progress=progress)
-    solver = diffrax.Tsit5() if solver is None else solver
+    method: Any = diffrax.Tsit5() if solver is None else solver
     if step is not None and not (rtol is None and atol is None):
         raise ValueError(
             "`step` fixes the steps of integration, `rtol` and `atol` let them follow the error: give one."
         )
-    if step is None and not isinstance(solver, diffrax.AbstractAdaptiveSolver):
+    if step is None and not isinstance(method, diffrax.AbstractAdaptiveSolver):
         raise ValueError(
-            f"{type(solver).__name__} estimates no error, which the steps would follow: give them, as in step=1e-3."
+            f"{type(method).__name__} estimates no error, which the steps would follow: give them, as in step=1e-3."
         )
     default = 1e-8 if ts.dtype == jnp.float64 else 1e-5
     if step is not None:
-        solver = _for_one_length(solver, default)
+        method = _for_one_length(method, default)
     if isinstance(adjoint, diffrax.BacksolveAdjoint):
         raise ValueError(
             "adjoint=BacksolveAdjoint() solves the motion backwards, without its events, inputs and samples: its "
@@ -98,7 +98,7 @@ def settings_for(
     return Settings(
         rtol=default if rtol is None else float(rtol),
         atol=default if atol is None else float(atol),
-        solver=solver,
+        solver=method,
         step=step,
         adjoint=ADJOINTS[adjoint]() if isinstance(adjoint, str) else adjoint,
         max_steps=max_steps,
