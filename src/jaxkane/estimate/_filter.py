@@ -26,7 +26,7 @@ from .._kane.rhs import output_names, outputs_at, values_of, vector_field
 from .._scalarjit.cache_key import jit
 from .._system.parameters import parameters_in, with_parameters
 from .._system.system import State, System, packed, unpacked
-from ._process_noise import MODES, Disturbance
+from ._process_noise import MODES, Disturbance, checked_noise
 from ._square_root import ordered, root
 from ._square_root import update as update_root
 
@@ -116,7 +116,6 @@ class Filter(eqx.Module):
         measurable = (*system.coordinates, *system.speeds, *system.states, *system.dependent_speeds)
         known = {
             "sensors": (sensors, (*measurable, *output_names(system))),
-            "noise": (noise, (*system.speeds, *system.states, *system.inputs)),
             "drift": (drift, tuple(name for name, value, _ in parameters_in(system) if np.ndim(value) == 0)),
         }
         for label, (given, names) in known.items():
@@ -137,8 +136,9 @@ class Filter(eqx.Module):
                 raise ValueError(f"Filter: `{label}` is a whole number of {least} at least, got {number!r}.")
         array = lambda given: jnp.asarray(np.array([*given.values()], float), jnp.result_type(float))  # noqa: E731
         self.system, self.method, self.lag, self.substeps = system, method, lag, substeps
-        self.sensors, self.noise, self.parameters = tuple(sensors), tuple(noise), tuple(drift)
-        self.sigma, self.density, self.drift = array(sensors), array(noise), array(drift)
+        self.sensors, self.parameters = tuple(sensors), tuple(drift)
+        self.sigma, self.drift = array(sensors), array(drift)
+        self.noise, self.density = checked_noise(system, noise, "Filter: `noise`")
 
     @property
     def names(self) -> tuple[str, ...]:

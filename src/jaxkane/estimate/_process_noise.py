@@ -71,14 +71,23 @@ class Noise(eqx.Module):
 
 def noise_of(system: System, noise: Any, deviations: Array, window: float | None) -> Noise:
     """Process noise by name, checked. `deviations` (n_z + n_b,): of a trial's unknowns."""
-    if not isinstance(noise, Mapping):
-        example = f"{{{system.speeds[0]!r}: 0.1}}"
-        raise TypeError(f"`noise` is a dict of spectral densities by name, {example}; got {noise!r}.")
+    names, density = checked_noise(system, noise, "`noise`")
     if window is not None:
         raise ValueError(
             "`noise` and `window` are two ways to follow a motion that one start does not determine: a filter, which "
             "goes on from every measurement, and windows, each with a start of its own. Give one of them."
         )
+    return Noise(names, density, tuple(bool(x) for x in np.isfinite(np.asarray(deviations))))
+
+
+def checked_noise(system: System, noise: Any, label: str) -> tuple[tuple[str, ...], Float[Array, " n_w"]]:
+    """Names of what is disturbed, and spectral densities.
+
+    **Raises:** `TypeError` and `ValueError` for what is no process noise, which begin with the label.
+    """
+    if not isinstance(noise, Mapping):
+        example = f"{{{system.speeds[0]!r}: 0.1}}"
+        raise TypeError(f"{label} is a dict of spectral densities by name, {example}; got {noise!r}.")
     known = (*system.speeds, *system.states, *system.inputs)
     for name, density in noise.items():
         if name not in known:
@@ -89,12 +98,10 @@ def noise_of(system: System, noise: Any, deviations: Array, window: float | None
                 if name in system.coordinates
                 else ""
             )
-            raise ValueError(f"`noise` names {name}; {hint(name, known, 'it may name')}{advice}")
-        if not 0 <= real_number(density, f"`noise`: the spectral density of {name}") < math.inf:
+            raise ValueError(f"{label} names {name}; {hint(name, known, 'it may name')}{advice}")
+        if not 0 <= real_number(density, f"{label}: the spectral density of {name}") < math.inf:
             raise ValueError(
-                f"`noise`: the spectral density of {name} is not negative, and finite; got {density!r}. "
-                f"To estimate it, start from such a number and name SpectralDensity({name!r}) among `free`."
+                f"{label}: the spectral density of {name} is not negative, and finite; got {density!r}. A fit finds "
+                f"it with SpectralDensity({name!r}) among `free`, starting from such a number."
             )
-    dtype = jnp.result_type(float)
-    random = tuple(bool(x) for x in np.isfinite(np.asarray(deviations)))
-    return Noise(tuple(noise), jnp.asarray([float(x) for x in noise.values()], dtype), random)
+    return tuple(noise), jnp.asarray([float(x) for x in noise.values()], jnp.result_type(float))
