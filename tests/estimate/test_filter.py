@@ -293,7 +293,7 @@ def test_constraints_are_kept():
         ({"rate": 0.0}, {}, "`sensors` of rate is 0.0: it must be positive and finite"),
         ({"rate": -1.0}, {}, "it must be positive and finite"),
         ({"rate": 0.1}, {"noise": {"angle": 0.1}}, "`noise` names angle"),
-        ({"rate": 0.1}, {"noise": {"rate": float("nan")}}, "the spectral density of rate is not negative, and finite; got nan"),
+        ({"rate": 0.1}, {"noise": {"rate": float("nan")}}, "density of rate is not negative, and finite; got nan"),
         ({"rate": 0.1}, {"drift": {"pul": 0.1}}, "`drift` names 'pul'; did you mean 'pull'"),
         ({}, {}, "`sensors` names nothing"),
         ({"rate": 0.1}, {"method": "particle"}, '`method` is "extended" or "unscented"'),
