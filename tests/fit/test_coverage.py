@@ -16,6 +16,7 @@ from jaxkane.fit import (
     laplace,
     minimize,
     profile,
+    validate,
 )
 from jaxkane.fit._covariance import jackknife_covariance
 from jaxkane.fit._statistics import autocorrelations, wald_test
@@ -232,3 +233,27 @@ def test_intervals_by_scatter_are_those_of_a_mean():
     low, high = cross_validate(minimize(problem, LeastSquares(damping=1e-9))).intervals(0.9)["gain"]
     half = stats.t.ppf(0.95, T - 1) * np.std(own, ddof=1) * (1 + 1 / T) ** 0.5
     assert (low, high) == pytest.approx((own.mean() - half, own.mean() + half), abs=1e-6)
+
+
+def test_what_the_data_do_not_determine_has_no_narrow_interval():
+    """Without a push its gain has no influence: infinite, or as wide as its prior says."""
+    rng = np.random.default_rng(7)
+    trials = [
+        Trial(t, x.measured, {"push": 0.0 * t}, sigma=SIGMA) for x in (trial(k, white, 1.0, rng) for k in range(6))
+    ]
+    options = {"unknown": ("x_dot",), "simulation": Simulation(step=0.1)}
+    found = minimize(Problem.of(Track(), trials, ("gain", "drift"), **options), LeastSquares(damping=1e-9))
+    for intervals in (found.intervals(), bootstrap(found).intervals(), cross_validate(found).intervals()):
+        assert intervals["gain"] == (-np.inf, np.inf)
+        assert np.isfinite(intervals["drift"]).all()
+    known = (Free("gain", prior=(1.2, 0.1)), "drift")
+    found = minimize(Problem.of(Track(), trials, known, **options), LeastSquares(damping=1e-9))
+    assert np.std(bootstrap(found).values["gain"]) == pytest.approx(0.1, rel=0.05)
+    for wrong in (0, -1, 99, 2.5, True, "many"):
+        with pytest.raises(ValueError, match="whole number of draws"):
+            bootstrap(found, n=wrong)
+    with pytest.raises(ValueError, match="parameters of another fit"):
+        bootstrap(validate(found, trials))
+    assert np.isnan(cross_validate(validate(found, trials)).intervals()["drift"]).all()
+    with pytest.raises(ValueError, match="`start` is of another problem"):
+        minimize(found.problem, LeastSquares(), start=validate(found, trials[:4]).point)

@@ -97,5 +97,7 @@ def test_what_is_no_low_pass_is_refused():
     ):
         with pytest.raises(ValueError, match=said):
             fit(Track(), trials, item)
+    with pytest.raises(TypeError, match="it takes the name of a channel"):
+        fit(Track(), trials, LowPass(3))
     with pytest.raises(ValueError, match=r"LowPass\('x'\): a filter of process noise .* `jaxkane.sensors.low_pass`"):
         fit(Track(), trials, LowPass("x"), noise={"x_dot": 0.1})

@@ -544,3 +544,26 @@ def test_a_motion_that_an_event_ends_is_told():
         fit(Fenced(), trial_of(y), "stiffness", **OPTIONS)
     far = fit(Fenced(), trial_of(y).between(0.0, 0.5), "stiffness", steps=2, **OPTIONS)
     assert np.isfinite(far.cost)
+
+
+def test_an_implicit_solver_and_xla_give_the_same_filter(by_xla):
+    """Their loops are differentiated forward."""
+    _, y = drawn(1)
+    costs = {}
+    for solver in (diffrax.Dopri8(), diffrax.Kvaerno5(), diffrax.Bosh3()):
+        options = OPTIONS | {"simulation": Simulation(step=0.0125, solver=solver)}
+        costs[type(solver).__name__] = Problem.of(Cart(), trial_of(y), "stiffness", **options)
+    costs = {name: problem.linearize(problem.start).cost for name, problem in costs.items()}
+    exact = minus_twice_log_likelihood(y)
+    assert costs["Dopri8"] == pytest.approx(exact, rel=1e-8)
+    assert costs["Kvaerno5"] == pytest.approx(exact, rel=1e-6)
+    assert costs["Bosh3"] == pytest.approx(exact, rel=1e-4)
+
+
+def test_a_step_longer_than_between_samples_is_told():
+    t = np.arange(0.0, 6.0, 0.5)
+    _, y = drawn(1, t)
+    told = fit(Cart(), trial_of(y, t), "stiffness", simulation=Simulation(step=5.0), **OPTIONS)
+    np.testing.assert_allclose(told.problem.windows.step, 0.5)
+    assert told.step_error > 0.3
+    assert any("too coarse" in note for note in told.notes)

@@ -93,12 +93,23 @@ def test_trials_go_one_by_one_through_one_program():
     assert more.history[1] > held.cost + min(costs_by_trial(found.problem, found.point)[:2])
 
 
-def test_a_trial_that_cannot_be_simulated_does_not_end_a_fit(falling):
+def test_a_trial_that_cannot_be_simulated_does_not_end_a_fit(falling, tmp_path):
     found = fit(Falling(), [FAR[0], *NEAR, FAR[1]], FREE, simulation=STEP, optimizer=LeastSquares())
     assert found.trial_names == ("near a", "near b", "near c")
     assert found.estimates == pytest.approx(falling.estimates, rel=1e-6)
     assert list(found.failed) == ["far (0)", "far (4)"]
     assert found.notes[0].startswith("far (0) is left out: from 0 to 1 s there are no finite residuals")
+    posed = [FAR[0], *NEAR, FAR[1]]
+    same = load(found.save(tmp_path / "found.npz"), Problem.of(Falling(), posed, FREE, simulation=STEP))
+    assert same.failed == found.failed
+    assert same.cost == found.cost
+    with pytest.raises(ValueError, match="`start` is of another problem"):
+        fit(Falling(), posed, FREE, simulation=STEP, start=found.point)
+    for steps in (1, None):  # goes on
+        kept = {"checkpoint": tmp_path / "checkpoint.npz", "steps": steps}
+        again = fit(Falling(), posed, FREE, simulation=STEP, optimizer=LeastSquares(), **kept)
+    assert again.estimates == pytest.approx(found.estimates, rel=1e-6)
+    assert list(again.failed) == list(found.failed)
     with pytest.raises(ValueError, match=r"far: with the initial guess .* 2 of 2 windows"):
         fit(Falling(), FAR, FREE, simulation=STEP)
 

@@ -19,6 +19,20 @@ def test_a_solver_without_an_estimate_of_its_error_asks_for_a_step():
     system, state = pendulum()
     with pytest.raises(ValueError, match="step=1e-3"):
         jk.simulate(system, state, jnp.linspace(0.0, 0.5, 3), solver=diffrax.Euler())
+    with pytest.raises(TypeError, match="KenCarp4 takes equations in two parts"):
+        jk.simulate(system, state, jnp.linspace(0.0, 0.5, 3), solver=diffrax.KenCarp4(), step=0.01)
+
+
+@pytest.mark.parametrize("solver", [diffrax.Kvaerno5(), diffrax.ImplicitEuler()])
+def test_implicit_steps_of_one_length(solver):
+    system, state = pendulum()
+    ts = jnp.linspace(0.0, 0.4, 3)
+    order = 1 if isinstance(solver, diffrax.ImplicitEuler) else 5
+    exact = np.asarray(jk.simulate(system, state, ts, rtol=1e-11).q)
+    errors = [
+        np.abs(np.asarray(jk.simulate(system, state, ts, solver=solver, step=h).q) - exact).max() for h in (0.04, 0.02)
+    ]
+    assert errors[0] / errors[1] > 2 ** (order - 0.6)
 
 
 def pendulum():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
@@ -210,6 +211,8 @@ def one_step(
     rates = _rates(jnp.array(True), settings.stabilize if constrained else 0.0)
     inputs = inputs_at(system, signals, t0, unpacked(system, y))
     solver, term = _solver_for(settings, system, t0, y, inputs), diffrax.ODETerm(rates)
+    if hasattr(solver, "scan_kind"):
+        solver = dataclasses.replace(solver, scan_kind="lax")  # as diffrax does it for derivatives in forward mode
     state = solver.init(term, t0, t1, y, args)
     y1, _, _, _, result = solver.step(term, t0, t1, y, args, state, False)
     return jnp.where(result == diffrax.RESULTS.successful, y1, jnp.nan)

@@ -132,6 +132,11 @@ def _check_types(solver: Any, adjoint: Any, **flags: Any) -> None:
             raise TypeError(f"`{label}` is an instance, not a class: {label}=diffrax.{value.__name__}().")
         if value is not None and not isinstance(value, kind):
             raise TypeError(f"`{label}` is one of diffrax, as diffrax.Tsit5() is a solver; got {value!r}.")
+    if isinstance(getattr(solver, "tableau", None), diffrax.MultiButcherTableau):
+        raise TypeError(
+            f"{type(solver).__name__} takes equations in two parts, stiff and not, and these are in one. A solver for "
+            "stiff ones is diffrax.Kvaerno5()."
+        )
     for label, value in flags.items():
         if not isinstance(value, (bool, np.bool_)):
             raise TypeError(f"`{label}` is True or False, got {value!r}.")

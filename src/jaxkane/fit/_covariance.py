@@ -136,20 +136,24 @@ def cluster_robust_covariance(
     return np.full((k, k), np.nan) if clusters is None else jackknife_covariance(*clusters)[-k:, -k:]
 
 
-def bootstrap_steps(clusters: Clusters, weights: np.ndarray) -> np.ndarray:
-    """By how much the unknowns (R, n) move where each cluster counts as often as the `weights` (R, G) say, linearized.
+def bootstrap_steps(clusters: Clusters, rng: np.random.Generator, n: int) -> np.ndarray:
+    """By how much the unknowns (n, n_unknowns) move, linearized, where as many clusters are drawn at random, each as
+    often as the weights w_g say, and priors e_P are measured again with their own deviations:
 
-    - (sum_g w_g N_g + P)^-1 sum_g (w_g - 1) s_g
+        - (sum_g w_g N_g + P)^-1 (sum_g (w_g - 1) s_g + e_P)
     """
-    G, n = len(clusters.places), len(clusters.of_priors)
-    information, scores = np.zeros((G, n, n)), np.zeros((G, n))
+    G, m = len(clusters.places), len(clusters.of_priors)
+    information, scores = np.zeros((G, m, m)), np.zeros((G, m))
     g = np.arange(G)[:, None]
     information[g[:, :, None], clusters.places[:, :, None], clusters.places[:, None, :]] = clusters.information
     scores[g, clusters.places] = clusters.scores
+    weights = rng.multinomial(G, np.full(G, 1 / G), size=n)
+    values, V = np.linalg.eigh(clusters.of_priors)
+    of_priors = rng.standard_normal((n, m)) * np.sqrt(np.maximum(values, 0.0)) @ V.T
     N = clusters.of_priors + np.einsum("rg,gij->rij", weights, information)
     scale = np.sqrt(np.maximum(np.diagonal(information.sum(axis=0) + clusters.of_priors), np.finfo(float).tiny))
     inverse = np.linalg.pinv(N / np.outer(scale, scale), rcond=1e-13, hermitian=True)
-    return -np.einsum("rij,rj->ri", inverse, (weights - 1) @ scores / scale) / scale
+    return -np.einsum("rij,rj->ri", inverse, ((weights - 1) @ scores + of_priors) / scale) / scale
 
 
 def prior_rows(problem: Problem, point: Unknowns) -> tuple[np.ndarray, int]:

@@ -128,9 +128,10 @@ class LowPass(CalibrationTerm):
         time_constant dx/dt = simulated - x
 
     `what`: the channel. `order`: 1, or 2 for the same filter twice, which is critically damped. What is simulated is
-    taken as linear between the samples. Each window begins as if its first slope had lasted: a time constant should be
-    short beside a window. Time constant 0 changes nothing; the rest as in `Free`. A filter with parameters of its own
-    is a state of the system: `jaxkane.sensors.low_pass_second_order`.
+    taken as linear between the samples. Each window begins as if its first slope had lasted. So the time constant is
+    found too small where windows are shorter than some twenty of it and their starts are free: fit whole trials. Time
+    constant 0 changes nothing; the rest as in `Free`. A filter with parameters of its own is a state of the system:
+    `jaxkane.sensors.low_pass_second_order`.
     """
 
     bounds: tuple[float | None, float | None] | None = (0.0, None)

@@ -95,9 +95,13 @@ def solve(
     """`minimize` without the trials that cannot be simulated, and again from where it ended while the steps of
     integration are too coarse there."""
     method: Any = LeastSquares() if optimizer is None else optimizer
+    if start is not None:
+        _refuse_start_of_another(problem, start)
     names, failed = trial_names(problem), {}
     while True:
         try:
+            if checkpoint is not None:  # which is that of the problem without the trials that are left out
+                solve_nuisance(problem, problem.start if start is None else start)
             result = minimize(problem, method, start=start, checkpoint=checkpoint, **run)
             break
         except Unsimulated as error:
@@ -153,7 +157,7 @@ def minimize(
         raise TypeError(f"`optimizer` is such as LeastSquares(), GradientDescent() or BFGS(); got {optimizer!r}.")
     refuse_other(problem, Problem, "minimize", "minimize(fit.problem, LeastSquares())")
     if start is not None:
-        refuse_other(start, Unknowns, "`start=`", "start=fit.point, or change the system's values")
+        _refuse_start_of_another(problem, start)
     steps = optimizer.steps if steps is None else steps
     if not isinstance(steps, int) or steps < 0:
         raise ValueError(f"`steps` is a whole number that is not negative, got {steps!r}.")
@@ -183,6 +187,16 @@ def minimize(
     finally:
         bar.close()
     return _result(problem, optimizer, run, first, status)
+
+
+def _refuse_start_of_another(problem: Problem, start: Any) -> None:
+    refuse_other(start, Unknowns, "`start=`", "start=fit.point, or change the system's values")
+    shapes, own = ([x.shape for x in (u.x, u.b, u.z)] for u in (start, problem.start))
+    if shapes != own:
+        raise ValueError(
+            "`start` is of another problem: its parameters, unknowns of trials and unknown starts have the shapes "
+            f"{shapes}; those of this one are {own}. A fit that left trials out has its own `fit.problem`."
+        )
 
 
 @dataclasses.dataclass

@@ -291,7 +291,7 @@ def _of_all_trials(system: System, item: CalibrationTerm, noise: Mapping[str, fl
     if isinstance(item, LowPass):
         if item.order not in (1, 2):
             raise ValueError(f"LowPass({item.what!r}): `order` is 1 or 2, got {item.order!r}.")
-        kind = LOW_PASSES[item.order - 1]
+        kind = LOW_PASSES[int(item.order) - 1]
     if noise is not None and where == "sensor" and isinstance(item, (Delay, LowPass)):
         state = "delayed" if isinstance(item, Delay) else "low_pass"
         raise ValueError(
@@ -343,6 +343,8 @@ def where_of(system: System, item: CalibrationTerm) -> Where:
     **Raises:** `ValueError` where there is nothing of that name.
     """
     title, kind, of = type(system).__name__, type(item).__name__, item.of
+    if not isinstance(item.what, str):
+        raise TypeError(f"{kind}({item.what!r}): it takes the name of a channel, an input or a speed, a text.")
     wheres = {"Delay": ("input", "sensor"), "LowPass": ("sensor",)}.get(kind, ("input", "sensor", "start"))
     if of not in (None, *wheres):
         raise ValueError(f"{kind}({item.what!r}): `of` is {' or '.join(map(repr, wheres))}, or None; got {of!r}.")

@@ -295,6 +295,9 @@ class Problem:
             step=simulation.step,
             guess=starts.guess,
         )
+        if noise is not None:  # a filter goes from sample to sample: a longer step is none, and half of it neither
+            longest = jnp.max(jnp.diff(windows.t, axis=1), axis=1)
+            windows = eqx.tree_at(lambda w: w.step, windows, jnp.minimum(windows.step, longest))
         varying = any(np.ptp(x) > 0 for trial in trials for x in trial.inputs.values())
         model = Model(
             system=system,

@@ -428,6 +428,10 @@ def load(path: str | os.PathLike[str], problem: Problem) -> Fit:
     of_fit: dict[str, Any] = saved.pop("fit", {})
     if not of_fit:
         raise ValueError(f"{path} is the checkpoint of a fit, not a fit that was saved: give it as `checkpoint=`.")
+    names, failed = statistics.trial_names(problem), of_fit["failed"]
+    if failed and failed.keys() <= {*names}:
+        kept = [trial for name, trial in zip(names, problem.trials, strict=True) if name not in failed]
+        problem = problem.with_trials(kept)
     step = tree_of(path, arrays, "step", problem.windows.step)
     if problem.chooses_steps and step.shape == problem.windows.step.shape:
         problem = problem.with_steps(step)

@@ -235,14 +235,17 @@ class Bootstrap:
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
         """Confidence intervals by name: percentiles, those that Student's distribution makes of `level` where the
         clusters are few (Hesterberg, What teachers should know about the bootstrap, 2015). They follow a distribution
-        that is not symmetric.
+        that is not symmetric. Infinite where the data determine nothing.
 
         **Raises:** `ValueError` for a level that is not between 0 and 1.
         """
         G = self.clusters[1]
         tail = float(norm.cdf(-((G / (G - 1)) ** 0.5) * t_quantile(level, G - 1)))
         ends = {name: np.quantile(values, [tail, 1 - tail]) for name, values in self.values.items()}
-        return {name: (float(low), float(high)) for name, (low, high) in ends.items()}
+        return {
+            name: (float(low), float(high)) if np.isfinite(low) else (-math.inf, math.inf)
+            for name, (low, high) in ends.items()
+        }
 
     def __repr__(self) -> str:
         rows = [
@@ -254,13 +257,18 @@ class Bootstrap:
 
 def bootstrap(fit: Fit, *, n: int = 2000, seed: int = 0) -> Bootstrap:
     """How estimates scatter where other trials of the same kind had been measured: a block bootstrap, by trial where
-    there are enough, else by window. Nothing is fitted again: each draw is one step of Gauss and Newton from the fit.
+    there are enough, else by window. Priors are drawn with their deviations. Nothing is fitted again: each draw is one
+    step of Gauss and Newton from the fit.
 
     **Arguments:** `n`: draws; `seed`: of the generator.
 
-    **Raises:** `ValueError` with fewer trials (or windows) than parameters and two.
+    **Raises:** `ValueError` with fewer trials (or windows) than parameters and two, and for a validated fit.
     """
     refuse_other(fit, Fit, "bootstrap", "bootstrap(fit(...))")
+    if not isinstance(n, int) or isinstance(n, bool) or n < 100:
+        raise ValueError(f"bootstrap: `n` is a whole number of draws, of 100 at least; got {n!r}.")
+    if fit.status == "validated":
+        raise ValueError("bootstrap: these are the parameters of another fit: draw from the trials of that one.")
     directions = fit.identifiability.directions
     clusters = clustered(fit.problem, fit.point, fit.linearization, directions)
     if clusters is None:
@@ -268,9 +276,7 @@ def bootstrap(fit: Fit, *, n: int = 2000, seed: int = 0) -> Bootstrap:
             f"bootstrap: {fit.problem.clusters} trials say nothing of how {len(fit.names)} parameters scatter; two "
             "more trials are needed than parameters. Cut long ones with `Trial.between`, or fit in windows."
         )
-    rng, G = np.random.default_rng(seed), len(clusters.places)
-    weights = rng.multinomial(G, np.full(G, 1 / G), size=n)
-    steps = bootstrap_steps(clusters, weights)[:, -directions.shape[1] :] @ directions.T
+    steps = bootstrap_steps(clusters, np.random.default_rng(seed), n)[:, -directions.shape[1] :] @ directions.T
     x = jnp.asarray(np.asarray(fit.point.x) + steps, fit.point.x.dtype)
     values = np.array(jax.vmap(fit.parameters.values)(x), float)
     values[:, np.isinf(np.array([*fit.clustered_errors.values()]))] = np.nan

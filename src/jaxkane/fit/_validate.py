@@ -129,8 +129,9 @@ class CrossValidation:
             estimate +- t s (1 + 1/K)^1/2,   s: of K estimates,   K estimate - (K - 1) (without the fold)   of each
 
         t is Student's with K - 1 degrees of freedom. Where a model lacks something, each run has estimates of its own,
-        and the next run does not lie in a confidence interval, which is about their mean. (The pseudo-values are
-        Tukey's, 1958.)
+        and the next run does not lie in a confidence interval, which is about their mean. Priors are the same for all.
+        Infinite, or NaN, where
+        the fit's own intervals are. (The pseudo-values are Tukey's, 1958.)
 
         **Raises:** `ValueError` for a level that is not between 0 and 1.
         """
@@ -138,6 +139,8 @@ class CrossValidation:
         K = without.shape[1]
         own = K * np.array([*self.fit.estimates.values()])[:, None] - (K - 1) * without
         half = t_quantile(level, K - 1) * np.std(own, axis=1, ddof=1) * (1 + 1 / K) ** 0.5
+        errors = np.array([*self.fit.errors.values()])
+        half = np.where(np.isfinite(errors), half, errors)
         return dict(zip(self.fit.names, intervals(self.fit.parameters, self.fit.point.x, half), strict=True))
 
     @property
