@@ -84,6 +84,10 @@ def test_trials_go_one_by_one_through_one_program():
     point, at = solve_nuisance(found.problem, found.point, steps=20, rtol=1e-6)
     assert held.cost == pytest.approx(at.cost, rel=1e-9)
     assert held.problem.size == found.problem.size
+    # Two parameters less have been fitted, one of which its prior determines in part.
+    difference = held.identifiability.degrees_of_freedom - found.identifiability.degrees_of_freedom
+    assert 0.5 < difference < 2.0
+    assert found.variance == pytest.approx(held.variance, rel=0.1)
     for name, y in found.fitted.items():
         np.testing.assert_allclose(held.fitted[name]["x"], y["x"], atol=1e-6)
     np.testing.assert_allclose(held.point.b, point.b, atol=1e-8)

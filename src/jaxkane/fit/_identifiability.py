@@ -142,10 +142,15 @@ def identifiability(problem: Problem, *, flat: float = 0.5, at: Unknowns | None 
 
 
 def identifiability_at(
-    problem: Problem, point: Unknowns, at: Linearization, flat: float = 0.5, sigma: str = "estimated"
+    problem: Problem,
+    point: Unknowns,
+    at: Linearization,
+    flat: float = 0.5,
+    sigma: str = "estimated",
+    fitted: bool = True,
 ) -> Identifiability:
     """Identifiability at a point where the problem has been linearized. With `sigma` "given" the variance of a residual
-    is one, with "estimated" it is that of the residuals there."""
+    is one, with "estimated" it is that of the residuals there; `fitted`: to which the parameters were."""
     parameters = problem.parameters
     names, p = parameters.names, len(parameters.names)
     to_values = np.asarray(parameters.slopes(point.x))
@@ -163,7 +168,8 @@ def identifiability_at(
     priors = prior_information(problem, point, eliminated)
     of_priors = to_x.T @ priors.information @ to_x
     n_data, n_unknown = problem.size[0] - priors.number, problem.size[1]
-    degrees_of_freedom = n_data - n_unknown + priors.determined + np.sum(inverse * of_priors)
+    by_parameters = p - np.sum(inverse * of_priors) if fitted else 0.0
+    degrees_of_freedom = n_data - (n_unknown - p) + priors.determined - by_parameters
     variance = 1.0
     if sigma == "estimated" and problem.model.noise is None:  # a likelihood knows how large residuals are
         variance = (at.cost - priors.squares) / degrees_of_freedom if degrees_of_freedom > 1e-3 else np.nan

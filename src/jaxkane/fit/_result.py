@@ -127,7 +127,7 @@ class Fit:
 
     @functools.cached_property
     def identifiability(self) -> Identifiability:
-        return identifiability_at(self.problem, self.point, self.linearization)
+        return identifiability_at(self.problem, self.point, self.linearization, fitted=self.status != "validated")
 
     @property
     def message(self) -> str:
@@ -297,14 +297,12 @@ class Fit:
     @functools.cached_property
     def notes(self) -> tuple[str, ...]:
         """What a reader should know, in words."""
-        problem, parameters, identifiability = self.problem, self.parameters, self.identifiability
+        problem, identifiability = self.problem, self.identifiability
         mean_squared = self.mean_normalized_innovation_squared
         return (
             *diagnostics.not_converged(self.status),
             *(f"{name} is left out: {why}." for name, why in self.failed.items()),
-            *filter(None, [identifiability.rank_message]),
-            *identifiability.messages,
-            *diagnostics.correlated_parameters(parameters, self.correlation),
+            *(() if self.status == "validated" else self._notes_on_parameters),
             *diagnostics.outlier_trials(self.residuals),
             *diagnostics.autocorrelated_residuals(self.autocorrelation),
             *(diagnostics.wrong_noise(self.residuals, mean_squared) if problem.model.noise is not None else ()),
@@ -312,14 +310,24 @@ class Fit:
             *diagnostics.no_degrees_of_freedom(problem, self.variance),
             *self._coarse_steps,
             *diagnostics.infeasible_bodies(problem, self.point),
-            *diagnostics.bodies_at_the_boundary(parameters, self.point.x),
-            *diagnostics.far_from_start(parameters, self.start, self.estimates, self.standard_errors),
-            *diagnostics.known_by_prior(parameters, identifiability.given_sigma_errors),
             *diagnostics.constant_records(problem),
             *diagnostics.suspicious_records(problem),
             *diagnostics.duplicate_trials(problem),
             *diagnostics.wrong_units(problem, self.fitted),
             *diagnostics.poorly_fitted_channels(self.tests, self.variance),
+        )
+
+    @property
+    def _notes_on_parameters(self) -> tuple[str, ...]:
+        """Of those that were fitted."""
+        parameters, identifiability = self.parameters, self.identifiability
+        return (
+            *filter(None, [identifiability.rank_message]),
+            *identifiability.messages,
+            *diagnostics.correlated_parameters(parameters, self.correlation),
+            *diagnostics.bodies_at_the_boundary(parameters, self.point.x),
+            *diagnostics.far_from_start(parameters, self.start, self.estimates, self.standard_errors),
+            *diagnostics.known_by_prior(parameters, identifiability.given_sigma_errors),
         )
 
     def save(self, path: str | os.PathLike[str]) -> Path:
