@@ -118,6 +118,18 @@ def test_a_trial_that_cannot_be_simulated_does_not_end_a_fit(falling, tmp_path):
         fit(Falling(), FAR, FREE, simulation=STEP)
 
 
+def test_shorter_horizons_leave_no_trial_out_with_a_checkpoint_either(falling, tmp_path):
+    """By them the fit comes to parameters that simulate all, from a guess that simulates none."""
+    guess = Falling(drift=30.0)
+    with pytest.raises(ValueError, match="3 of 3 windows"):
+        fit(guess, NEAR, FREE, simulation=STEP, checkpoint=tmp_path / "none.npz")
+    by_horizons = LeastSquares(horizons=(0.3, 0.6))
+    for more in ({}, {"checkpoint": tmp_path / "horizons.npz"}):
+        found = fit(guess, NEAR, FREE, simulation=STEP, optimizer=by_horizons, **more)
+        assert found.failed == {}
+        assert found.cost == pytest.approx(falling.cost, rel=1e-4)
+
+
 def test_a_trial_that_the_others_cannot_simulate_costs_infinity(falling):
     both = falling.problem.with_trials([*NEAR, FAR[0]])
     costs = costs_by_trial(both, dataclasses.replace(both.start, x=falling.point.x))

@@ -100,7 +100,9 @@ def solve(
     names, failed = trial_names(problem), {}
     while True:
         try:
-            if checkpoint is not None:  # which is that of the problem without the trials that are left out
+            # A checkpoint is that of the problem without the trials that are left out. Shorter horizons may yet lead to
+            # parameters by which all can be simulated.
+            if checkpoint is not None and not method.horizons:
                 solve_nuisance(problem, problem.start if start is None else start)
             result = minimize(problem, method, start=start, checkpoint=checkpoint, **run)
             break

@@ -137,12 +137,17 @@ class _Motion:
     calibration: Any
     window: Windows
 
+    @property
+    def n(self) -> int:
+        """How many of v are the state; the rest are the trial's own unknowns."""
+        return len(state_names(self.system))
+
     def signals(self, b: Array) -> Any:
         return for_fixed_steps(self.model.signals(self.window, b, self.calibration), self.model.settings.solver)
 
     def start(self, v: Array) -> Reached:
-        y, t = v[: len(state_names(self.system))], self.window.t[0]
-        valid = is_valid(self.system, unpacked(self.system, y), t, self.signals(v[len(y) :]), None)
+        y, t = v[: self.n], self.window.t[0]
+        valid = is_valid(self.system, unpacked(self.system, y), t, self.signals(v[self.n :]), None)
         return Reached(t, y, jnp.where(valid, jnp.int32(Status.COMPLETED), jnp.int32(Status.INVALID)))
 
     def predicted(self, v: Array, S: Array, t0: Array, t1: Array, reached: Reached):
@@ -180,20 +185,19 @@ class _Motion:
 
     def moved(self, v: Array, t0: Array, t1: Array, disturbance: Disturbance) -> Array:
         """v after one step of integration."""
-        n = len(state_names(self.system))
-        b, settings = v[n:], self.model.settings
-        return jnp.concatenate([one_step(self.system, v[:n], t0, t1, self.signals(b), settings, disturbance), b])
+        y, b, settings = v[: self.n], v[self.n :], self.model.settings
+        return jnp.concatenate([one_step(self.system, y, t0, t1, self.signals(b), settings, disturbance), b])
 
     def reached(self, v: Array, t: Array, before: Reached) -> Reached:
-        y = jax.lax.stop_gradient(v[: len(before.y)])
-        ended = ends_between(self.system, before.t, before.y, t, y, self.signals(v[len(y) :]))
+        y = jax.lax.stop_gradient(v[: self.n])
+        ended = ends_between(self.system, before.t, before.y, t, y, self.signals(v[self.n :]))
         status = jnp.where(jnp.all(jnp.isfinite(y)), ended, jnp.int32(Status.STEP_TOO_SMALL))
         return Reached(t, y, jnp.where(before.status > 0, before.status, status))
 
     def measured(self, v: Array, t: Array) -> Array:
         """What the sensors read (n_c,)."""
-        n, system, model = len(state_names(self.system)), self.system, self.model
-        state, b = unpacked(system, v[:n]), v[n:]
+        system, model = self.system, self.model
+        state, b = unpacked(system, v[: self.n]), v[self.n :]
         values = values_of(system, state.x, inputs_at(system, self.signals(b), t, state))
         return model.as_read(sensed(system, model.channels, t, state.q, state.u, values), b, self.calibration)
 
