@@ -28,6 +28,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 from jax.core import Tracer as Tracer
 
 MISSING: str | None = None  # what this JAX lacks, without which there are no scalar programs
@@ -246,6 +247,11 @@ def nothing_is_traced() -> bool:
     with eval_context():
         plain = get_opaque_trace_state()
     return get_opaque_trace_state() == plain
+
+
+def on_device(x: Any, dtype: Any = None) -> jax.Array:
+    """NumPy's numbers as an array of JAX. `jax.numpy.asarray` compiles a program for each shape (JAX 0.12)."""
+    return jax.device_put(np.asarray(x, dtype))
 
 
 def settings() -> Any:

@@ -114,7 +114,7 @@ def clustered(problem: Problem, point: Unknowns, at: Linearization, directions: 
         rows = np.concatenate([rows[..., : -p - 1], rows[..., -p - 1 : -1] @ directions, rows[..., -1:]], axis=-1)
         return rows.mT @ rows
 
-    data = squares(np.asarray(eliminate(blocks, 0.0).R, float))
+    data = squares(eliminate(blocks, 0.0).R.astype(float))
     of_priors = np.zeros_like(data)
     np.add.at(of_priors, clusters, squares(prior_rows(problem, point)[0][:, -n_own - p :, -n_own - p - 1 :]))
     n = len(problem.trials) * n_own + k
@@ -199,7 +199,7 @@ def prior_information(problem: Problem, point: Unknowns, eliminated: Eliminated)
     of_x, of_nuisance, determined = rows[:, -p:, -p - 1 : -1], rows[:, :-p], 0.0
     information = np.einsum("wmi,wmj->ij", of_x, of_x)
     if of_nuisance.any():
-        still, *moved = (eliminated.back_substitute(x) for x in jnp.eye(p + 1, p, -1, dtype=point.x.dtype))
+        still, *moved = (eliminated.back_substitute(x) for x in np.eye(p + 1, p, -1, dtype=point.x.dtype))
         z, b = (np.array([new - old for new in news]).T for *news, old in zip(*moved, still, strict=True))  # by x
         follow = np.concatenate([z.swapaxes(0, 1), b.swapaxes(0, 1)[np.asarray(problem.windows.trial)]], axis=1)
         places = [*range(blocks.n_z), *range(blocks.n_z + blocks.n_next, rows.shape[2] - p - 1)]
@@ -208,8 +208,8 @@ def prior_information(problem: Problem, point: Unknowns, eliminated: Eliminated)
         # d log det (N + e P) / de = tr (P N^-1), of starts and biases
         e = float(jnp.finfo(blocks.R.dtype).eps) ** (1 / 3)
         R = np.linalg.qr(np.concatenate([np.asarray(blocks.R), e**0.5 * of_nuisance], axis=1), mode="r")
-        with_more = eliminate(eqx.tree_at(lambda blocks: blocks.R, blocks, jnp.asarray(R, blocks.R.dtype)), 0.0)
-        determined = float(with_more.log_determinant - eliminated.log_determinant) / e
+        with_more = eliminate(eqx.tree_at(lambda blocks: blocks.R, blocks, R.astype(blocks.R.dtype)), 0.0)
+        determined = (with_more.log_determinant - eliminated.log_determinant) / e
     return PriorInformation(information, determined, number, float(np.sum(rows[:, :, -1] ** 2)))
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from tqdm import tqdm
 
 from .._common.lookup import refuse_unknown
+from .._scalarjit.compat import on_device
 from ._block_lsq import Blocks, eliminate
 from ._candidates import (
     AugmentedProblem,
@@ -390,11 +391,11 @@ def linearized_problem(problem: Problem, at: Linearization, point: Unknowns, b: 
     blocks, parameters = at.blocks, problem.parameters
     first = blocks.n_z + blocks.n_next
     columns = [*range(first), *(first + i for i in b), *range(first + blocks.n_b, blocks.R.shape[-1])]
-    R = blocks.R[:, :, jnp.asarray(columns, dtype=jnp.int32)]
+    R = on_device(np.asarray(blocks.R)[:, :, columns])
     reduced = eliminate(Blocks(R, blocks.windows, blocks.n_z, blocks.n_next, len(b)), 0.0)
     slopes = np.asarray(parameters.slopes(point.x)) / np.asarray(parameters.prior_deviation, float)[:, None]
     priors = np.column_stack([slopes, np.asarray(parameters.prior_residuals(point.x))])
-    return LinearizedProblem(np.asarray(reduced.R, float), priors, np.asarray(blocks.column_norms, float))
+    return LinearizedProblem(reduced.R.astype(float), priors, blocks.column_norms.astype(float))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -159,7 +159,7 @@ def identifiability_at(
     # From scaled parameters; at the edge of what a body can have, a free number moves nothing any more.
     to_x = np.linalg.pinv(to_values / scales[:, None], rcond=1e-9)
     eliminated = eliminate(at.blocks, 0.0)
-    A = np.asarray(eliminated.rows[0]) @ to_x
+    A = eliminated.rows[0] @ to_x
     before = np.linalg.norm(np.asarray(at.blocks.R)[:, :, -1 - p : -1] @ to_x, axis=(0, 1))
     eps = float(jnp.finfo(eliminated.R.dtype).eps)
     no_influence = before <= 1e4 * eps * before.max()

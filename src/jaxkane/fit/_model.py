@@ -19,7 +19,8 @@ from .._integrate.integrate import solve
 from .._integrate.settings import Settings, settings_for
 from .._integrate.trajectory import Trajectory
 from .._kane.assemble import assemble
-from .._system.system import System, packed, unpacked
+from .._scalarjit.cache_key import jit
+from .._system.system import State, System, packed, unpacked
 from ..estimate._process_noise import Noise
 from ._parameters import LOW_PASSES, Parameters
 from ._windows import Windows, state_names
@@ -233,6 +234,16 @@ class Model(eqx.Module):
     def consistent(self, window: Windows, z: Array, x: Array) -> Array:
         """The start (n_q + n_u + n_x,) of one window, its dependent coordinates found by `assemble`. Euler
         parameters that were measured, or are unknown, are brought to unit norm."""
+        return packed(self.start(window, z, x))
+
+    def start(self, window: Windows, z: Array, x: Array) -> State:
+        """The same as a `State`."""
+        system, state = self._guessed(window, z, x)
+        return assemble(system, state.q, state.u, state.x, t=window.t[0], free=self.assembled)
+
+    @jit
+    def _guessed(self, window: Windows, z: Array, x: Array) -> tuple[System, State]:
+        """The system with these parameters, and where a window starts but for its dependent coordinates."""
         system, calibration = self.parameters.apply(self.system, x)
         if self.noise is not None:  # a start with a deviation is no unknown of a filter, but what it begins with
             z = jnp.where(jnp.isfinite(self.nuisance.start_deviation), 0.0, z)
@@ -240,8 +251,7 @@ class Model(eqx.Module):
         for four in self.quaternions:
             e = start[np.array(four)]
             start = start.at[np.array(four)].set(e / jnp.linalg.norm(e))
-        state = unpacked(system, start)
-        return packed(assemble(system, state.q, state.u, state.x, t=window.t[0], free=self.assembled))
+        return system, unpacked(system, start)
 
     def known(self, start: Array, calibration: Calibration) -> Array:
         """What is known of a start (n_q + n_u + n_x,), with the gains and offsets that all trials have in common."""

@@ -6,22 +6,22 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from .._integrate.status import Status, reason
+from .._scalarjit.compat import on_device
 from ._block_lsq import Eliminated, eliminate
 from ._linearize import Linearization
 from ._model import Unknowns
 from ._problem import Problem
 
 
-@jax.jit
-def moved(point: Unknowns, x: Array, eliminated: Eliminated) -> Unknowns:
+def moved(point: Unknowns, x: Any, eliminated: Eliminated) -> Unknowns:
     """The point after a step x of the parameters, with the nuisance values that go with it."""
+    x = np.asarray(x)
     z, b = eliminated.back_substitute(x)
-    return Unknowns(point.x + x, point.b + b, point.z + z)
+    after = lambda before, step: on_device(np.asarray(before) + step)  # noqa: E731
+    return Unknowns(after(point.x, x), after(point.b, b), after(point.z, z))
 
 
 def usable(at: Linearization | None) -> bool:
@@ -109,7 +109,7 @@ def refined(
     Trials then know nothing of one another: each has a damping of its own, and keeps a step only where its own cost
     falls, so that one in which a step leads too far holds up no other.
     """
-    still, owner = jnp.zeros_like(point.x), np.asarray(problem.windows.trial)
+    still, owner = np.zeros_like(point.x), np.asarray(problem.windows.trial)
     damping, before = np.zeros(len(problem.trials)), _by_owner(at, owner, len(problem.trials))
     for _ in range(steps):
         tried = moved(point, still, eliminate(at.blocks, damping))
@@ -132,13 +132,12 @@ def _by_owner(at: Linearization, owner: np.ndarray, n: int) -> np.ndarray:
     return np.bincount(owner, weights=at.costs, minlength=n)
 
 
-@jax.jit
 def _chosen(better: np.ndarray, owner: np.ndarray, new: Any, old: Any) -> tuple[Unknowns, Linearization]:
     """Of two points with the same parameters, and what they were linearized to, the first where a trial is better."""
     (tried, there), (point, at) = new, old
 
     def of(which: np.ndarray):
-        return lambda a, b: jnp.where(jnp.reshape(which, (-1,) + (1,) * (a.ndim - 1)), a, b)
+        return lambda a, b: on_device(np.where(np.reshape(which, (-1,) + (1,) * (a.ndim - 1)), a, b))
 
     of_windows = of(better[owner])
     R, seen = of_windows(there.blocks.R, at.blocks.R), jax.tree.map(of_windows, there.prediction, at.prediction)

@@ -11,6 +11,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 import optimistix as optx
 from jax.flatten_util import ravel_pytree
@@ -18,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from .._common.lookup import real_number
 from .._scalarjit.cache_key import jit
+from .._scalarjit.compat import on_device
 from .._scalarjit.digest import digest
 from ._block_lsq import Eliminated, eliminate
 from ._linearize import Linearization, half_cost
@@ -115,7 +117,7 @@ class LeastSquares(Optimizer):
         return "Levenberg-Marquardt" if self.damping else "Gauss-Newton"
 
     def init(self, problem: Problem, point: Unknowns, at: Linearization) -> Array:
-        return jnp.asarray(self.damping, point.x.dtype)
+        return on_device(self.damping, point.x.dtype)
 
     def step(self, problem: Problem, now: Iterate, i: int) -> Iterate | str:
         """A step that is refused leaves the point and raises the damping."""
@@ -123,7 +125,7 @@ class LeastSquares(Optimizer):
         assert at is not None
         eliminated = eliminate(at.blocks, damping)
         x, predicted = eliminated.step(damping)
-        gain = at.squares - float(predicted)
+        gain = at.squares - predicted
         # What is left of a cost that vanishes is rounding: a millionth of a standard error.
         if gain <= max(self.rtol * at.squares, 1e-12) and damping <= 1e-2:
             return "converged"
@@ -138,11 +140,11 @@ class LeastSquares(Optimizer):
             ratio = (at.cost - at_tried.cost) / gain
             # Nielsen's rule: trust more where the promise was kept.
             damping *= max(0.1, 1 - (2 * ratio - 1) ** 3)
-            return Iterate(tried, at_tried.cost, at_tried, jnp.asarray(damping, x.dtype))
+            return Iterate(tried, at_tried.cost, at_tried, on_device(damping, x.dtype))
         if _is_refined(problem, at):
             return "converged"
         damping = max(5 * damping, 1e-3)
-        return dataclasses.replace(now, state=jnp.asarray(damping, x.dtype)) if damping <= 1e8 else "stuck"
+        return dataclasses.replace(now, state=on_device(damping, x.dtype)) if damping <= 1e8 else "stuck"
 
 
 def _is_refined(problem: Problem, at: Linearization) -> bool:
@@ -151,7 +153,7 @@ def _is_refined(problem: Problem, at: Linearization) -> bool:
     n_r, n_unknown = problem.size
     known = problem.model.noise is not None or n_r <= n_unknown
     variance = 1.0 if known else at.squares / (n_r - n_unknown)
-    return at.squares - float(eliminate(at.blocks, 0.0).step(0.0)[1]) <= 0.01 * variance
+    return at.squares - eliminate(at.blocks, 0.0).step(0.0)[1] <= 0.01 * variance
 
 
 class DescentState(eqx.Module):
@@ -223,10 +225,11 @@ class GradientDescent(Optimizer):
         eliminated = eliminate(at.blocks, 0.0)
         if _is_minimum(at, eliminated, self.rtol):
             return "converged"
-        directions, unit, gradient = state.directions, state.unit, _gradient(eliminated)
+        directions, unit, gradient = np.asarray(state.directions), np.asarray(state.unit), _gradient(eliminated)
         if i == 0 or (self.refresh and i % self.refresh == 0):
             directions = _directions(eliminated, at.squares / problem.size[0] if self.refresh else None)
-        unit = unit if unit > 0 else jnp.linalg.norm(directions.T @ gradient)
+        unit = unit if unit > 0 else np.linalg.norm(directions.T @ gradient)
+        directions, unit = on_device(directions), on_device(unit)
         step, y, of_optax = _descend(self.transform)(directions, unit, gradient, state.of_optax, state.y)
         new = _guarded(problem, now.point, at, step, eliminated)
         if new is None:
@@ -253,26 +256,26 @@ def _descend(transform: optax.GradientTransformation) -> Callable[..., tuple[Arr
     return descend
 
 
-def _gradient(eliminated: Eliminated) -> Array:
+def _gradient(eliminated: Eliminated) -> np.ndarray:
     """Of half the sum of squares, nuisance values following."""
     A, r = eliminated.rows
     return A.T @ r
 
 
-def _directions(eliminated: Eliminated, variance: float | None) -> Array:
+def _directions(eliminated: Eliminated, variance: float | None) -> np.ndarray:
     """(A^T A)^(-1/2), (p, p): symmetric, so that momentum keeps its meaning when it is made anew."""
     A, _ = eliminated.rows
     if variance is None:
-        return jnp.eye(A.shape[1], dtype=A.dtype) / jnp.linalg.norm(A)
-    _, s, V = jnp.linalg.svd(A, full_matrices=False)
+        return np.eye(A.shape[1], dtype=A.dtype) / np.linalg.norm(A)
+    _, s, V = np.linalg.svd(A, full_matrices=False)
     # What the data do not determine may not run away: as if every parameter were known to about its scale.
-    floor = jnp.maximum(variance**0.5, 1e-6 * s[0]) + jnp.finfo(s.dtype).tiny
-    return (V.T / jnp.sqrt(s**2 + floor**2)[None, :]) @ V
+    floor = max(variance**0.5, 1e-6 * float(s[0])) + float(np.finfo(s.dtype).tiny)
+    return (V.T / np.sqrt(s**2 + floor**2)) @ V
 
 
 def _is_minimum(at: Linearization, eliminated: Eliminated, rtol: float) -> bool:
     """Whether the linearized problem promises to lower the cost by less than `rtol` of it."""
-    return at.squares - float(eliminated.step(1e-9)[1]) <= max(rtol * at.squares, 1e-12)
+    return at.squares - eliminated.step(1e-9)[1] <= max(rtol * at.squares, 1e-12)
 
 
 def _guarded(problem: Problem, point: Unknowns, at: Linearization, step: Array, eliminated: Eliminated):
@@ -355,7 +358,7 @@ class BFGS(Optimizer):
         at = problem.linearize(best.point) if best.at is None else best.at
         if at is None or not usable(at):
             return best, status
-        to_gain = at.squares - float(eliminate(at.blocks, 0.0).step(1e-9)[1])
+        to_gain = at.squares - eliminate(at.blocks, 0.0).step(1e-9)[1]
         if status == "converged" and to_gain > 0.01 * at.squares:
             # Steps also become short before what cannot be simulated: no minimum while others would lower the cost.
             status = "stuck"

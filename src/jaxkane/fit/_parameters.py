@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 from .._common.lookup import as_names, hint, real_number, refuse_unknown
 from .._kane.rhs import output_names
 from .._scalarjit.cache_key import jit
+from .._scalarjit.compat import on_device
 from .._system.parameters import ANY, ParameterInfo, declared, leaf_name, learned_part, names_of_leaf
 from .._system.system import System, unit_of, units_of
 from ._bijections import Interval, PossibleBody
@@ -272,7 +273,7 @@ def parameters_of(
     if twice:
         raise ValueError(f"`free` names {', '.join(sorted(set(twice)))} twice, or ties it too: {', '.join(names)}.")
     priors = [prior if prior else (0.0, math.inf) for part in parts for prior in part[4]]
-    array = lambda numbers: jnp.asarray(np.array(numbers, float), jnp.result_type(float))  # noqa: E731
+    array = lambda numbers: on_device(numbers, jnp.result_type(float))  # noqa: E731
     return Parameters(
         all_entries=tuple(entries),
         bijections=tuple(part[1] for part in parts),
@@ -281,8 +282,8 @@ def parameters_of(
         scale=array([s for part in parts for s in part[3]]),
         prior_mean=array([mean for mean, _ in priors]),
         prior_deviation=array([deviation for _, deviation in priors]),
-        places=jnp.arange(len(entries), dtype=jnp.int32),
-        rest=jnp.zeros(len(entries), jnp.result_type(float)),
+        places=on_device(np.arange(len(entries)), np.int32),
+        rest=array(np.zeros(len(entries))),
     )
 
 

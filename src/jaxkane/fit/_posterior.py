@@ -104,7 +104,7 @@ def laplace(fit: Fit) -> Laplace:
             f"These data do not determine {', '.join(undetermined)}: give a prior, or leave something out."
         )
     eliminated = eliminate(fit.linearization.blocks, 0.0)
-    to_gain = fit.linearization.squares - float(eliminated.step(1e-9)[1])
+    to_gain = fit.linearization.squares - eliminated.step(1e-9)[1]
     if fit.status == "validated" or not to_gain < 0.1:
         raise ValueError(
             f"This is no minimum ({fit.status}): a step would lower the sum of squares by {to_gain:.3g}. Go on with "
@@ -155,16 +155,16 @@ def log_nuisance_priors(problem: Problem) -> float:
 
 def _log_volume(fit: Fit, eliminated: Eliminated, s: np.ndarray) -> float:
     """1/2 log det(2 pi C) of all unknowns in their units; those that have no density at all are left out."""
-    z, b = (np.asarray(x) for x in eliminated.informed)
+    z, b = eliminated.informed
     number = s.size + np.count_nonzero(z) + np.count_nonzero(b)
-    log_information = 2 * np.sum(np.log(s)) + float(eliminated.log_determinant)
+    log_information = 2 * np.sum(np.log(s)) + eliminated.log_determinant
     to_units = float(fit.parameters.log_determinant(fit.point.x))
     return 0.5 * number * LOG_2PI - 0.5 * log_information + to_units
 
 
 def _undetermined_nuisance(problem: Problem, eliminated: Eliminated) -> str:
     """The starts and biases that have neither data nor a prior, in words: nothing bounds their posterior."""
-    z, b = (np.asarray(x) for x in eliminated.informed)  # (T, m, n_z), (T, n_b)
+    z, b = eliminated.informed  # (T, m, n_z), (T, n_b)
     counts, n = np.append(problem.active_windows, False)[np.asarray(problem.by_trial)], problem.model.nuisance  # (T, m)
     names = [name for j, name in enumerate(n.start) if np.any(counts & ~z[..., j])]
     names += [" ".join(pair) for j, pair in enumerate(n.trial) if np.any(counts.any(axis=1) & ~b[:, j])]
@@ -188,6 +188,6 @@ def marginal_likelihood(fit: Fit) -> float:
     refuse_other(fit, Fit, "marginal_likelihood", "marginal_likelihood(fit(...))")
     problem, priors = fit.problem, float(np.sum(np.asarray(fit.parameters.prior_residuals(fit.point.x)) ** 2))
     eliminated = eliminate(fit.linearization.blocks, 0.0)
-    number = sum(int(np.count_nonzero(x)) for x in eliminated.informed)
-    volume = 0.5 * number * LOG_2PI - 0.5 * float(eliminated.log_determinant)
+    number = sum(map(np.count_nonzero, eliminated.informed))
+    volume = 0.5 * number * LOG_2PI - 0.5 * eliminated.log_determinant
     return log_likelihood(problem, fit.cost - priors) + log_nuisance_priors(problem) + volume

@@ -20,6 +20,7 @@ from .._integrate.trajectory import Trajectory
 from .._kane.assemble import AssemblyProblem, NoConfiguration, euler_parameters
 from .._kane.constraints import has_configuration_constraints
 from .._kane.rhs import output_names
+from .._scalarjit.compat import on_device
 from .._system.system import System
 from ..estimate._process_noise import noise_of
 from ._declarations import Prior
@@ -164,8 +165,8 @@ def start_assembly(system: System, trials: Sequence[Trial], unknown: Sequence[st
     quaternions = tuple(four for four, names in fours if all(names <= known for known in by_trial))
     moved = AssemblyProblem.of(system, dict.fromkeys(named, 0.0)).moved
     guess = AssemblyProblem.of(system, dict.fromkeys([c for c in named if c not in unknown], 0.0)).guess
-    q = jnp.zeros(len(system.coordinates))
-    if system.dependent_coordinates or not has_configuration_constraints(system, jnp.zeros(()), q):
+    t, q = (on_device(np.zeros(shape), jnp.result_type(float)) for shape in ((), len(system.coordinates)))
+    if system.dependent_coordinates or not has_configuration_constraints(system, t, q):
         return StartAssembly(None, quaternions, guess)
     for trial, names in zip(trials, by_trial, strict=True):
         missing = [c for c in named if c not in names]
@@ -196,7 +197,7 @@ def nuisance_of(spec: ProblemSpec, channels: Sequence[str], sampled: Sequence[st
     independent = tuple(c for c in system.coordinates if c not in system.dependent_coordinates or c in turned)
     start = checked_names(system, "unknown", spec.unknown, (*independent, *system.speeds, *system.states))
     defects = checked_names(system, "defect_std", spec.defect_std or {}, tuple(start))
-    array = lambda numbers: jnp.asarray(np.array(list(numbers), float), jnp.result_type(float))  # noqa: E731
+    array = lambda numbers: on_device([*numbers], jnp.result_type(float))  # noqa: E731
     return Nuisance(
         start=tuple(start),
         trial=tuple(trial),
@@ -216,7 +217,7 @@ def reach_of(trials: Sequence[Trial], parameters: Parameters, nuisance: Nuisance
         return np.inf, np.inf
     shortest = min(trials, key=lambda trial: np.ptp(trial.t))
     reaches = [(0.0, 0.0)]
-    for entry, start, owner in zip(parameters.entries, parameters.start, parameters.owners, strict=True):
+    for entry, start, owner in zip(parameters.entries, np.asarray(parameters.start), parameters.owners, strict=True):
         if entry.role is None or entry.role[0] != "delay of input":
             continue
         lower, upper = (float(getattr(parameters.bijections[owner], end)) for end in ("lower", "upper"))
@@ -303,7 +304,7 @@ class Problem:
             system=system,
             parameters=parameters,
             nuisance=nuisance,
-            settings=simulation.settings(windows.t[0], varying or noise is not None),
+            settings=simulation.settings(np.asarray(windows.t)[0], varying or noise is not None),
             channels=channels,
             sampled_inputs=sampled,
             zero_order_hold=tuple(checked_names(system, "zero_order_hold", spec.zero_order_hold, system.inputs)),
@@ -322,9 +323,9 @@ class Problem:
 
         Where the constraints cannot be met there is nothing to check: a fit says of which windows.
         """
-        first = jax.tree.map(lambda x: jnp.asarray(np.asarray(x)[0]), self.windows)
+        first, z = jax.tree.map(lambda x: np.asarray(x)[0], (self.windows, point.z))
         with contextlib.suppress(NoConfiguration):
-            self.model.consistent(first, point.z[0], point.x)  # which checks the system there
+            self.model.start(first, z, point.x)  # which checks the system there
 
     @property
     def cost_name(self) -> str:
@@ -347,7 +348,7 @@ class Problem:
     def start(self) -> Unknowns:
         """No parameter changed, no bias, every window starts as it was measured."""
         p, T, W = len(self.parameters.entries), len(self.trials), len(self.slices)
-        zeros = lambda *shape: jnp.asarray(np.zeros(shape, self.windows.t.dtype))  # noqa: E731
+        zeros = lambda *shape: on_device(np.zeros(shape, self.windows.t.dtype))  # noqa: E731
         return Unknowns(zeros(p), zeros(T, len(self.model.nuisance.trial)), zeros(W, len(self.model.nuisance.start)))
 
     def at(self, values: Mapping[str, float], point: Unknowns | None = None) -> Unknowns:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .._scalarjit.compat import on_device
 from .._system.system import System
 from ._trial import Trial
 
@@ -65,7 +66,7 @@ class Windows(eqx.Module):
         owner = np.asarray(self.trial)
         own = [np.flatnonzero(owner == k) for k in range(owner.max() + 1)]
         most = max(map(len, own))
-        return jnp.asarray([np.append(i, np.full(most - len(i), len(owner))) for i in own], dtype=jnp.int32)
+        return on_device([np.append(i, np.full(most - len(i), len(owner))) for i in own], np.int32)
 
 
 def cut(
@@ -119,15 +120,15 @@ def cut(
     owner = np.array([k for k, _, _ in places])
     span = np.ptp(columns["t"], axis=1) + 2 * np.array(columns["step"])
     longest = {k: span[owner == k].max() for k in owner.tolist()}
-    array = lambda x: jnp.asarray(np.array(x), dtype=jnp.result_type(float))  # noqa: E731
+    array = lambda x: on_device(x, jnp.result_type(float))  # noqa: E731
     windows = Windows(
         **{key: array(value) for key, value in columns.items()},
         start=array(start),
         next_start=array(np.append(start[1:], start[-1:], axis=0)),
         linked=array(np.array(linked, float)),
-        trial=jnp.asarray(owner, dtype=jnp.int32),
-        first=jnp.asarray(np.append(True, owner[1:] != owner[:-1])),
-        very_first=jnp.asarray(np.arange(len(owner)) == 0),
+        trial=on_device(owner, np.int32),
+        first=on_device(np.append(True, owner[1:] != owner[:-1])),
+        very_first=on_device(np.arange(len(owner)) == 0),
         n_acting=min(n_in, max(_most_within(trials[k].t, lasts) for k, lasts in longest.items())),
     )
     return windows, tuple(places)
