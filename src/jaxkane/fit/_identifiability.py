@@ -261,7 +261,7 @@ def _direction(of: Identifiability, i: int, row: np.ndarray) -> Direction:
     if len(parts) == 1 and first in of.at_bound:
         text = f"{first} has gone to its bound: the data want it beyond. It may be making up for what the model lacks."
     elif len(parts) == 1 and first in of.without_influence:
-        text = f"{first} has no influence on these data; it stays at its start."
+        text = f"{first} has no influence on these data with these values: a fit does not move it from here."
     elif len(parts) == 1 and s == 0:
         text = f"{first} cannot be distinguished from the unknown starts and biases."
     elif len(parts) == 1:
