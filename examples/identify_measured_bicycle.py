@@ -14,8 +14,8 @@ sum of squares falls with each number that is freed; whether the prediction gets
 
 Run:      python examples/identify_measured_bicycle.py [--out FOLDER]
           The rides are shipped with the library (`jaxkane.data.steer_by_wire`).
-Appears:  a table for each fit with what is suspicious about it; the costs of fitted and of held-out rides; and
-          identify_measured_bicycle.html: the full report of the first, with trials left out.
+Appears:  a table for each fit with what is suspicious about it; the fits beside each other, with the rides held out;
+          and identify_measured_bicycle.html: the full report of the first, with trials left out.
 Takes:    about a minute, half of it compilation.
 """
 
@@ -28,12 +28,12 @@ from jaxkane.fit import (
     Gain,
     LeastSquares,
     bicycle_rides,
+    compare,
     cross_validate,
     fit_bicycle,
     frame_inertia,
     profile,
     save_report,
-    validate,
 )
 
 HELD_OUT = 5.0  # [m/s]
@@ -49,11 +49,11 @@ FREE = {
 }
 
 
-def check(fits, costs):
+def check(comparison):
     """The errors and estimates that these rides give. No test repeats these fits."""
-    (first, four, five, _), (damping, *richer) = fits.values(), costs.values()
-    assert all(fit.status == "converged" for fit in fits.values())
-    assert damping[0] < 136 < 600 < first.history[0] / len(first.trial_names)
+    fits = first, four, five, _ = list(comparison.fits.values())
+    assert all(fit.status == "converged" for fit in fits)
+    assert first.cost < 3000 < 15000 < first.history[0]
     assert abs(first.estimates["steer_damping"] - 0.535) < 0.01
     assert any("not noise" in note for note in first.notes)
     # What no fork can be is said, and what no such bicycle has.
@@ -61,8 +61,9 @@ def check(fits, costs):
     assert any(note.startswith("c went to") and "implausible" in note for note in four.notes)
     assert any("Not a possible body" in note and "rear frame" in note for note in five.notes)
     # All fit better than the damping alone; two predict worse.
-    assert all(fitted < damping[0] for fitted, _ in richer)
-    assert [held_out < damping[1] for _, held_out in richer] == [True, False, False]
+    assert all(fit.cost < first.cost for fit in fits[1:])
+    damping, *richer = (fit.cost for fit in comparison.held_out.values())
+    assert [cost < damping for cost in richer] == [True, False, False]
 
 
 def main():
@@ -72,21 +73,17 @@ def main():
     jk.configure()
     recording = jk.data.steer_by_wire()
     bicycle = WhippleBicycle.from_parameters(recording.parameters)
-    speeds = [ride.initial["speed"][0] for ride in recording.trials]
-    rides = [ride for ride, speed in zip(recording.trials, speeds, strict=True) if speed != HELD_OUT]
-    unseen = [ride for ride, speed in zip(recording.trials, speeds, strict=True) if speed == HELD_OUT]
+    rides = [ride for ride in recording.trials if ride.initial["speed"][0] != HELD_OUT]
+    unseen = [ride for ride in recording.trials if ride.initial["speed"][0] == HELD_OUT]
     # The steering torque is a command, kept until the next.
     options = {"input_bias": ("roll_torque", "steer_torque"), "zero_order_hold": ("steer_torque",)}
-    fits, costs = {}, {}
+    fits = {}
     for what, free in FREE.items():
-        fits[what] = fit = fit_bicycle(rides, bicycle, free, optimizer=LeastSquares(), **options)
-        held_out = validate(fit, bicycle_rides(unseen, bicycle))
-        costs[what] = (fit.cost / len(rides), held_out.cost / len(unseen))
-        print(f"\n{what[0].upper()}{what[1:]}\n{fit}")
-    print(f"\n{'cost of a ride':<52}{'2 to 4 m/s, fitted':>20}{f'{HELD_OUT:.0f} m/s, held out':>20}")
-    for what, (fitted, predicted) in costs.items():
-        print(f"{what:<52}{fitted:20.1f}{predicted:20.1f}")
-    check(fits, costs)
+        fits[what] = fit_bicycle(rides, bicycle, free, optimizer=LeastSquares(), **options)
+        print(f"\n{what[0].upper()}{what[1:]}\n{fits[what]}")
+    comparison = compare(fits, held_out=bicycle_rides(unseen, bicycle))
+    print(f"\n{comparison}")
+    check(comparison)
     first = fits["the damping alone"]
     left_out, likelihood = cross_validate(first), profile(first, "steer_damping")
     low, high = likelihood.interval

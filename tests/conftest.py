@@ -4,7 +4,9 @@ How to run them:
 
     pytest                        everything, in as many processes as there are cores, four at most
     pytest tests/system/test_vectors.py  a file or a test, in this process
-    JAXKANE_TEST_CACHE=FOLDER     keeps the compiled programs for the next run; by default they go with this one
+    pytest --cache-clear          compiles every program anew; by default they are kept for the next run, as pytest keeps
+                                  what it knows, and thrown away where they have become many
+    JAXKANE_TEST_CACHE=FOLDER     keeps them elsewhere
     JAXKANE_TEST_CACHE=0          keeps none, and leaves XLA as a user has it
     pytest -m ""                  the slow ones too, and with XLA's optimizations
     JAXKANE_VALIDATION=docs/validation.md pytest -m published    writes the table of published figures
@@ -26,7 +28,7 @@ import touched
 import jaxkane as jk
 from jaxkane._scalarjit.backends import native as native_kernels
 
-CACHE = "JAXKANE_TEST_CACHE"
+CACHE, MOST_PROGRAMS = "JAXKANE_TEST_CACHE", 500_000_000  # bytes
 
 # Most of the tests' time is compilation, and with XLA's newer way to write fused loops it takes a third longer. From
 # JAX 0.11 on there is no other way, and XLA ends a process at a flag that it does not know.
@@ -43,8 +45,7 @@ def pytest_xdist_auto_num_workers(config):
 def pytest_configure(config):
     # Set by the process that the user started, and inherited by those that pytest-xdist starts.
     if CACHE not in os.environ:
-        os.environ[CACHE] = folder = tempfile.mkdtemp(prefix="jaxkane-programs-")
-        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+        os.environ[CACHE] = str(_folder_of_programs(config))
     kept = os.environ[CACHE]
     jk.configure(cache=False if kept == "0" else kept, verbose=False)
     if kept != "0" and config.option.markexpr == "not slow":
@@ -56,6 +57,19 @@ def pytest_configure(config):
     # A trace makes a million small objects, most of which live on: to look through all of them again and again took a
     # tenth of the tests' time.
     gc.set_threshold(100_000, 50, 50)
+
+
+def _folder_of_programs(config):
+    """In pytest's own cache; a folder of this run alone where that is switched off."""
+    if not hasattr(config, "cache"):
+        folder = tempfile.mkdtemp(prefix="jaxkane-programs-")
+        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+        return folder
+    folder = config.cache.mkdir("programs")
+    if sum(file.stat().st_size for file in folder.rglob("*") if file.is_file()) > MOST_PROGRAMS:
+        shutil.rmtree(folder)
+        folder.mkdir()
+    return folder
 
 
 def pytest_collection_finish():
