@@ -40,6 +40,7 @@ try:
 
     _ = Jaxpr.replace, Jaxpr.eqns, Jaxpr.invars, Jaxpr.constvars, Jaxpr.outvars
     _ = JaxprEqn.replace, JaxprEqn.primitive, JaxprEqn.params, JaxprEqn.invars, JaxprEqn.outvars, JaxprEqn.effects
+    _ = ad.primitive_transposes, ad.UndefinedPrimal, ad.Zero
     _ = ClosedJaxpr.jaxpr, ClosedJaxpr.consts, ClosedJaxpr.in_avals, ClosedJaxpr.out_avals, Primitive.get_bind_params
 except (ImportError, AttributeError) as error:
     MISSING = f"this JAX lacks what that needs ({error})"
@@ -122,6 +123,29 @@ def evaluated(equation: Any, inputs: Sequence[Any]) -> Sequence[Any]:
     primitive = equation.primitive
     results = primitive.bind(*inputs, **primitive.get_bind_params(equation.params))
     return results if primitive.multiple_results else [results]
+
+
+def transposed(equation: Any, inputs: Sequence[Any], moves: Sequence[bool], cotangents: Sequence[Any]) -> Sequence[Any]:
+    """The cotangents, by input, of an equation that is linear in those of its inputs that move, of the cotangents of
+    its results. What is None is zero. Inputs that move have no values."""
+    primitive, xs = equation.primitive, list(inputs)
+    cts = [ad.Zero(v.aval) if ct is None else ct for v, ct in zip(equation.outvars, cotangents, strict=True)]
+    if primitive in ad.primitive_transposes:
+        for i, v in enumerate(equation.invars):
+            xs[i] = ad.UndefinedPrimal(v.aval) if moves[i] else xs[i]
+        rule, of_results = ad.primitive_transposes[primitive], cts if primitive.multiple_results else cts[0]
+        results = rule(of_results, *xs, **equation.params)
+        return [None if is_no_tangent(ct) else ct for ct in results]
+    places = [i for i, is_one in enumerate(moves) if is_one]
+
+    def linear(*ys: Any) -> Sequence[Any]:
+        values = dict(zip(places, ys, strict=True))
+        return evaluated(equation, [values.get(i, x) for i, x in enumerate(xs)])
+
+    specs = [jax.ShapeDtypeStruct(equation.invars[i].aval.shape, equation.invars[i].aval.dtype) for i in places]
+    of_places = jax.linear_transpose(linear, *specs)([*map(instantiate_zeros, cts)])
+    by_place = dict(zip(places, of_places, strict=True))
+    return [by_place.get(i) for i in range(len(xs))]
 
 
 def programs_in(equation: Any) -> list[Any]:

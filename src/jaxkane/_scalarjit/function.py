@@ -52,6 +52,7 @@ from .jaxpr import (
     replaced,
     specs_of,
     tangent_program,
+    transposed_program,
     unsupported_primitives,
 )
 
@@ -330,15 +331,7 @@ class Program:
         """(the other inputs, cotangents of the outputs) -> cotangents of the linear inputs."""
         places = [i for i, is_linear in enumerate(linear) if is_linear]
         fixed = [i for i, is_linear in enumerate(linear) if not is_linear]
-        specs = specs_of(self.in_avals)
-
-        def cotangents(*args):
-            known, cts = args[: len(fixed)], args[len(fixed) :]
-            full = replaced([None] * len(linear), fixed, known)
-            of_linear = lambda *ys: self.evaluate(*replaced(full, places, ys))  # noqa: E731
-            return jax.linear_transpose(of_linear, *[specs[i] for i in places])(list(cts))
-
-        program = program_of(cotangents, *[specs[i] for i in fixed], *specs_of(self.out_avals))
+        program = transposed_program(self.program, places)
         invariant = frozenset(j for j, i in enumerate(fixed) if i in self.loop_invariant)
         return Program(program, self.label, invariant, once=self.once)
 

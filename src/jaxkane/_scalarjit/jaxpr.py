@@ -12,7 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .compat import ClosedJaxpr, Jaxpr, dce_jaxpr, interpret, is_literal, jaxpr_as_fun, new_variable, types_of
+from .compat import (
+    ClosedJaxpr,
+    Jaxpr,
+    dce_jaxpr,
+    evaluated,
+    interpret,
+    is_literal,
+    jaxpr_as_fun,
+    new_variable,
+    transposed,
+    types_of,
+)
 from .graph import CALLS, Graph, applied, as_constants
 
 _LONGEST, _LARGEST = 64, 4096  # sum, number of products
@@ -199,6 +210,44 @@ def tangent_program(program: ClosedJaxpr, moving: Sequence[int]) -> ClosedJaxpr:
         return [dy for dy, aval in zip(dys, outputs, strict=True) if is_inexact(aval)]
 
     return program_of(tangents, specs, [specs[i] for i in moving])
+
+
+def transposed_program(program: ClosedJaxpr, linear: Sequence[int]) -> ClosedJaxpr:
+    """(the other inputs, cotangents of the outputs) -> cotangents of the inputs at the places `linear`.
+
+    `jax.linear_transpose` would trace the program once more before it begins, which takes longer than all the rest.
+    """
+    jaxpr: Any = program.jaxpr
+    places = [i for i in range(len(jaxpr.invars)) if i not in linear]
+    inputs, outputs = types_of(program)
+
+    def cotangents(known: Sequence[Any], cts: Sequence[Any]) -> list[Any]:
+        values = dict(zip(jaxpr.constvars, program.consts, strict=True))
+        values.update(zip([jaxpr.invars[i] for i in places], known, strict=True))
+        read = lambda v: v.val if is_literal(v) else values.get(v)  # noqa: E731
+        moved, moving = {jaxpr.invars[i] for i in linear}, []
+        for equation in jaxpr.eqns:
+            if any(not is_literal(v) and v in moved for v in equation.invars):
+                moving.append(equation)
+                moved.update(equation.outvars)
+            else:
+                values.update(zip(equation.outvars, evaluated(equation, [*map(read, equation.invars)]), strict=True))
+        sums: dict[Any, Any] = {}
+
+        def add(variables: Sequence[Any], cts: Sequence[Any]) -> None:
+            for v, ct in zip(variables, cts, strict=True):
+                if ct is not None and not is_literal(v) and v in moved:
+                    sums[v] = sums[v] + ct if v in sums else ct
+
+        add(jaxpr.outvars, cts)
+        for equation in reversed(moving):
+            cts = [sums.pop(v, None) for v in equation.outvars]
+            if any(ct is not None for ct in cts):
+                along = [not is_literal(v) and v in moved for v in equation.invars]
+                add(equation.invars, transposed(equation, [*map(read, equation.invars)], along, cts))
+        return [sums.get(jaxpr.invars[i], jnp.zeros(inputs[i].shape, inputs[i].dtype)) for i in linear]
+
+    return program_of(cotangents, specs_of([inputs[i] for i in places]), specs_of(outputs))
 
 
 Direction = tuple[int, int]  # an argument and the place of the element in it
