@@ -18,7 +18,7 @@ from .._kane.kanes_method import KaneEquations
 from .._kane.rhs import outputs_at, rates_are_native, values_of, vector_field
 from .._scalarjit.cache_key import captured_tracers, captures_any, jit
 from .._scalarjit.components import as_vector
-from .._scalarjit.function import ScalarFunction
+from .._scalarjit.function import Packed, ScalarFunction, tree_of
 from .._scalarjit.nan import all_finite, derivative_free_where_not_finite, flat, nan_derivative_where, nan_where
 from .._system.parameters import ANY, ParameterInfo, parameters_in
 from .._system.system import State, System, names_of, packed, units_of, unpacked
@@ -177,6 +177,10 @@ def solve(
     # What is not finite must not enter the solver, where it would spoil the gradient of what is shared. In its steps
     # what all members of a batch share remains shared, of which a kernel computes its part once.
     stepped = replace_invalid_parameters(system)
+    if not isinstance(settings.adjoint, diffrax.ForwardMode):
+        # In reverse mode the cotangent of each number would be a sum of its own, in each of the loops. In forward mode
+        # they stay apart, since in a batch some of them may be shared.
+        stepped = Packed.of(stepped, state.q.dtype)
     system, state = where_valid(valid, (system, state))
     signals = mask_invalid_inputs(signals, valid)
     constrained = has_configuration_constraints(system, times.start, state.q)
@@ -267,12 +271,13 @@ def _rates(valid: Array, stabilize: float) -> Callable[..., Any]:
     """(t, y, args) -> y_dot, zero where no motion can begin. `stabilize` [1/s]: how fast constraints are led back."""
 
     def rates(t: Array, y: Array, args: Any) -> Array:
-        system, signals, disturbance = args
+        packed_system, signals, disturbance = args
+        system = tree_of(packed_system)
         state = unpacked(system, y)
         inputs, extra = inputs_at(system, signals, t, state), None
         if disturbance is not None:
             inputs, extra = disturbance(t, inputs, state)
-        y_dot = vector_field(system, t, y, inputs)
+        y_dot = vector_field(packed_system, t, y, inputs)
         if extra is not None:
             y_dot += packed(extra)
         if stabilize:
@@ -302,7 +307,7 @@ def _integrated(problem: InitialValueProblem) -> Solution:
         problem.start,
         problem.args,
         stepsize_controller=controller_of(
-            times, problem.rates, problem.events, stepped, problem.discontinuities, settings
+            times, problem.rates, problem.events, problem.system, problem.discontinuities, settings
         ),
         **saveat_and_adjoint(problem.ts, settings.adjoint, as_given=settings.progress),
         max_steps=settings.max_steps,

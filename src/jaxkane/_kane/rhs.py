@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 from .._common.lookup import not_there, refuse_unknown
 from .._scalarjit.components import Component, add3, as_vector, component, cross, is_exact, is_written_out
-from .._scalarjit.function import ScalarFunction
+from .._scalarjit.function import ScalarFunction, tree_of
 from .._system.kinematics import Frame, Point, Vector
 from .._system.motion import Motion
 from .._system.system import NamedVector, State, System, has_outputs, packed, unpacked
@@ -219,8 +219,9 @@ def rates(system: System, t: Array, q: Array, u: Array, values: dict[str, Array]
 def vector_field(system: System, t: Array, y: Array, inputs: Mapping[str, Any]) -> Array:
     """The right-hand side as a solver asks for it: of a packed state (n_q + n_u + n_x,), packed, so that one array goes
     through the steps."""
+    packed_system, system = system, tree_of(system)
     if is_written_out(len(system.speeds)):
-        return _vector_field(system, t, y, dict(inputs))
+        return _vector_field(packed_system, t, y, dict(inputs))
     state = unpacked(system, y)
     values = values_of(system, state.x, inputs)
     q_dot, u_dot = motion_rates(system, t, state.q, state.u, values)
@@ -230,7 +231,7 @@ def vector_field(system: System, t: Array, y: Array, inputs: Mapping[str, Any]) 
 
 def rates_are_native(system: System, t: Array, y: Array, inputs: Mapping[str, Any]) -> bool:
     """Whether `vector_field` of these is one native kernel."""
-    return is_written_out(len(system.speeds)) and _vector_field.is_native(system, t, y, dict(inputs))
+    return is_written_out(len(tree_of(system).speeds)) and _vector_field.is_native(system, t, y, dict(inputs))
 
 
 def values_of(system: System, x: Array | None, inputs: Mapping[str, Any]) -> dict[str, Any]:

@@ -16,6 +16,7 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -134,6 +135,32 @@ _MOST_LANES = 128  # in XLA's hands: with more, intermediates no longer stay in 
 Where = tuple[tuple[bool, ...], ...]
 
 
+class Packed(eqx.Module):
+    """A tree whose single numbers are one array, which a loop carries, and whose cotangents it adds up, at once.
+
+    A `ScalarFunction` takes it for the tree. `others`: the tree without these numbers.
+    """
+
+    numbers: jax.Array  # (n,)
+    others: Any
+    structure: Any = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, tree: Any, dtype: Any) -> Any:
+        """The tree itself where it has no such numbers."""
+        single = lambda x: eqx.is_array(x) and x.shape == () and x.dtype == dtype  # noqa: E731
+        numbers, others = eqx.partition(tree, single)
+        leaves, structure = jax.tree.flatten(numbers)
+        return cls(jnp.stack(leaves), others, structure) if leaves else tree
+
+
+def tree_of(x: Any) -> Any:
+    """The tree that is `Packed`; any other as it is."""
+    if not isinstance(x, Packed):
+        return x
+    return eqx.combine(jax.tree.unflatten(x.structure, [*x.numbers]), x.others)
+
+
 class ScalarFunction:
     """A pure function at module level, as a decorator. It is traced once for each `CacheKey`, and evaluated by
 
@@ -162,7 +189,7 @@ class ScalarFunction:
         numbers, program = self.program(*args)
         if program is None:
             with explain_leaked_tracer(_label(args[0])):
-                return self.__wrapped__(*args)
+                return self.__wrapped__(*map(tree_of, args))
         return jax.tree.unflatten(program.structure, program(*numbers))
 
     def program(self, *args: Any) -> tuple[list[Any], Program | None]:
@@ -178,7 +205,7 @@ class ScalarFunction:
 
     def _traced(self, key: CacheKey, label: str) -> Program | None:
         f, unflatten = trace_with_snapshot(self.__wrapped__), functools.partial(jax.tree.unflatten, key.structure)
-        program, out = _jaxpr_of(lambda *leaves: f(*unflatten(leaves)), specs_of(key.types))
+        program, out = _jaxpr_of(lambda *leaves: f(*map(tree_of, unflatten(leaves))), specs_of(key.types))
         inside = list(unsupported_primitives(program.jaxpr))
         if any(where for _, where in inside):
             names = dict.fromkeys(name for name, where in inside if where)
@@ -275,6 +302,8 @@ def _jaxpr_of(f: Callable[..., Any], specs: Sequence[Any]) -> tuple[ClosedJaxpr,
 
 
 def _label(system: Any) -> str:
+    if isinstance(system, Packed):
+        system = system.others
     return "A function" if hasattr(system, "dtype") else type(system).__name__
 
 

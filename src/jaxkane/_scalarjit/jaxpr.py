@@ -16,7 +16,6 @@ from .compat import (
     ClosedJaxpr,
     Jaxpr,
     dce_jaxpr,
-    evaluated,
     interpret,
     is_literal,
     jaxpr_as_fun,
@@ -215,39 +214,49 @@ def tangent_program(program: ClosedJaxpr, moving: Sequence[int]) -> ClosedJaxpr:
 def transposed_program(program: ClosedJaxpr, linear: Sequence[int]) -> ClosedJaxpr:
     """(the other inputs, cotangents of the outputs) -> cotangents of the inputs at the places `linear`.
 
-    `jax.linear_transpose` would trace the program once more before it begins, which takes longer than all the rest.
+    Equations that do not depend on these are put down as they stand. `jax.linear_transpose` traces the whole program
+    twice, which takes longer than all that JAX does besides.
     """
     jaxpr: Any = program.jaxpr
-    places = [i for i in range(len(jaxpr.invars)) if i not in linear]
     inputs, outputs = types_of(program)
+    moved: set[Any] = {jaxpr.invars[i] for i in linear}
+    moves = lambda v: not is_literal(v) and v in moved  # noqa: E731
+    known, moving = [], []
+    for equation in jaxpr.eqns:
+        if any(map(moves, equation.invars)):
+            moving.append(equation)
+            moved.update(equation.outvars)
+        else:
+            known.append(equation)
+    read = list(dict.fromkeys(v for e in moving for v in e.invars if not is_literal(v) and v not in moved))
 
-    def cotangents(known: Sequence[Any], cts: Sequence[Any]) -> list[Any]:
-        values = dict(zip(jaxpr.constvars, program.consts, strict=True))
-        values.update(zip([jaxpr.invars[i] for i in places], known, strict=True))
-        read = lambda v: v.val if is_literal(v) else values.get(v)  # noqa: E731
-        moved, moving = {jaxpr.invars[i] for i in linear}, []
-        for equation in jaxpr.eqns:
-            if any(not is_literal(v) and v in moved for v in equation.invars):
-                moving.append(equation)
-                moved.update(equation.outvars)
-            else:
-                values.update(zip(equation.outvars, evaluated(equation, [*map(read, equation.invars)]), strict=True))
-        sums: dict[Any, Any] = {}
+    def cotangents(values: Sequence[Any], cts_of_outputs: Sequence[Any]) -> list[Any]:
+        value_of, sums = dict(zip(read, values, strict=True)), {}
 
         def add(variables: Sequence[Any], cts: Sequence[Any]) -> None:
             for v, ct in zip(variables, cts, strict=True):
-                if ct is not None and not is_literal(v) and v in moved:
+                if ct is not None and moves(v):
                     sums[v] = sums[v] + ct if v in sums else ct
 
-        add(jaxpr.outvars, cts)
+        add(jaxpr.outvars, cts_of_outputs)
         for equation in reversed(moving):
             cts = [sums.pop(v, None) for v in equation.outvars]
             if any(ct is not None for ct in cts):
-                along = [not is_literal(v) and v in moved for v in equation.invars]
-                add(equation.invars, transposed(equation, [*map(read, equation.invars)], along, cts))
+                xs = [v.val if is_literal(v) else value_of.get(v) for v in equation.invars]
+                add(equation.invars, transposed(equation, xs, [*map(moves, equation.invars)], cts))
         return [sums.get(jaxpr.invars[i], jnp.zeros(inputs[i].shape, inputs[i].dtype)) for i in linear]
 
-    return program_of(cotangents, specs_of([inputs[i] for i in places]), specs_of(outputs))
+    traced = program_of(cotangents, specs_of([v.aval for v in read]), specs_of(outputs))
+    inner: Any = traced.jaxpr
+    stands_for = dict(zip(inner.invars, read, strict=False))
+    of_program = lambda vs: [v if is_literal(v) else stands_for.get(v, v) for v in vs]  # noqa: E731
+    whole = jaxpr.replace(
+        constvars=[*jaxpr.constvars, *inner.constvars],
+        invars=[*(v for i, v in enumerate(jaxpr.invars) if i not in linear), *inner.invars[len(read) :]],
+        eqns=[*known, *(e.replace(invars=of_program(e.invars)) for e in inner.eqns)],
+        outvars=of_program(inner.outvars),
+    )
+    return ClosedJaxpr(whole, [*program.consts, *traced.consts])
 
 
 Direction = tuple[int, int]  # an argument and the place of the element in it
