@@ -15,7 +15,8 @@ from jaxkane._scalarjit.function import ScalarFunction
 
 USED = {
     "jax.extend.core": "ClosedJaxpr Jaxpr JaxprEqn Primitive jaxpr_as_fun get_opaque_trace_state",
-    "jax.interpreters.ad": "Zero instantiate_zeros is_undefined_primal primitive_jvps primitive_transposes",
+    "jax.interpreters.ad": "Zero UndefinedPrimal instantiate_zeros is_undefined_primal primitive_jvps "
+    "primitive_transposes",
     "jax.interpreters.batching": "primitive_batchers",
     "jax.interpreters.mlir": "lower_fun register_lowering",
     "jax.interpreters.partial_eval": "dce_jaxpr",

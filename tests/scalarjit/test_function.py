@@ -13,9 +13,10 @@ import pytest
 
 from jaxkane._scalarjit import function
 from jaxkane._scalarjit.backends import xla
+from jaxkane._scalarjit.compat import jaxpr_as_fun
 from jaxkane._scalarjit.components import determinant, solve
-from jaxkane._scalarjit.function import ScalarFunction
-from jaxkane._scalarjit.jaxpr import cse
+from jaxkane._scalarjit.function import Packed, ScalarFunction, tree_of
+from jaxkane._scalarjit.jaxpr import cse, transposed_program
 
 
 def plain(a, b, x):
@@ -272,6 +273,44 @@ def of_two(a, b):
 @ScalarFunction
 def with_a_constant(b):
     return jnp.ones(()), 2.0 * b
+
+
+def moving_about(a, x, y):
+    """What only carries numbers from place to place, products with what stands still, and results that are inputs."""
+    z = jnp.concatenate([a * x[1:3], x[::2] / (1.0 + a * a), jnp.stack([y, -y])])
+    z = jax.lax.pad(z.reshape(3, 2).T, 0.0, ((1, 0, 0), (0, -1, 0)))
+    z = jnp.where(a > 0, z, 2.0 * z) + jnp.broadcast_to(y, z.shape) - z[0, 0]
+    return z, jnp.sum(z * jnp.cos(a), axis=1), x, y * 0.0 + x[2] + x[2], jnp.sin(a)
+
+
+def test_a_program_is_transposed_as_jax_transposes_it():
+    rtol = 1e-14
+    x, y, unused = jnp.arange(1.0, 5.0), jnp.array(0.7), jnp.array(3.0)
+    for a in (0.4, -0.4):
+        linear = functools.partial(moving_about, jnp.array(a))
+        cts = [jnp.cos(jnp.arange(1.0, out.size + 1.0)).reshape(out.shape) for out in linear(x, y)]
+        cts[-1] = jnp.zeros(())  # of what does not follow from them
+        expected = jax.vjp(linear, x, y)[1](tuple(cts))
+        traced = cse(jax.make_jaxpr(lambda a, x, y, z: moving_about(a, x, y))(a, x, y, unused))
+        found = jaxpr_as_fun(transposed_program(traced, [1, 2, 3]))(jnp.array(a), *cts)
+        for ours, theirs in zip(found, (*expected, jnp.zeros(())), strict=True):
+            np.testing.assert_allclose(ours, theirs, rtol=rtol)
+
+
+def test_packed_numbers_are_the_tree(kernels):
+    rtol = 1e-14
+    tree = {"a": jnp.array(0.7), "b": [jnp.array(-1.2), None], "x": jnp.array([0.3, 0.9]), "n": jnp.array(2.0, jnp.float32)}
+    f = ScalarFunction(lambda tree, y: plain(tree["a"], tree["b"][0], tree["x"] * y)[0])
+    value = lambda tree: f(Packed.of(tree, jnp.float64), jnp.array(1.5)).sum()  # noqa: E731
+    packed = Packed.of(tree, jnp.float64)
+    assert packed.numbers.shape == (2,)
+    assert eqx.tree_equal(tree_of(packed), tree)
+    np.testing.assert_allclose(f(packed, jnp.array(1.5)), f(tree, jnp.array(1.5)), rtol=rtol)
+    moving, rest = eqx.partition(tree, eqx.is_inexact_array)
+    of = lambda value: jax.grad(lambda moving: value(eqx.combine(moving, rest)))(moving)  # noqa: E731
+    ours, theirs = of(value), of(lambda tree: f(tree, jnp.array(1.5)).sum())
+    jax.tree.map(functools.partial(np.testing.assert_allclose, rtol=rtol), ours, theirs)
+    assert Packed.of({"x": jnp.ones(2)}, jnp.float64) == {"x": pytest.approx(jnp.ones(2))}
 
 
 def test_what_members_share_remains_shared():
