@@ -103,19 +103,22 @@ def ours(call: str) -> Callable[[], Any]:
     import dataclasses
 
     import jax
+    import jax.numpy as jnp
     import numpy as np
 
     import jaxkane as jk
 
     from . import _bicycle as bicycle
 
-    ts, values = np.linspace(0.0, 5.0, 251), dict(vars(bicycle.BICYCLE))
+    ts, names = np.linspace(0.0, 5.0, 251), tuple(vars(bicycle.BICYCLE))
+    values = jnp.stack([*vars(bicycle.BICYCLE).values()])  # one array, as the floor has
     state = jk.assemble(bicycle.BICYCLE, {}, {"roll_rate": 0.5, "rear_wheel_rate": -4.6 / 0.3})
     states, sweep = bicycle.starts(MEMBERS), jk.sweep.sweep
     tolerances: dict[str, Any] = {"rtol": 1e-8, "atol": 1e-8}
 
     def last(values):
-        return jk.simulate(dataclasses.replace(bicycle.BICYCLE, **values), state, ts, **tolerances)["roll"][-1]
+        system = dataclasses.replace(bicycle.BICYCLE, **dict(zip(names, values, strict=True)))
+        return jk.simulate(system, state, ts, **tolerances)["roll"][-1]
 
     return {
         "simulate": lambda: jk.simulate(bicycle.BICYCLE, state, ts, **tolerances).q,
