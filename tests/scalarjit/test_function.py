@@ -299,7 +299,8 @@ def test_a_program_is_transposed_as_jax_transposes_it():
 
 def test_packed_numbers_are_the_tree(kernels):
     rtol = 1e-14
-    tree = {"a": jnp.array(0.7), "b": [jnp.array(-1.2), None], "x": jnp.array([0.3, 0.9]), "n": jnp.array(2.0, jnp.float32)}
+    single = jnp.array(2.0, jnp.float32)  # of another type, and not read
+    tree = {"a": jnp.array(0.7), "b": [jnp.array(-1.2), None], "x": jnp.array([0.3, 0.9]), "n": single}
     f = ScalarFunction(lambda tree, y: plain(tree["a"], tree["b"][0], tree["x"] * y)[0])
     value = lambda tree: f(Packed.of(tree, jnp.float64), jnp.array(1.5)).sum()  # noqa: E731
     packed = Packed.of(tree, jnp.float64)
