@@ -13,12 +13,15 @@ from jaxkane.fit import (
     Problem,
     Simulation,
     Trial,
+    compare,
     cross_validate,
     fit,
     identifiability,
     laplace,
     minimize,
     profile,
+    report,
+    validate,
 )
 
 TIGHT = 1e-6
@@ -240,6 +243,22 @@ def test_trials_left_out(case):
         for values, costs in ((others, left_out.held_out), (best[:2], left_out.fitted), ((1, 0), left_out.at_start)):
             assert costs[k] == pytest.approx(np.sum((pieces[k][0] @ values - pieces[k][1]) ** 2), rel=1e-3)
     assert left_out.n.tolist() == [np.isfinite(y).sum() for y in records]
+
+
+def test_the_held_out_cost_is_that_of_fits_of_the_others(case):
+    rtol = 1e-3  # of starts that are searched for
+    found = fit(Track(), trials_of(recorded(3)), ("gain", "drift"), **OPTIONS)
+    assert found.held_out_cost == pytest.approx(cross_validate(found).held_out.sum(), rel=rtol)
+    assert found.held_out_cost > found.cost
+    told = f"{found.held_out_cost:.6g}"
+    assert f"({told} of trials left out in turn)" in str(found)
+    assert f"({told} of trials left out in turn)" in report(found)
+    alone = fit(Track(), trials_of(recorded(3))[:1], ("gain", "drift"), **OPTIONS)
+    for other in (alone, case[1], validate(found, trials_of(recorded(4)))):  # one trial; a prior; nothing was fitted
+        assert math.isnan(other.held_out_cost)
+        assert "left out in turn" not in str(other)
+    row = next(line for line in str(compare({"all": found, "one": alone})).splitlines() if "left out in turn" in line)
+    assert row.split()[-1] == told
 
 
 def test_the_evidence_is_the_density_of_the_data():

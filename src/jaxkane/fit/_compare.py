@@ -120,6 +120,9 @@ class Comparison:
         rows = [["", *columns], ["status", *(fit.status for fit in fits)]]
         for cost in dict.fromkeys(fit.problem.cost_name for fit in fits):
             rows.append([cost, *(f"{fit.cost:.6g}" if fit.problem.cost_name == cost else "" for fit in fits)])
+        if any(not math.isnan(fit.held_out_cost) for fit in fits):
+            cells = ("" if math.isnan(fit.held_out_cost) else f"{fit.held_out_cost:.6g}" for fit in fits)
+            rows.append(["of trials left out in turn", *cells])
         if self.held_out:
             rows.append(["held out", *(_held_out_cost(self.held_out[name]) for name in columns)])
         rows.append(["residuals", *(str(fit.problem.size[0]) for fit in fits)])

@@ -13,8 +13,6 @@ import numpy as np
 from tqdm import tqdm
 
 from .._common.lookup import refuse_unknown
-from .._scalarjit.compat import on_device
-from ._block_lsq import Blocks, eliminate
 from ._candidates import (
     AugmentedProblem,
     Candidate,
@@ -38,13 +36,14 @@ from ._statistics import (
     check_level,
     effective_sample_fraction,
     f_test,
+    folds_of,
+    linearized_problem,
     score_test,
     solved,
     use_clusters,
     wald_test,
 )
 from ._tables import Rows, Tables, html_tables, text_tables
-from ._validate import folds_of
 
 HEAD = ("candidate", "estimate", "std. error", "predicted cost", "cost", "p", "criterion", "held-out cost", "decision")
 
@@ -231,7 +230,7 @@ def forward_selection(
     order, plausible = tuple(candidate.name for candidate in candidates), dict(plausible or {})
     T, groups = len(fit.problem.trials), None
     if T >= 2:
-        groups = folds_of((T if T <= 10 else 5) if folds is None else folds, T)
+        groups = folds_of(folds, T)
     elif folds is not None:
         raise ValueError("`folds`: one trial alone cannot be left out: cut it with `Trial.between`.")
     branches, ended, accepted = [Branch((), RestrictedModel.of(fit), ())], [], {}
@@ -364,7 +363,7 @@ class RestrictedModel:
         if np.any(np.isfinite(np.asarray(fit.parameters.prior_deviation))):
             at = without_priors(fit.problem).linearize(fit.point)
         n_r, n_unknown = fit.problem.size
-        linearized = linearized_problem(fit.problem, at, fit.point, range(fit.point.b.shape[1]))
+        linearized = linearized_problem(fit.problem, at, fit.point)
         return cls(fit.problem, fit.point, fit.names, fit.cost, n_r - n_unknown, fit.autocorrelation, linearized)
 
     @property
@@ -384,18 +383,6 @@ class RestrictedModel:
 def without_priors(problem: Problem) -> Problem:
     """The same without priors of parameters; nothing is compiled anew."""
     return problem.with_priors(dict.fromkeys(problem.parameters.names, (0.0, math.inf)))
-
-
-def linearized_problem(problem: Problem, at: Linearization, point: Unknowns, b: Sequence[int]) -> LinearizedProblem:
-    """A linearization without priors, with starts and these unknowns of trials eliminated, all others fixed."""
-    blocks, parameters = at.blocks, problem.parameters
-    first = blocks.n_z + blocks.n_next
-    columns = [*range(first), *(first + i for i in b), *range(first + blocks.n_b, blocks.R.shape[-1])]
-    R = on_device(np.asarray(blocks.R)[:, :, columns])
-    reduced = eliminate(Blocks(R, blocks.windows, blocks.n_z, blocks.n_next, len(b)), 0.0)
-    slopes = np.asarray(parameters.slopes(point.x)) / np.asarray(parameters.prior_deviation, float)[:, None]
-    priors = np.column_stack([slopes, np.asarray(parameters.prior_residuals(point.x))])
-    return LinearizedProblem(reduced.R.astype(float), priors, blocks.column_norms.astype(float))
 
 
 @dataclasses.dataclass(frozen=True)

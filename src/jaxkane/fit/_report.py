@@ -20,7 +20,7 @@ from .._system.system import System
 from ._diagnostics import STATUS
 from ._extensions import ForwardSelection
 from ._problem import refuse_other
-from ._result import Fit, parameter_rows
+from ._result import Fit, costs_in_words, parameter_rows
 from ._statistics import autocorrelations
 from ._studies import Profile, check_signs
 from ._tables import Rows, html_table, text_table
@@ -170,7 +170,7 @@ def _ending(fit: Fit) -> str:
     else:
         nis = fit.mean_normalized_innovation_squared
         size = f"Mean square of the normalized innovations: {nis:.3g} (one where the noise is right)."
-    return f"{name[0].upper()}{name[1:]} {fit.history[0]:.6g} → {fit.cost:.6g} {how} {size}"
+    return f"{name[0].upper()}{name[1:]} {costs_in_words(fit, '→')} {how} {size}"
 
 
 def _errors(fit: Fit) -> str:

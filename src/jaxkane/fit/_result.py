@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib.metadata
+import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -49,6 +50,9 @@ class Fit:
     - `intervals(level)`: by name. `correlation` (p, p) of the estimates, in the order of `names`.
     - `cost`: sum of squared residuals, with process noise minus twice the log likelihood; `history`: of the cost.
         `status`, `message`: how it ended, in a word and in words.
+    - `held_out_cost`: the sum of squares of trials that are left out in turn, linearized at the estimates, with starts
+        and biases of their own; `cross_validate` fits anew instead. NaN with one trial, with process noise or priors,
+        and where no fit has converged.
     - `identifiability`: singular values and directions of the sensitivity, and what the data do not determine.
     - `residuals`: by trial and channel, (simulated - measured) / sigma (n_t,), NaN in gaps; `fitted`: simulated (n_t,).
         With process noise: predicted, from all that was measured before, and the normalized innovations.
@@ -346,6 +350,16 @@ class Fit:
         write_state(path, key, {"point": self.point, "step": step, "history": np.array(self.history), **numbers})
         return path
 
+    @functools.cached_property
+    def held_out_cost(self) -> float:
+        """The sum of squares of trials that are left out in turn."""
+        T, specification = len(self.problem.trials), self.problem.specification
+        with_priors = np.any(np.isfinite(np.asarray(self.parameters.prior_deviation)))
+        if T < 2 or specification.noise is not None or self.status != "converged" or with_priors:
+            return math.nan
+        linearized = statistics.linearized_problem(self.problem, self.linearization, self.point)
+        return float(np.sum(linearized.costs_left_out(range(len(self.names)), statistics.folds_of(None, T))))
+
     @property
     def title(self) -> str:
         """How much was fitted, in a line."""
@@ -360,11 +374,17 @@ class Fit:
         return text_table(parameter_rows(self, truth))
 
     def __str__(self) -> str:
-        end = f"{self.problem.cost_name} {self.history[0]:.6g} -> {self.cost:.6g} by {self.method}"
         bodies = diagnostics.describe_bodies(self.parameters, self.point.x)
+        end = f"{self.problem.cost_name} {costs_in_words(self, '->')} by {self.method}"
         return "\n".join([self.title, self.table(), *bodies, f"{end}: {diagnostics.STATUS[self.status]}", *self.notes])
 
     __repr__ = __str__
+
+
+def costs_in_words(fit: Fit, arrow: str) -> str:
+    """From the initial guess to the end, and of trials left out in turn."""
+    held_out = "" if math.isnan(fit.held_out_cost) else f" ({fit.held_out_cost:.6g} of trials left out in turn)"
+    return f"{fit.history[0]:.6g} {arrow} {fit.cost:.6g}{held_out}"
 
 
 def parameter_rows(fit: Fit, truth: Mapping[str, float] | System | None = None, detailed: bool = False) -> Rows:

@@ -9,7 +9,11 @@ import numpy as np
 from scipy import stats
 
 from .._common.lookup import real_number
+from .._scalarjit.compat import on_device
+from ._block_lsq import Blocks, eliminate
 from ._covariance import enough_clusters, formal_covariance, jackknife_covariance
+from ._linearize import Linearization
+from ._model import Unknowns
 from ._problem import Problem
 
 ByTrial = dict[str, dict[str, np.ndarray]]
@@ -160,6 +164,20 @@ def bic_change(before: float, after: float, more: int, n: int, correlation: floa
     return float(n_effective * np.log(max(after, 1e-300) / max(before, 1e-300)) + more * np.log(n_effective))
 
 
+def folds_of(folds: int | Sequence[Sequence[int]] | None, T: int) -> list[list[int]]:
+    """Which trials are left out together. None: each trial alone, and five folds from eleven trials on."""
+    if folds is None:
+        folds = T if T <= 10 else 5
+    if isinstance(folds, int):
+        if not 2 <= folds <= T:
+            raise ValueError(f"`folds`: {T} trials can be left out in 2 to {T} parts, not in {folds}.")
+        return [list(range(k, T, folds)) for k in range(folds)]
+    groups = [[int(k) for k in group] for group in folds]
+    if sorted(k for group in groups for k in group) != list(range(T)) or not all(groups) or len(groups) < 2:
+        raise ValueError(f"`folds` must leave out each of the trials 0 to {T - 1} once, in two groups at least.")
+    return groups
+
+
 @dataclasses.dataclass(frozen=True)
 class LinearizedProblem:
     """Least squares in x, in rows by trial: residuals A_t x + r_t, and priors of which each belongs to one x.
@@ -193,6 +211,21 @@ class LinearizedProblem:
             out = self.data[list(fold)]
             costs.append(np.sum((out[:, :, places] @ x + out[:, :, -1]) ** 2))
         return np.array(costs)
+
+
+def linearized_problem(
+    problem: Problem, at: Linearization, point: Unknowns, b: Sequence[int] | None = None
+) -> LinearizedProblem:
+    """A linearization without priors, with starts and these unknowns of trials eliminated (None: all), others fixed."""
+    blocks, parameters = at.blocks, problem.parameters
+    b = range(blocks.n_b) if b is None else b
+    first = blocks.n_z + blocks.n_next
+    columns = [*range(first), *(first + i for i in b), *range(first + blocks.n_b, blocks.R.shape[-1])]
+    R = on_device(np.asarray(blocks.R)[:, :, columns])
+    reduced = eliminate(Blocks(R, blocks.windows, blocks.n_z, blocks.n_next, len(b)), 0.0)
+    slopes = np.asarray(parameters.slopes(point.x)) / np.asarray(parameters.prior_deviation, float)[:, None]
+    priors = np.column_stack([slopes, np.asarray(parameters.prior_residuals(point.x))])
+    return LinearizedProblem(reduced.R.astype(float), priors, blocks.column_norms.astype(float))
 
 
 def solved(A: np.ndarray, r: np.ndarray) -> np.ndarray:

@@ -21,7 +21,7 @@ from ._nuisance import Unsimulated, solve_nuisance
 from ._optimizers import LeastSquares
 from ._problem import Problem, refuse_other
 from ._result import Fit
-from ._statistics import t_quantile, trial_names
+from ._statistics import folds_of, t_quantile, trial_names
 from ._tables import Rows, text_table
 from ._trial import Trial
 
@@ -178,8 +178,6 @@ def cross_validate(fit: Fit, folds: int | Sequence[Sequence[int]] | None = None)
     T = len(fit.problem.trials)
     if T < 2:
         raise ValueError("Leaving trials out needs two at least: cut a long one with `Trial.between`.")
-    if folds is None:
-        folds = T if T <= 10 else 5
     groups = folds_of(folds, T)
     held_out, estimates = np.full(T, np.nan), []
     for group in groups:
@@ -200,17 +198,6 @@ def cross_validate(fit: Fit, folds: int | Sequence[Sequence[int]] | None = None)
         estimates={name: np.array([of_fold[name] for of_fold in estimates]) for name in fit.names},
         cost_name=fit.problem.cost_name,
     )
-
-
-def folds_of(folds: int | Sequence[Sequence[int]], T: int) -> list[list[int]]:
-    if isinstance(folds, int):
-        if not 2 <= folds <= T:
-            raise ValueError(f"`folds`: {T} trials can be left out in 2 to {T} parts, not in {folds}.")
-        return [list(range(k, T, folds)) for k in range(folds)]
-    groups = [[int(k) for k in group] for group in folds]
-    if sorted(k for group in groups for k in group) != list(range(T)) or not all(groups) or len(groups) < 2:
-        raise ValueError(f"`folds` must leave out each of the trials 0 to {T - 1} once, in two groups at least.")
-    return groups
 
 
 def costs_by_trial(problem: Problem, point: Unknowns) -> np.ndarray:
