@@ -14,7 +14,7 @@ import pytest
 from jaxkane._scalarjit import function
 from jaxkane._scalarjit.backends import xla
 from jaxkane._scalarjit.compat import jaxpr_as_fun
-from jaxkane._scalarjit.components import determinant, solve
+from jaxkane._scalarjit.components import add, determinant, mul, solve, sub
 from jaxkane._scalarjit.function import Packed, ScalarFunction, tree_of
 from jaxkane._scalarjit.jaxpr import cse, transposed_program
 
@@ -295,6 +295,16 @@ def test_a_program_is_transposed_as_jax_transposes_it():
         found = jaxpr_as_fun(transposed_program(traced, [1, 2, 3]))(jnp.array(a), *cts)
         for ours, theirs in zip(found, (*expected, jnp.zeros(())), strict=True):
             np.testing.assert_allclose(ours, theirs, rtol=rtol)
+
+
+@pytest.mark.parametrize("operation", [add, sub, mul], ids=lambda f: f.__name__)
+def test_numbers_of_two_types_and_shapes_are_converted(operation):
+    x, y = jnp.array(3.0, jnp.float32), jnp.array([2.0, 5.0])
+    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+        found = jax.jit(operation)(x, y)
+    expected = {add: [5.0, 8.0], sub: [1.0, -2.0], mul: [6.0, 15.0]}[operation]
+    np.testing.assert_array_equal(found, expected)
+    assert found.dtype == jnp.float64
 
 
 def test_packed_numbers_are_the_tree(kernels):
