@@ -360,7 +360,7 @@ class RestrictedModel:
     @classmethod
     def of(cls, fit: Fit) -> RestrictedModel:
         at: Any = fit.linearization
-        if np.any(np.isfinite(np.asarray(fit.parameters.prior_deviation))):
+        if fit.parameters.has_prior.any():
             at = without_priors(fit.problem).linearize(fit.point)
         n_r, n_unknown = fit.problem.size
         linearized = linearized_problem(fit.problem, at, fit.point)

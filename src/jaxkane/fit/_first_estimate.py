@@ -210,7 +210,7 @@ def _projection(
         row = np.zeros(len(base.places))
         row[base.fixed] = 10.0 * np.sqrt(max(eigenvalues.max(initial=0.0), 1e-300))
         root = np.vstack([root, row])
-    has_prior = np.isfinite(np.asarray(parameters.prior_deviation))
+    has_prior = parameters.has_prior
     memory: dict[bytes, Any] = {}
 
     def evaluate(x: np.ndarray) -> Any:

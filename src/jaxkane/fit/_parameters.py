@@ -109,6 +109,11 @@ class Parameters(eqx.Module):
     places: Int[Array, " p"]
     rest: Float[Array, " all"]
 
+    @property
+    def has_prior(self) -> np.ndarray:
+        """Which of them (p,) have a prior."""
+        return np.isfinite(np.asarray(self.prior_deviation))
+
     def subset(self, places: Sequence[int], x: Float[Array, " p"]) -> Parameters:
         """Those at `places`; all others keep their values at x."""
         at = jnp.asarray(places, dtype=jnp.int32)

@@ -353,9 +353,8 @@ class Fit:
     @functools.cached_property
     def held_out_cost(self) -> float:
         """The sum of squares of trials that are left out in turn."""
-        T, specification = len(self.problem.trials), self.problem.specification
-        with_priors = np.any(np.isfinite(np.asarray(self.parameters.prior_deviation)))
-        if T < 2 or specification.noise is not None or self.status != "converged" or with_priors:
+        T, noise = len(self.problem.trials), self.problem.specification.noise
+        if T < 2 or noise is not None or self.status != "converged" or self.parameters.has_prior.any():
             return math.nan
         linearized = statistics.linearized_problem(self.problem, self.linearization, self.point)
         return float(np.sum(linearized.costs_left_out(range(len(self.names)), statistics.folds_of(None, T))))
