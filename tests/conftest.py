@@ -3,7 +3,7 @@
 How to run them:
 
     pytest                        everything, in as many processes as there are cores, four at most
-    pytest tests/system/test_vectors.py  a file or a test, in this process
+    pytest tests/system/test_kinematics.py  a file or a test, in this process
     pytest --cache-clear          compiles every program anew; by default they are kept for the next run, in pytest's
                                   own cache, and thrown away where they have become many
     JAXKANE_TEST_CACHE=FOLDER     keeps them elsewhere
