@@ -20,7 +20,6 @@ Jaxprs are read in this room alone: equation by equation by `interpret`, and by 
 from __future__ import annotations
 
 import contextlib
-import copy
 import importlib
 import os
 import warnings
@@ -33,19 +32,19 @@ from jax.core import Tracer as Tracer
 
 MISSING: str | None = None  # what this JAX lacks, without which there are no scalar programs
 try:
-    from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Primitive, jaxpr_as_fun
+    from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Primitive, Var, jaxpr_as_fun
     from jax.interpreters import ad, batching, mlir
     from jax.interpreters.ad import instantiate_zeros, is_undefined_primal
     from jax.interpreters.partial_eval import dce_jaxpr
 
     _ = Jaxpr.replace, Jaxpr.eqns, Jaxpr.invars, Jaxpr.constvars, Jaxpr.outvars
     _ = JaxprEqn.replace, JaxprEqn.primitive, JaxprEqn.params, JaxprEqn.invars, JaxprEqn.outvars, JaxprEqn.effects
-    _ = ad.primitive_transposes, ad.UndefinedPrimal, ad.Zero
+    _ = ad.primitive_jvps, ad.primitive_transposes, ad.UndefinedPrimal, ad.Zero
     _ = ClosedJaxpr.jaxpr, ClosedJaxpr.consts, ClosedJaxpr.in_avals, ClosedJaxpr.out_avals, Primitive.get_bind_params
 except (ImportError, AttributeError) as error:
     MISSING = f"this JAX lacks what that needs ({error})"
     missing: Any = None
-    ClosedJaxpr = Jaxpr = Primitive = missing
+    ClosedJaxpr = Jaxpr = Primitive = Var = missing
     jaxpr_as_fun = dce_jaxpr = instantiate_zeros = is_undefined_primal = ad = batching = mlir = missing
 
 
@@ -125,6 +124,23 @@ def evaluated(equation: Any, inputs: Sequence[Any]) -> Sequence[Any]:
     return results if primitive.multiple_results else [results]
 
 
+def tangents_of(equation: Any, inputs: Sequence[Any], tangents: Sequence[Any]) -> Sequence[Any]:
+    """The tangents of the results of an equation, of those of its inputs. What is None is zero."""
+    primitive = equation.primitive
+    if primitive in ad.primitive_jvps:
+        dxs = [no_tangent(v.aval) if dx is None else dx for v, dx in zip(equation.invars, tangents, strict=True)]
+        dys = ad.primitive_jvps[primitive](inputs, dxs, **equation.params)[1]
+        return [None if is_no_tangent(dy) else dy for dy in (dys if primitive.multiple_results else [dys])]
+    places = [i for i, dx in enumerate(tangents) if dx is not None]
+
+    def of_moving(*ys: Any) -> Sequence[Any]:
+        values = dict(zip(places, ys, strict=True))
+        return evaluated(equation, [values.get(i, x) for i, x in enumerate(inputs)])
+
+    dys = jax.jvp(of_moving, [inputs[i] for i in places], [tangents[i] for i in places])[1]
+    return [dy if jax.numpy.issubdtype(v.aval.dtype, np.inexact) else None for v, dy in zip(equation.outvars, dys)]
+
+
 def transposed(equation: Any, inputs: Sequence[Any], moves: Sequence[bool], cotangents: Sequence[Any]) -> Sequence[Any]:
     """The cotangents, by input, of an equation that is linear in those of its inputs that move, of the cotangents of
     its results. What is None is zero. Inputs that move have no values."""
@@ -197,7 +213,7 @@ def new_primitive(
 
 def new_variable(like: Any) -> Any:
     """A variable of a jaxpr, of the same type as another; they are told apart by identity."""
-    return copy.copy(like)
+    return Var(like.aval)
 
 
 def is_moved_forward(x: Any) -> bool:

@@ -321,8 +321,9 @@ class Program:
     """A traced program, and the programs that follow from it, each made once.
 
     `loop_invariant`: places of the arguments that stay what they are while the program is called again and again, as
-    the parameters of a system. `tangents`: places of those that are tangents. `structure`: of the results. `once`:
-    whether it is called once.
+    the parameters of a system. `tangents`: places of those that are tangents; `linear`: of those in which all of it is
+    linear. `structure`: of the results. `once`: whether it is called once. `is_reduced`: whether `cse` would find
+    nothing in it.
     """
 
     def __init__(
@@ -332,11 +333,13 @@ class Program:
         loop_invariant: frozenset[int] = frozenset(),
         structure: Any = None,
         tangents: frozenset[int] = frozenset(),
+        linear: frozenset[int] = frozenset(),
         once: bool = False,
+        is_reduced: bool = False,
     ):
-        self.label, self.loop_invariant, self.structure, self.tangents = label, loop_invariant, structure, tangents
-        self.once = once
-        self.program = cse(program)
+        self.label, self.loop_invariant, self.structure, self.once = label, loop_invariant, structure, once
+        self.tangents, self.linear = tangents, linear
+        self.program = program if is_reduced else cse(program)
         self.evaluate = jaxpr_as_fun(self.program)
         self.in_avals, self.out_avals = self.program.in_avals, self.program.out_avals
         self.is_fusable = is_fusable(self.program.jaxpr)
@@ -353,8 +356,16 @@ class Program:
         """(primals, tangents of those that move) -> tangents of the outputs that have any."""
         places = [i for i, m in enumerate(moving) if m]
         fixed = self.loop_invariant | {len(moving) + j for j, i in enumerate(places) if i in self.loop_invariant}
-        tangents = self.tangents | frozenset(range(len(moving), len(moving) + len(places)))
-        return Program(tangent_program(self.program, places), self.label, fixed, tangents=tangents, once=self.once)
+        linear = frozenset(range(len(moving), len(moving) + len(places)))
+        return Program(
+            tangent_program(self.program, places),
+            self.label,
+            fixed,
+            tangents=self.tangents | linear,
+            linear=linear,
+            once=self.once,
+            is_reduced=True,
+        )
 
     def _transposed(self, linear: tuple[bool, ...]) -> Program:
         """(the other inputs, cotangents of the outputs) -> cotangents of the linear inputs."""
@@ -362,7 +373,7 @@ class Program:
         fixed = [i for i, is_linear in enumerate(linear) if not is_linear]
         program = transposed_program(self.program, places)
         invariant = frozenset(j for j, i in enumerate(fixed) if i in self.loop_invariant)
-        return Program(program, self.label, invariant, once=self.once)
+        return Program(program, self.label, invariant, once=self.once, is_reduced=True)
 
     def _batched(self, sizes: tuple[int, ...], where: Where) -> Program:
         """The program over leading axes of these sizes, of which input i has those in `where[i]`."""
@@ -472,7 +483,10 @@ def _jvp(primals, tangents, *, program, sizes, where):
 
 
 def _transpose(cotangents, *args, program, sizes, where):
-    linear = tuple(is_undefined_primal(x) for x in args)
+    asked = linear = tuple(map(is_undefined_primal, args))
+    if all(i in program.linear for i, is_asked in enumerate(asked) if is_asked):
+        # One transpose for whichever of the tangents are constant: a loop asks for some before it asks for all.
+        linear = tuple(i in program.linear for i in range(len(args)))
     known = [(x, w) for x, w, is_linear in zip(args, where, linear, strict=True) if not is_linear]
     everywhere = ((True,) * len(sizes),) * len(cotangents)
     results = iter(
@@ -489,7 +503,8 @@ def _transpose(cotangents, *args, program, sizes, where):
         axes = tuple(d for d, h in enumerate(has) if not h)
         return ct.sum(axes) if axes else ct
 
-    return [over_missing(next(results), w) if is_linear else None for is_linear, w in zip(linear, where, strict=True)]
+    cts = [next(results) if is_linear else None for is_linear in linear]
+    return [over_missing(ct, w) if is_asked else None for ct, w, is_asked in zip(cts, where, asked, strict=True)]
 
 
 def _batch(args, axes, *, program, sizes, where):
