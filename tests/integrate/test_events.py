@@ -99,7 +99,8 @@ class Pendulum(jk.System):
         return jk.weight(motion, -9.81 * motion.N.y)
 
     def events(self, t, q, u):
-        return {"vertical": {0: q["angle"], 1: jk.rising(q["angle"]), -1: jk.falling(q["angle"])}[self.way]}
+        low = jk.falling(jnp.sin(q["angle"]) - 0.05 * t * u["rate"] ** 2 - 0.01 * self.length)
+        return {"vertical": {0: q["angle"], 1: jk.rising(q["angle"]), -1: jk.falling(q["angle"]), 2: low}[self.way]}
 
 
 @pytest.mark.parametrize(
@@ -116,6 +117,26 @@ def test_a_pendulum_through_the_vertical(way, quarters):
     found, slope = jax.jit(lambda x: jax.jvp(t_end, (x,), (1.0,)))(1.3)
     np.testing.assert_allclose(found, expected, atol=1e-9)
     np.testing.assert_allclose(slope, expected / 2.6, rtol=1e-6)
+
+
+@pytest.mark.slow
+def test_second_derivatives_along_several_directions():
+    """By a length, an angle and a rate, of an event that reads coordinates, speeds and the time: in forward mode, and
+    forward over reverse, against differences of first derivatives."""
+
+    def end(x, adjoint):
+        start, tolerances = jk.State(x[1:2], x[2:]), {"rtol": 1e-12, "atol": 1e-12}
+        ride = jk.simulate(Pendulum(x[0], 2), start, 2 * TS, adjoint=adjoint, **tolerances)
+        return jnp.stack([ride.t_end, ride.end.q[0], ride.end.u[0]])
+
+    x, rtol = jnp.array([1.3, 0.9, 0.2]), 1e-12
+    first = jax.jit(jax.jacfwd(lambda x: end(x, "forward")))
+    second = jax.jit(jax.jacfwd(jax.jacfwd(lambda x: end(x, "forward"))))(x)
+    over_reverse = jax.jit(jax.jacfwd(jax.jacrev(lambda x: end(x, "both"))))(x)
+    numeric = jnp.stack([(first(x + e) - first(x - e)) / 2e-4 for e in 1e-4 * jnp.eye(3)], axis=-1)
+    assert jnp.abs(numeric).min() > 1e-3
+    np.testing.assert_allclose(second, numeric, atol=1e-6)
+    np.testing.assert_allclose(over_reverse, second, rtol=rtol, atol=rtol)
 
 
 def test_a_start_on_zero():

@@ -11,13 +11,13 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from .._kane.kanes_method import KaneEquations
 from .._scalarjit.compat import depends_on
 from .._scalarjit.components import Component, as_vector, determinant
 from .._scalarjit.function import ScalarFunction
+from .._scalarjit.nan import negligible
 from .._system.system import State, System, unpacked
 from .status import REASONS, Status
 
@@ -189,31 +189,43 @@ class EventPoint(NamedTuple):
 
 
 def locate_event(
-    system: System, t: Array, y: Array, which: Array, happened: Array, rates: Any, reach: Array, events: Events
+    system: System,
+    t: Array,
+    y: Array,
+    which: Array,
+    happened: Array,
+    rates: Any,
+    args: Any,
+    reach: Array,
+    events: Events,
 ) -> EventPoint:
     """The instant beside `t` at which the event `which` vanishes, with derivatives up to the second order.
 
         t_end = t - g / g_dot,   y_end = y + (t_end - t) y_dot,   twice
 
-    To first order that is the implicit function theorem. Here `t` is a number, near enough (within `reach`) that two
-    steps of Newton's method are exact, and the packed state `y` is the motion at that time.
+    To first order that is the implicit function theorem. Here `t` is a number, so near (within `reach`) that one step
+    of Newton's method is exact, and the packed state `y` is the motion at that time. The second step has the second
+    derivatives; in them the rates are those halfway, and follow from `args`. Elsewhere they are numbers.
 
-    **Arguments:** `rates`: (t, y) -> y_dot; `which`: as a float; `happened`: False where no event did: then it is `t`
-    itself.
+    **Arguments:** `rates`: (t, y, args) -> y_dot; `which`: as a float; `happened`: False where no event did: then it is
+    `t` itself.
     """
-    first = (jax.lax.stop_gradient(t), y)
+    t = jax.lax.stop_gradient(t)
+    y_dot = rates(*_constant((t, y, args)))
 
-    def stage(search: _Search, k: Array):
-        y_dot = rates(search.t, search.y)
-        quantities = event_values(system, search.t, search.y, y_dot if events.read_speeds else None)
-        return _next_point(reach, k, first, search, y_dot, quantities, which, happened), None
+    def stepped(point: _Near) -> _Near:
+        quantities = event_values(system, point.t, point.y, y_dot if events.read_speeds else None)
+        return _next_point(reach, point, y_dot, quantities, which, happened)
 
-    start = _Search(*first, jnp.zeros_like(t), jnp.array(True))
-    search, _ = jax.lax.scan(stage, start, np.arange(3.0, dtype=y.dtype))  # pyright: ignore[reportArgumentType]
-    return EventPoint(search.t, search.y, search.smooth)
+    def bend(h: Array, y: Array, args: Any) -> Array:
+        return h * (rates(t + 0.5 * h, y + 0.5 * h * y_dot, args) - y_dot)
+
+    near = stepped(_Near(t, y, jnp.zeros_like(t), jnp.array(True)))
+    end = stepped(near._replace(y=near.y + negligible(bend, near.step, y, args)))
+    return EventPoint(end.t, end.y, end.smooth)
 
 
-class _Search(NamedTuple):
+class _Near(NamedTuple):
     t: Array
     y: Array
     step: Array
@@ -221,18 +233,19 @@ class _Search(NamedTuple):
 
 
 @ScalarFunction.once
-def _next_point(reach: Array, k: Array, first: Any, search: _Search, y_dot, quantities, which, happened) -> _Search:
+def _next_point(reach: Array, point: _Near, y_dot, quantities: EventValues, which, happened) -> _Near:
     g, g_dot = quantities.values[0], quantities.rates[0]
     for i in range(1, len(quantities.values)):
         g, g_dot = (jnp.where(which == i, x[i], x0) for x, x0 in ((quantities.values, g), (quantities.rates, g_dot)))
-    # Beside the first point, where to go; there halfway, by the rates in the middle; and there again.
+    g_dot = jax.lax.stop_gradient(g_dot)
     is_small = jnp.abs(g) <= jnp.abs(g_dot) * reach
-    newton = -g / jnp.where(happened & is_small & (g_dot != 0), g_dot, jnp.ones_like(g_dot))
-    newton = jnp.where(happened & is_small, newton, jnp.zeros_like(newton))
-    step = jnp.where(k == 1, search.step, newton)
-    ahead = jnp.where(k == 0, 0.5 * step, step)
-    t, y = (jnp.where(k == 1, x0, x) for x0, x in zip(first, (search.t, search.y), strict=True))
-    return _Search(t + ahead, y + ahead * y_dot, step, search.smooth & (is_small | (k == 1)))
+    moves = happened & is_small & (g_dot != 0)
+    step = jnp.where(moves, -g / jnp.where(moves, g_dot, jnp.ones_like(g_dot)), jnp.zeros_like(g))
+    return _Near(point.t + step, point.y + step * y_dot, step, point.smooth & is_small)
+
+
+def _constant(values: Any) -> Any:
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, values)
 
 
 class Limits(eqx.Module):
@@ -321,8 +334,7 @@ class EventController(diffrax.AbstractStepSizeController[Any, Any]):
 
     def _values(self, t: Any, y: Any, args: Any) -> EventValues | None:
         # Where steps end has no derivative, and compiling one would take its time.
-        constant = lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x  # noqa: E731
-        return None if self.quantities is None else self.quantities(*jax.tree.map(constant, (t, y, args)))
+        return None if self.quantities is None else self.quantities(*_constant((t, y, args)))
 
 
 class Step(NamedTuple):

@@ -132,13 +132,14 @@ class InitialValueProblem(NamedTuple):
 
 class Ending(NamedTuple):
     """The `status`, as a float; the last time and packed state; whether these move `smooth`ly with what they come from;
-    whether the motion ended `by_event`."""
+    whether the motion ended `by_event`, which is `near` the last time and state, or else the first."""
 
     status: Array
     t_end: Array
     end: Array
     smooth: Array
     by_event: Array
+    near: tuple[Array, Array]
 
 
 class Solution(NamedTuple):
@@ -330,16 +331,10 @@ def _integrated(problem: InitialValueProblem) -> Solution:
 @ScalarFunction.once
 def _ending(times: Times, outcome: Outcome, valid: Array, t_last: Array, last: Array, start: Array) -> Ending:
     status = status_of(outcome, valid)
-    completed = status == Status.COMPLETED
-    t_end = jnp.where(completed, times.end, jnp.where(valid, t_last, times.start))
-    return Ending(status, t_end, jnp.where(valid, last, start), completed, status >= Status.EVENT)
-
-
-@ScalarFunction.once
-def _at_event(times: Times, ending: Ending, start: Array) -> tuple[Array, Array]:
-    """Where an event is looked for: the last point, where one happened."""
-    t = jnp.where(ending.by_event, ending.t_end, times.start)
-    return t, jnp.where(ending.by_event, ending.end, start)
+    completed, by_event = status == Status.COMPLETED, status >= Status.EVENT
+    t_end, end = jnp.where(completed, times.end, jnp.where(valid, t_last, times.start)), jnp.where(valid, last, start)
+    near = jnp.where(by_event, t_end, times.start), jnp.where(by_event, end, start)
+    return Ending(status, t_end, end, completed, by_event, near)
 
 
 @ScalarFunction.once
@@ -350,11 +345,9 @@ def _by_event(point: EventPoint, ending: Ending) -> Ending:
 
 def _to_event(problem: InitialValueProblem, solution: Solution) -> Solution:
     """The same, whose end is the instant of the event, where one happened."""
-    times, ending = problem.times, solution.ending
-    rates = lambda t, y: problem.rates(t, y, problem.args)  # noqa: E731
-    t, y = _at_event(times, ending, problem.start)
-    event = jnp.maximum(ending.status - Status.EVENT, 0.0)
-    point = locate_event(problem.args[0], t, y, event, ending.by_event, rates, times.event_reach, problem.events)
+    times, ending, (system, *_) = problem.times, solution.ending, problem.args
+    which = (ending.status - Status.EVENT, ending.by_event)
+    point = locate_event(system, *ending.near, *which, problem.rates, problem.args, times.event_reach, problem.events)
     end = _by_event(point, ending)
     # The last step ends a little beside the event: samples from there to here are those of the event itself.
     before = problem.ts <= end.t_end + times.rounding

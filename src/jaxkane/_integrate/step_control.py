@@ -92,7 +92,7 @@ def times_of(start: Array, second: Array, end: Array) -> Times:
     """Of the first, the second and the last time at which the motion is kept."""
     eps, duration = jnp.finfo(end.dtype).eps, jax.lax.stop_gradient(end - start)
     shortest = 1e3 * eps * duration
-    resolution = 8 * shortest + 1e-9 * duration
+    resolution = 8 * shortest + 1e-11 * duration
     return Times(
         start=start,
         end=end,

@@ -1,4 +1,4 @@
-"""Values that do not exist: NaN, and so is their derivative. Knows arrays only.
+"""Values that do not exist: NaN, and so is their derivative; and derivatives that are left out. Knows arrays only.
 
 `jnp.where(missing, jnp.nan, x)` has the derivative zero where it is NaN, and an optimizer takes that for the end of its
 search. A factor NaN instead would be read in reverse mode even by who does not read what is missing: 0 * NaN is NaN.
@@ -13,6 +13,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool
 
 
@@ -73,6 +74,46 @@ def derivative_free_where_not_finite(f: Callable[..., Any], *arguments: Any) -> 
         return y, slope(jax.tree.map(lambda x_dot: jnp.where(finite, x_dot, jnp.zeros_like(x_dot)), moving_dot))
 
     return gated(moving, fixed)
+
+
+def negligible(f: Callable[..., Array], *arguments: Any) -> Array:
+    """Zeros for the array `f(*arguments)`, whose value and first derivative are negligible, as of a product of two
+    numbers that are both small; its second derivatives are those of `f`. Closed-over arrays count as arguments.
+
+    The derivatives of `f` are compiled only where second ones are asked for.
+    """
+    f = eqx.filter_closure_convert(f, *arguments)
+    moving, other = eqx.partition((f, arguments), eqx.is_inexact_array)
+    fixed, rest = eqx.partition(other, eqx.is_array)
+
+    def value(moving: Any, fixed: Any) -> Array:
+        f, arguments = eqx.combine(moving, fixed, rest)
+        return f(*arguments)
+
+    @jax.custom_jvp
+    def zero(moving: Any, fixed: Any) -> Array:
+        y = jax.eval_shape(value, moving, fixed)
+        return jnp.where(
+            jnp.any(jnp.isnan(flat(moving))) & False, jnp.nan, jnp.zeros(y.shape, y.dtype)
+        )  # as in `_mask`
+
+    @zero.defjvp
+    def _(primals: Any, tangents: Any) -> Any:
+        # The solution of dy - J dx = 0, dx = dx, is said to be dy = 0, but is differentiated as it is. It is one array,
+        # since JAX transposes no such equations of which a part of the right-hand side is known.
+        (moving, fixed), (moving_dot, _) = primals, tangents
+        y, (x_dot, as_tree) = zero(moving, fixed), ravel_pytree(moving_dot)
+
+        def equations(both: Array) -> Array:
+            y_dot, x_dot = both[: y.size], both[y.size :]
+            slope = jax.jvp(lambda x: value(x, fixed), (moving,), (as_tree(x_dot),))[1]
+            return jnp.concatenate([y_dot - jnp.ravel(slope).astype(both.dtype), x_dot])
+
+        right, given = jnp.pad(x_dot, (y.size, 0)), lambda _, right: right
+        solution = jax.lax.custom_linear_solve(equations, right, given, transpose_solve=given)
+        return y, solution[: y.size].reshape(y.shape).astype(y.dtype)
+
+    return zero(moving, fixed)
 
 
 def _masked(shown: bool, missing: Array, values: Any, origin: Any) -> Any:
