@@ -211,7 +211,7 @@ def locate_event(
     `t` itself.
     """
     t = jax.lax.stop_gradient(t)
-    y_dot = rates(*_constant((t, y, args)))
+    y_dot = rates(*constant((t, y, args)))
 
     def stepped(point: _Near) -> _Near:
         quantities = event_values(system, point.t, point.y, y_dot if events.read_speeds else None)
@@ -244,7 +244,8 @@ def _next_point(reach: Array, point: _Near, y_dot, quantities: EventValues, whic
     return _Near(point.t + step, point.y + step * y_dot, step, point.smooth & is_small)
 
 
-def _constant(values: Any) -> Any:
+def constant(values: Any) -> Any:
+    """The same arrays, of which nothing has a derivative."""
     return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, values)
 
 
@@ -334,7 +335,7 @@ class EventController(diffrax.AbstractStepSizeController[Any, Any]):
 
     def _values(self, t: Any, y: Any, args: Any) -> EventValues | None:
         # Where steps end has no derivative, and compiling one would take its time.
-        return None if self.quantities is None else self.quantities(*_constant((t, y, args)))
+        return None if self.quantities is None else self.quantities(*constant((t, y, args)))
 
 
 class Step(NamedTuple):

@@ -23,7 +23,7 @@ from .._scalarjit.nan import all_finite, derivative_free_where_not_finite, flat,
 from .._system.parameters import ANY, ParameterInfo, parameters_in
 from .._system.system import State, System, names_of, packed, units_of, unpacked
 from .diffrax_compat import UnrolledERK, saveat_and_adjoint
-from .events import EventPoint, Events, EventValues, event_values, events_of, locate_event
+from .events import EventPoint, Events, EventValues, constant, event_values, events_of, locate_event
 from .inputs import (
     Discontinuities,
     InputState,
@@ -53,20 +53,20 @@ def _is_rising(ts: Array) -> Array:
     return all_finite(ts) & jnp.all(ts[1:] >= ts[:-1]) & (ts[-1] > ts[0])
 
 
-def is_valid(system: System, state: State, t: Array, signals: Any, rises: Array | None) -> Array:
-    """Whether a motion can begin at `t`; `rises`: whether the times rise, None where that is known."""
-    large = eqx.filter((system, state), _is_small, inverse=True)
-    valid = all_finite(large) & (True if rises is None else rises) & inputs_are_valid(signals)
-    for value, info in _limited(system):
-        if not _is_small(value):
-            valid &= jnp.all(info.allows(value))
-    numbers, static = eqx.partition((system, state, t), eqx.is_array)
-    return _small_are_valid(*eqx.combine(jax.lax.stop_gradient(numbers), static), valid)
+def is_valid(system: System, state: State, t: Array, signals: Any) -> Array:
+    """Whether a motion can begin at `t`."""
+    others = _large_are_valid(system, state) & inputs_are_valid(signals)
+    return _small_are_valid(*constant((system, state, t)), others)
+
+
+def _large_are_valid(system: System, state: State) -> Array:
+    allowed = [jnp.all(info.allows(x)) for x, info in _limited(system) if not _is_small(x)]
+    return functools.reduce(jnp.logical_and, allowed, all_finite(eqx.filter((system, state), _is_small, inverse=True)))
 
 
 @ScalarFunction.once
-def _small_are_valid(system: System, state: State, t: Array, large_are_valid: Array) -> Array:
-    conditions = [large_are_valid, configuration_is_met(system, t, state.q)]
+def _small_are_valid(system: System, state: State, t: Array, others_are_valid: Array) -> Array:
+    conditions = [others_are_valid, configuration_is_met(system, t, state.q)]
     conditions += [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((system, state)) if _is_small(x)]
     conditions += [jnp.all(info.allows(x)) for x, info in _limited(system) if _is_small(x)]
     return functools.reduce(jnp.logical_and, conditions)
@@ -77,40 +77,47 @@ def _limited(system: System) -> list[tuple[Array, ParameterInfo]]:
     return [(value, info) for _, value, info in parameters_in(system) if info.is_limited]
 
 
-def where_valid(valid: Array, values: Any) -> Any:
-    """The values where they are valid, ones elsewhere."""
-    return _or_ones(values, lambda x: ANY, valid)
+class Beginning(NamedTuple):
+    """The `times` of a motion; whether it can begin; its `system` and `state`, ones where it cannot.
+
+    `stepped`: the system that the steps read, with ones for parameters that are not finite, or that no description can
+    have: behind a mask these would still spoil the reverse gradient of what is shared. What all members of a batch
+    share remains shared there, of which a kernel computes its part once.
+    """
+
+    times: Times
+    valid: Array
+    system: System
+    state: State
+    stepped: System
 
 
-def replace_invalid_parameters(system: System) -> System:
-    """The system with ones for parameters that are not finite, or that no description can have: behind a mask these
-    would still spoil the reverse gradient of what is shared."""
-    limits = {id(x): info for x, info in _limited(system)}
-    return _or_ones(system, lambda x: limits.get(id(x), ANY), None)
-
-
-def _or_ones(values: Any, info_of: Callable[[Array], ParameterInfo], valid: Array | None) -> Any:
-    """Ones in the place of numbers that are not valid: small arrays all in one program, large ones each by itself."""
-    small, rest = eqx.partition(values, _is_small)
-    large, rest = eqx.partition(rest, eqx.is_inexact_array)
-    leaves, treedef = jax.tree.flatten(small)
-    if leaves:
-        leaves = _small_or_ones(leaves, _Limits(tuple(map(info_of, leaves))), valid)
-    large = jax.tree.map(lambda x: _or_one(x, info_of(x), valid), large)
-    return eqx.combine(jax.tree.unflatten(treedef, leaves), large, rest)
-
-
-class _Limits(eqx.Module):
-    infos: tuple[ParameterInfo, ...] = eqx.field(static=True)
+def beginning(system: System, state: State, ts: Array, others_are_valid: Array) -> Beginning:
+    """Of the times (n_t,) at which a motion is kept. Small arrays all in one program, large ones each by itself."""
+    others = _large_are_valid(system, state) & others_are_valid
+    small = _beginning(system, state, ts[0], ts[1], ts[-1], others)
+    large = _harmless(system, state, small.valid, lambda x: eqx.is_inexact_array(x) and not _is_small(x))
+    rest = eqx.filter((system, state, system), eqx.is_inexact_array, inverse=True)
+    return Beginning(small.times, small.valid, *eqx.combine(small[2:], large, rest))
 
 
 @ScalarFunction.once
-def _small_or_ones(values: list[Array], limits: _Limits, valid: Array | None) -> list[Array]:
-    return [_or_one(x, info, valid) for x, info in zip(values, limits.infos, strict=True)]
+def _beginning(system: System, state: State, first: Array, second: Array, last: Array, others: Array) -> Beginning:
+    valid = _small_are_valid.__wrapped__(system, state, first, others)
+    masked, start, stepped = _harmless(system, state, valid, _is_small)
+    # To JAX the state moves with the parameters, so that the derivative of the first rates is the program of the loop.
+    numbers = [jnp.sum(x) for x in jax.tree.leaves(stepped) if x.dtype == state.q.dtype]
+    start = jax.tree.map(lambda x: jnp.where(valid, x, x + 0.0 * sum(numbers)), start)
+    return Beginning(times_of(first, second, last), valid, masked, start, stepped)
 
 
-def _or_one(x: Array, info: ParameterInfo, valid: Array | None) -> Array:
-    return jnp.where(info.allows(x) if valid is None else valid, x, jnp.ones_like(x))
+def _harmless(system: System, state: State, valid: Array, is_chosen: Callable[[Any], bool]) -> Any:
+    """The last three of a `Beginning`: those of their arrays that are chosen, None for the others."""
+    limits = {id(x): info for x, info in _limited(system)}
+    where = lambda condition, x: jnp.where(condition, x, jnp.ones_like(x))  # noqa: E731
+    masked = lambda x: where(valid, x) if is_chosen(x) else None  # noqa: E731
+    possible = lambda x: where(limits.get(id(x), ANY).allows(x), x) if is_chosen(x) else None  # noqa: E731
+    return *jax.tree.map(masked, (system, state)), jax.tree.map(possible, system)
 
 
 class InitialValueProblem(NamedTuple):
@@ -173,16 +180,13 @@ def solve(
     origin = flat((system, state, ts, signals, disturbance, closures))
     rises = None if settings.rising else _is_rising(ts)
     ts = ts if rises is None else jnp.where(rises, ts, jnp.arange(ts.shape[0], dtype=ts.dtype))
-    times = times_of(ts[0], ts[1], ts[-1])
-    valid = is_valid(system, state, times.start, signals, rises)
-    # What is not finite must not enter the solver, where it would spoil the gradient of what is shared. In its steps
-    # what all members of a batch share remains shared, of which a kernel computes its part once.
-    stepped = replace_invalid_parameters(system)
+    others_are_valid = inputs_are_valid(signals) & (True if rises is None else rises)
+    # What is not finite must not enter the solver, where it would spoil the gradient of what is shared.
+    times, valid, system, state, stepped = beginning(system, state, ts, others_are_valid)
     if not isinstance(settings.adjoint, diffrax.ForwardMode):
         # In reverse mode the cotangent of each number would be a sum of its own, in each of the loops. In forward mode
         # they stay apart, since in a batch some of them may be shared.
         stepped = Packed.of(stepped, state.q.dtype)
-    system, state = where_valid(valid, (system, state))
     signals = mask_invalid_inputs(signals, valid)
     constrained = has_configuration_constraints(system, times.start, state.q)
     problem = InitialValueProblem(

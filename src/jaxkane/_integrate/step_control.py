@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._scalarjit.function import ScalarFunction
 from .._system.system import System
 from .events import AdaptiveEventController, EventController, Events, EventValues, InnerTolerances, Limits, event_values
 from .inputs import Discontinuities
@@ -87,7 +86,6 @@ class Times(NamedTuple):
     limits: Array
 
 
-@ScalarFunction.once
 def times_of(start: Array, second: Array, end: Array) -> Times:
     """Of the first, the second and the last time at which the motion is kept."""
     eps, duration = jnp.finfo(end.dtype).eps, jax.lax.stop_gradient(end - start)

@@ -248,9 +248,13 @@ class ScalarFunction:
         places = [i for i, dx in enumerate(along) if dx is not None]
         moving = [np.asarray(along[i]) for i in places]
         numbers, program = self.program(*args)
-        tangent = program and program.tangent(tuple(dx is not None for dx in along)).numpy
-        if program is not None and tangent is not None:
-            return jax.tree.unflatten(program.structure, tangent([*numbers, *moving], moving[0].shape[-1:]))
+        tangent = program and program.tangent(tuple(dx is not None for dx in along))
+        if program is not None and tangent and tangent.numpy is not None:
+            size = moving[0].shape[-1:]
+            slopes = iter(tangent.numpy([*numbers, *moving], size))
+            results = zip(tangent.moves, program.out_avals, strict=True)
+            slopes = [next(slopes) if m else np.zeros((*aval.shape, *size), aval.dtype) for m, aval in results]
+            return jax.tree.unflatten(program.structure, slopes)
         leaves, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, tuple(args)))
         of_moving = lambda *xs: self(*jax.tree.unflatten(structure, replaced(leaves, places, xs)))  # noqa: E731
         slope = lambda *dxs: jax.jvp(of_moving, tuple(leaves[i] for i in places), dxs)[1]  # noqa: E731
@@ -322,8 +326,8 @@ class Program:
 
     `loop_invariant`: places of the arguments that stay what they are while the program is called again and again, as
     the parameters of a system. `tangents`: places of those that are tangents; `linear`: of those in which all of it is
-    linear. `structure`: of the results. `once`: whether it is called once. `is_reduced`: whether `cse` would find
-    nothing in it.
+    linear; `moves`: which results of the program that it is a derivative of move. `structure`: of the results. `once`:
+    whether it is called once. `is_reduced`: whether `cse` would find nothing in it.
     """
 
     def __init__(
@@ -334,11 +338,12 @@ class Program:
         structure: Any = None,
         tangents: frozenset[int] = frozenset(),
         linear: frozenset[int] = frozenset(),
+        moves: tuple[bool, ...] = (),
         once: bool = False,
         is_reduced: bool = False,
     ):
         self.label, self.loop_invariant, self.structure, self.once = label, loop_invariant, structure, once
-        self.tangents, self.linear = tangents, linear
+        self.tangents, self.linear, self.moves = tangents, linear, moves
         self.program = program if is_reduced else cse(program)
         self.evaluate = jaxpr_as_fun(self.program)
         self.in_avals, self.out_avals = self.program.in_avals, self.program.out_avals
@@ -353,16 +358,18 @@ class Program:
         return _program_p.bind(*leaves, program=self, sizes=(), where=((),) * len(leaves))
 
     def _tangent(self, moving: tuple[bool, ...]) -> Program:
-        """(primals, tangents of those that move) -> tangents of the outputs that have any."""
+        """(primals, tangents of those that move) -> tangents of the outputs that move."""
         places = [i for i, m in enumerate(moving) if m]
         fixed = self.loop_invariant | {len(moving) + j for j, i in enumerate(places) if i in self.loop_invariant}
         linear = frozenset(range(len(moving), len(moving) + len(places)))
+        program, moves = tangent_program(self.program, places)
         return Program(
-            tangent_program(self.program, places),
+            program,
             self.label,
             fixed,
             tangents=self.tangents | linear,
             linear=linear,
+            moves=moves,
             once=self.once,
             is_reduced=True,
         )
@@ -465,21 +472,14 @@ def _jvp(primals, tangents, *, program, sizes, where):
         reads and is_inexact(x) and not is_no_tangent(dx)
         for reads, x, dx in zip(program.reads, program.in_avals, tangents, strict=True)
     )
-    moves = [(dx, w) for dx, m, w in zip(tangents, moving, where, strict=True) if m]
     outputs = _program_p.bind(*primals, program=program, sizes=sizes, where=where)
+    tangent, slopes = program.tangent(moving) if any(moving) else None, iter(())
+    if tangent and any(tangent.moves):
+        along, places = zip(*[(dx, w) for dx, m, w in zip(tangents, moving, where, strict=True) if m], strict=True)
+        slopes = iter(_program_p.bind(*primals, *along, program=tangent, sizes=sizes, where=(*where, *places)))
     shapes = _abstract(program=program, sizes=sizes, where=where)
-    if not moves:
-        return outputs, list(map(no_tangent, shapes))
-    slopes = iter(
-        _program_p.bind(
-            *primals,
-            *(dx for dx, _ in moves),
-            program=program.tangent(moving),
-            sizes=sizes,
-            where=(*where, *(w for _, w in moves)),
-        )
-    )
-    return outputs, [next(slopes) if is_inexact(aval) else no_tangent(aval) for aval in shapes]
+    moved = tangent.moves if tangent else (False,) * len(shapes)
+    return outputs, [next(slopes) if m else no_tangent(aval) for m, aval in zip(moved, shapes, strict=True)]
 
 
 def _transpose(cotangents, *args, program, sizes, where):

@@ -252,12 +252,8 @@ def _cotangents(equation: Any, moves_and_given: tuple[bool, ...], *values: Any) 
     return transposed(equation, xs, moves, [next(values_left) if is_one else None for is_one in given])
 
 
-def _zeros(once: _Once, aval: Any) -> Any:
-    return once.walk(program_of(lambda: jnp.zeros(aval.shape, aval.dtype)), [])[0]
-
-
-def tangent_program(program: ClosedJaxpr, moving: Sequence[int]) -> ClosedJaxpr:
-    """(inputs, tangents of those at the places `moving`) -> tangents of the outputs that have any.
+def tangent_program(program: ClosedJaxpr, moving: Sequence[int]) -> tuple[ClosedJaxpr, tuple[bool, ...]]:
+    """(inputs, tangents of those at the places `moving`) -> tangents of the outputs that move; and which these are.
 
     Equation by equation, by JAX's rule of each, traced once for all alike. To trace the whole takes four times as long.
     """
@@ -276,9 +272,8 @@ def tangent_program(program: ClosedJaxpr, moving: Sequence[int]) -> ClosedJaxpr:
 
     inputs = [(v, tangents.get(v)) for v in jaxpr.invars]
     pairs = interpret(program, inputs, rule, lambda v, x: (once.constant(v, x), None))
-    results = zip(pairs, types_of(program)[1], strict=True)
-    dys = [_zeros(once, aval) if dy is None else dy for (_, dy), aval in results if is_inexact(aval)]
-    return once.program(jaxpr, [*jaxpr.invars, *tangents.values()], dys)
+    dys = [dy for _, dy in pairs if dy is not None]
+    return once.program(jaxpr, [*jaxpr.invars, *tangents.values()], dys), tuple(dy is not None for _, dy in pairs)
 
 
 def transposed_program(program: ClosedJaxpr, linear: Sequence[int]) -> ClosedJaxpr:
@@ -318,7 +313,8 @@ def transposed_program(program: ClosedJaxpr, linear: Sequence[int]) -> ClosedJax
             fixed = [v for v in equation.invars if not moves(v)]
             rule = _rule(_cotangents, equation, which, *fixed, *(v for v, _ in given))
             add(equation.invars, rule.written(once, [*map(read, fixed), *(ct for _, ct in given)]))
-    results = [sums[v] if v in sums else _zeros(once, v.aval) for v in (jaxpr.invars[i] for i in linear)]
+    zeros = lambda aval: once.walk(program_of(lambda: jnp.zeros(aval.shape, aval.dtype)), [])[0]  # noqa: E731
+    results = [sums[v] if v in sums else zeros(v.aval) for v in (jaxpr.invars[i] for i in linear)]
     return once.program(jaxpr, [*inputs, *cotangents], results)
 
 
@@ -335,7 +331,7 @@ def jacobian(
 ) -> list[np.ndarray]:
     """The derivatives (..., d) of each output by d elements of the inputs, as nodes of the graph."""
     moving = sorted({i for i, _ in directions})
-    tangents = cse(tangent_program(program, moving))
+    tangents, moved = tangent_program(program, moving)
     jaxpr: Any = tangents.jaxpr
     avals = types_of(program)
     values = dict(zip(jaxpr.invars, inputs, strict=False)) | {
@@ -359,7 +355,8 @@ def jacobian(
                 along[v].flat[element] = graph.constant(1.0, str(v.aval.dtype))
         for equation in later:
             along.update(zip(equation.outvars, _outputs(equation, along, moves), strict=True))
-        outputs = zip([_read(v, along, moves) for v in jaxpr.outvars], avals[1], strict=True)
+        slopes = iter([_read(v, along, moves) for v in jaxpr.outvars])
+        outputs = [(next(slopes) if m else np.full(aval.shape, NOTHING), aval) for m, aval in zip(moved, avals[1])]
         columns.append([moves.instantiated(x, str(aval.dtype)) for x, aval in outputs])
     return [
         np.stack([column[i] for column in columns], axis=-1) if columns else np.zeros((*aval.shape, 0), np.int64)
