@@ -53,9 +53,15 @@ _MOVED = (
 
 
 def wrapper_text(
-    kernel: str, sizes: Sequence[int], where: Sequence[Sequence[bool]], n_out: int, bytes_of: Sequence[int]
+    kernel: str,
+    sizes: Sequence[int],
+    where: Sequence[Sequence[bool]],
+    n_out: int,
+    bytes_of: Sequence[int],
+    of_kernel: str = "",
 ) -> str:
-    """The function that XLA calls: for every place in the outer dimensions, the kernel on the lanes of the last.
+    """The function that XLA calls: for every place in the outer dimensions, the kernel on the lanes of the last. The
+    kernel has this name, in the program or in the text `of_kernel`, which becomes a part of this one.
 
     Argument i has those of the dimensions `sizes` that `where[i]` says, results have all; an element of each is so
     many bytes. Where a structure is not as large as it is taken to be, XLA is handed an error.
@@ -93,7 +99,8 @@ def wrapper_text(
     message = "".join(f"\\{byte:02X}" for byte in _MOVED.encode())
     return (
         f'@moved = private constant [{len(_MOVED) + 1} x i8] c"{message}\\00"\n'
-        f"declare void @{kernel}(ptr, ptr, i64)\ndeclare void @llvm.trap()\n"
+        + (of_kernel or f"declare void @{kernel}(ptr, ptr, i64)\n")
+        + "declare void @llvm.trap()\n"
         f"define ptr @it(ptr %frame) {{\n{body}\n}}\n"
     )
 

@@ -264,10 +264,13 @@ class Scalars:
         self.kernel = functools.cache(self._kernel)
         self.target = functools.cache(self._target)
 
-    def _kernel(self, groups: Groups, varies: tuple[bool, ...], lanes: int) -> str:
+    def _kernel(self, groups: Groups, varies: tuple[bool, ...], lanes: int) -> tuple[str, str]:
+        """Its name; and its text, where that is to be part of the one function that calls it."""
         of_lanes = functools.partial(llvm_compiler().of_lanes, lanes=lanes)
-        writer = Writer(self.graph.reading_groups(groups), varies, lanes, of_lanes)
-        return _compiled(writer.text(len(varies), self.outputs), self.level)[1]
+        text = Writer(self.graph.reading_groups(groups), varies, lanes, of_lanes).text(len(varies), self.outputs)
+        if self.level:
+            return _compiled(text, self.level)[1], ""
+        return "kernel", text.replace("define void @it(", "define internal void @kernel(")
 
     def _target(self, sizes: tuple[int, ...], where: tuple[tuple[bool, ...], ...], groups: Groups) -> str:
         """The name under which XLA calls the program for a batch of `sizes`, of whose dimensions argument i has those
@@ -284,8 +287,9 @@ class Scalars:
             sizes, where = (int(np.prod(sizes)),) if sizes else (), tuple((any(w),) if sizes else () for w in where)
         lanes = min(llvm_compiler().lanes, 1 << (sizes[-1] - 1).bit_length()) if sizes else 1
         with llvm_compiler().lock:
-            kernel = self.kernel(groups, tuple(bool(w and w[-1]) for w in where), lanes)
-            address, name = _compiled(wrapper_text(kernel, sizes, where, len(self.outputs), bytes_of), self.level)
+            kernel, text = self.kernel(groups, tuple(bool(w and w[-1]) for w in where), lanes)
+            wrapper = wrapper_text(kernel, sizes, where, len(self.outputs), bytes_of, text)
+            address, name = _compiled(wrapper, self.level)
             _register(address, name)
         return name
 
