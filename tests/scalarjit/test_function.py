@@ -16,7 +16,7 @@ from jaxkane._scalarjit.backends import xla
 from jaxkane._scalarjit.compat import jaxpr_as_fun
 from jaxkane._scalarjit.components import add, determinant, mul, solve, sub
 from jaxkane._scalarjit.function import Packed, ScalarFunction, tree_of
-from jaxkane._scalarjit.jaxpr import cse, transposed_program
+from jaxkane._scalarjit.jaxpr import cse, tangent_program, transposed_program
 
 
 def plain(a, b, x):
@@ -295,6 +295,43 @@ def test_a_program_is_transposed_as_jax_transposes_it():
         found = jaxpr_as_fun(transposed_program(traced, [1, 2, 3]))(jnp.array(a), *cts)
         for ours, theirs in zip(found, (*expected, jnp.zeros(())), strict=True):
             np.testing.assert_allclose(ours, theirs, rtol=rtol)
+
+
+def of_many_operations(a, x, y, n):
+    """One of each kind, numbers that stand still, and results that do not move or are inputs."""
+    z = jnp.sin(a * x) * jnp.exp(-x) + jnp.tanh(y) ** 3 - x[::-1] ** 1.5 / (1.0 + jnp.abs(y - x))
+    z = jnp.where(a < x, z, jnp.maximum(z, y)) + jnp.arctan2(z, jnp.sqrt(a)) * jnp.array([0.5, 2.0, 3.0])
+    still = jax.lax.stop_gradient(jnp.exp(1000.0 * y * z))  # infinite
+    flag = (z > 0) & (n > 2)
+    return z @ z, jnp.clip(z, -1.0, 1.0) + 0.0 * y, flag, jnp.floor(y), a, jnp.where(flag, 1.0, still), n, jnp.ones(2)
+
+
+@pytest.mark.parametrize("moving", [(0, 1, 2), (1,), (0, 2)], ids=str)
+def test_the_derivative_of_a_program_is_that_of_jax(moving):
+    rtol = 1e-14
+    args = (jnp.array(0.7), jnp.array([0.5, 0.9, 1.4]), jnp.array(0.8), jnp.array(3))
+    dxs = [jnp.cos(jnp.arange(1.0, args[i].size + 1.0)).reshape(args[i].shape) for i in moving]
+    program = cse(jax.make_jaxpr(of_many_operations)(*args))
+    tangent, moves = tangent_program(program, moving)
+    assert moves == (True, True, False, False, 0 in moving, False, False, False)
+    found = jaxpr_as_fun(tangent)(*args, *dxs)
+    of_moving = lambda *xs: of_many_operations(*[dict(zip(moving, xs)).get(i, x) for i, x in enumerate(args)])  # noqa: E731
+    expected = jax.jvp(of_moving, [args[i] for i in moving], dxs)[1]
+    for ours, theirs in zip(found, [dy for dy, m in zip(expected, moves) if m], strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=rtol)
+    # Nor is anything left in it that could be found once more, or that no result needs.
+    assert len(cse(tangent).jaxpr.eqns) == len(tangent.jaxpr.eqns)
+
+
+def test_numbers_that_do_not_move_have_no_derivative(kernels):
+    """Not even zero: JAX leaves out what is computed of it."""
+    f = ScalarFunction(lambda a, x: (jnp.sin(a), a * x, jax.lax.stop_gradient(x)))
+    still = lambda x: jnp.exp(f(0.5, x)[2]) * f(0.5, x)[0]  # noqa: E731
+    text = str(jax.make_jaxpr(lambda x: jax.jvp(still, (x,), (x,)))(0.3))
+    assert text.count(" exp ") == 1
+    assert text.endswith("0.0:f64[]) }")
+    slopes = jax.jit(jax.jacfwd(lambda a, x: f(a, x), argnums=1))(0.5, 0.3)
+    np.testing.assert_array_equal(slopes, [0.0, 0.5, 0.0])
 
 
 @pytest.mark.parametrize("operation", [add, sub, mul], ids=lambda f: f.__name__)
