@@ -17,7 +17,6 @@ from .._kane.kanes_method import KaneEquations
 from .._scalarjit.compat import depends_on
 from .._scalarjit.components import Component, as_vector, determinant
 from .._scalarjit.function import ScalarFunction
-from .._scalarjit.nan import negligible
 from .._system.system import State, System, unpacked
 from .status import REASONS, Status
 
@@ -180,52 +179,9 @@ def event_values(system: System, t: Component, y: Array, y_dot: Array | None) ->
 
 
 class EventPoint(NamedTuple):
-    """Where an event ended a motion: `t` [s], the packed state `y`, and whether both move smoothly with what they come
-    from."""
+    """Beside an event: `t` [s] and the packed state `y`, after a `step`, and whether they move smoothly with what they
+    come from."""
 
-    t: Array
-    y: Array
-    smooth: Array
-
-
-def locate_event(
-    system: System,
-    t: Array,
-    y: Array,
-    which: Array,
-    happened: Array,
-    rates: Any,
-    args: Any,
-    reach: Array,
-    events: Events,
-) -> EventPoint:
-    """The instant beside `t` at which the event `which` vanishes, with derivatives up to the second order.
-
-        t_end = t - g / g_dot,   y_end = y + (t_end - t) y_dot,   twice
-
-    To first order that is the implicit function theorem. Here `t` is a number, so near (within `reach`) that one step
-    of Newton's method is exact, and the packed state `y` is the motion at that time. The second step has the second
-    derivatives; in them the rates are those halfway, and follow from `args`. Elsewhere they are numbers.
-
-    **Arguments:** `rates`: (t, y, args) -> y_dot; `which`: as a float; `happened`: False where no event did: then it is
-    `t` itself.
-    """
-    t = jax.lax.stop_gradient(t)
-    y_dot = rates(*constant((t, y, args)))
-
-    def stepped(point: _Near) -> _Near:
-        quantities = event_values(system, point.t, point.y, y_dot if events.read_speeds else None)
-        return _next_point(reach, point, y_dot, quantities, which, happened)
-
-    def bend(h: Array, y: Array, args: Any) -> Array:
-        return h * (rates(t + 0.5 * h, y + 0.5 * h * y_dot, args) - y_dot)
-
-    near = stepped(_Near(t, y, jnp.zeros_like(t), jnp.array(True)))
-    end = stepped(near._replace(y=near.y + negligible(bend, near.step, y, args)))
-    return EventPoint(end.t, end.y, end.smooth)
-
-
-class _Near(NamedTuple):
     t: Array
     y: Array
     step: Array
@@ -233,7 +189,13 @@ class _Near(NamedTuple):
 
 
 @ScalarFunction.once
-def _next_point(reach: Array, point: _Near, y_dot, quantities: EventValues, which, happened) -> _Near:
+def next_point(reach: Array, point: EventPoint, y_dot, quantities: EventValues, which, happened) -> EventPoint:
+    """After a step of Newton's method towards the event `which`, a float; no step where none `happened`.
+
+        t - g / g_dot,   y - (g / g_dot) y_dot
+
+    It is smooth where the event is within `reach` [s]. The rates g_dot and y_dot are taken for numbers.
+    """
     g, g_dot = quantities.values[0], quantities.rates[0]
     for i in range(1, len(quantities.values)):
         g, g_dot = (jnp.where(which == i, x[i], x0) for x, x0 in ((quantities.values, g), (quantities.rates, g_dot)))
@@ -241,7 +203,7 @@ def _next_point(reach: Array, point: _Near, y_dot, quantities: EventValues, whic
     is_small = jnp.abs(g) <= jnp.abs(g_dot) * reach
     moves = happened & is_small & (g_dot != 0)
     step = jnp.where(moves, -g / jnp.where(moves, g_dot, jnp.ones_like(g_dot)), jnp.zeros_like(g))
-    return _Near(point.t + step, point.y + step * y_dot, step, point.smooth & is_small)
+    return EventPoint(point.t + step, point.y + step * y_dot, step, point.smooth & is_small)
 
 
 def constant(values: Any) -> Any:

@@ -19,11 +19,18 @@ from .._kane.rhs import outputs_at, rates_are_native, values_of, vector_field
 from .._scalarjit.cache_key import captured_tracers, captures_any, jit
 from .._scalarjit.components import as_vector
 from .._scalarjit.function import Packed, ScalarFunction, tree_of
-from .._scalarjit.nan import all_finite, derivative_free_where_not_finite, flat, nan_derivative_where, nan_where
+from .._scalarjit.nan import (
+    all_finite,
+    derivative_free_where_not_finite,
+    flat,
+    nan_derivative_where,
+    nan_where,
+    negligible,
+)
 from .._system.parameters import ANY, ParameterInfo, parameters_in
 from .._system.system import State, System, names_of, packed, units_of, unpacked
 from .diffrax_compat import UnrolledERK, saveat_and_adjoint
-from .events import EventPoint, Events, EventValues, constant, event_values, events_of, locate_event
+from .events import EventPoint, Events, EventValues, constant, event_values, events_of, next_point
 from .inputs import (
     Discontinuities,
     InputState,
@@ -347,12 +354,34 @@ def _by_event(point: EventPoint, ending: Ending) -> Ending:
     return ending._replace(t_end=t, end=y, smooth=ending.smooth | (ending.by_event & point.smooth))
 
 
+def _located(problem: InitialValueProblem, ending: Ending) -> EventPoint:
+    """Where the event is that ended the motion, with derivatives up to the second order; the start if none did.
+
+    The last step ends so near to it that the first step of Newton's method is exact, and that its first derivative is
+    that of the implicit function theorem. The second step has the second derivatives. In these alone the rates are
+    those halfway, and have a derivative.
+    """
+    system, events = problem.args[0], problem.events
+    t, y = jax.lax.stop_gradient(ending.near[0]), ending.near[1]
+    y_dot = problem.rates(*constant((t, y, problem.args)))
+
+    def stepped(point: EventPoint) -> EventPoint:
+        quantities = event_values(system, point.t, point.y, y_dot if events.read_speeds else None)
+        which = (ending.status - Status.EVENT, ending.by_event)
+        return next_point(problem.times.event_reach, point, y_dot, quantities, *which)
+
+    def bend(step: Array, y: Array, args: Any) -> Array:
+        return step * (problem.rates(t + 0.5 * step, y + 0.5 * step * y_dot, args) - y_dot)
+
+    near = stepped(EventPoint(t, y, jnp.zeros_like(t), jnp.array(True)))
+    reverse = not isinstance(problem.settings.adjoint, diffrax.ForwardMode)
+    return stepped(near._replace(y=near.y + negligible(bend, near.step, y, problem.args, transposes=reverse)))
+
+
 def _to_event(problem: InitialValueProblem, solution: Solution) -> Solution:
     """The same, whose end is the instant of the event, where one happened."""
-    times, ending, (system, *_) = problem.times, solution.ending, problem.args
-    which = (ending.status - Status.EVENT, ending.by_event)
-    point = locate_event(system, *ending.near, *which, problem.rates, problem.args, times.event_reach, problem.events)
-    end = _by_event(point, ending)
+    times, ending = problem.times, solution.ending
+    end = _by_event(_located(problem, ending), ending)
     # The last step ends a little beside the event: samples from there to here are those of the event itself.
     before = problem.ts <= end.t_end + times.rounding
     late = ending.by_event & ~solution.reached & before

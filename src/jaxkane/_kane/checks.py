@@ -8,7 +8,7 @@ from __future__ import annotations
 import functools
 import operator
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -17,7 +17,7 @@ import numpy as np
 
 from .._scalarjit.cache_key import Cache
 from .._scalarjit.compat import Tracer, concretely
-from .._scalarjit.components import Component, as_vector, cross, is_exact, stack
+from .._scalarjit.components import Component, as_vector, cross, dot, is_exact, mul, stack, sub, total
 from .._scalarjit.function import ScalarFunction
 from .._system.kinematics import Frame, Point
 from .._system.motion import Force, Load, Motion
@@ -136,17 +136,22 @@ def with_possible_bodies(system: System, t: Any, state: State) -> State:
 @ScalarFunction.once
 def _bodies_are_possible(system: System, t: Any, q: Any) -> Any:
     bodies = _masses_and_inertias.__wrapped__(system, t, q)
-    return functools.reduce(operator.and_, [_is_possible(mass, I, system.check_inertia) for mass, I in bodies])
+    rows = [(mass, [tuple(row) for row in I]) for mass, I in bodies]
+    return functools.reduce(operator.and_, [_is_possible(mass, I, system.check_inertia) for mass, I in rows])
 
 
-def _is_possible(mass: Any, I: Any, check_inertia: bool) -> Any:
-    trace = I[0, 0] + I[1, 1] + I[2, 2]
+Matrix = Sequence[Sequence[Component]]
+
+
+def _is_possible(mass: Any, I: Matrix, check_inertia: bool) -> Any:
     # c - a - b > 5 % of c, where c > trace / 1.95: and no c is, where trace / 1.95 - I has no eigenvalue below zero.
-    skew = functools.reduce(jnp.maximum, [jnp.abs(I[i, j] - I[j, i]) for i, j in _PAIRS])
+    skew = _largest([sub(I[i][j], I[j][i]) for i, j in _PAIRS])
     possible = (mass >= 0) & (skew <= 1e-6 * _size(I)) & _is_semidefinite(I)
     if check_inertia:
-        rest = trace / (2.0 - MEASURED) * np.eye(3, dtype=I.dtype) - I
-        is_rotor = sum(_minors(I)) <= 1e-12 * trace * trace
+        trace = total(I[i][i] for i in range(3))
+        half = mul(1.0 / (2.0 - MEASURED), trace)
+        rest = [[sub(half if i == j else 0.0, I[i][j]) for j in range(3)] for i in range(3)]
+        is_rotor = total(_minors(I)) <= mul(1e-12, mul(trace, trace))
         possible &= _is_semidefinite(rest) | is_rotor
     return possible
 
@@ -154,20 +159,27 @@ def _is_possible(mass: Any, I: Any, check_inertia: bool) -> Any:
 _PAIRS = ((0, 1), (0, 2), (1, 2))
 
 
-def _is_semidefinite(A: Any) -> Any:
+def _is_semidefinite(A: Matrix) -> Any:
     # By principal minors: LAPACK's eigenvalues of many small matrices would be slow, and wait for each other.
     size = _size(A)
-    det = sum(x * y for x, y in zip(A[0], cross(A[1], A[2]), strict=True))
-    minors = [*((A[i, i], size) for i in range(3)), *((x, size**2) for x in _minors(A)), (det, size**3)]
+    minors = [
+        *((A[i][i], size) for i in range(3)),
+        *((x, size**2) for x in _minors(A)),
+        (dot(A[0], cross(A[1], A[2])), size**3),
+    ]
     return functools.reduce(operator.and_, [x >= -1e-6 * scale for x, scale in minors])
 
 
-def _size(A: Any) -> Any:
-    return functools.reduce(jnp.maximum, [jnp.abs(A[i, j]) for i in range(3) for j in range(3)])
+def _size(A: Matrix) -> Any:
+    return _largest([x for row in A for x in row])
 
 
-def _minors(A: Any) -> list[Any]:
-    return [A[i, i] * A[j, j] - A[i, j] * A[j, i] for i, j in _PAIRS]
+def _largest(xs: Sequence[Component]) -> Any:
+    return functools.reduce(jax.lax.max, map(jnp.abs, xs))
+
+
+def _minors(A: Matrix) -> list[Any]:
+    return [sub(mul(A[i][i], A[j][j]), mul(A[i][j], A[j][i])) for i, j in _PAIRS]
 
 
 # -- a description that contradicts itself

@@ -76,11 +76,12 @@ def derivative_free_where_not_finite(f: Callable[..., Any], *arguments: Any) -> 
     return gated(moving, fixed)
 
 
-def negligible(f: Callable[..., Array], *arguments: Any) -> Array:
+def negligible(f: Callable[..., Array], *arguments: Any, transposes: bool = True) -> Array:
     """Zeros for the array `f(*arguments)`, whose value and first derivative are negligible, as of a product of two
     numbers that are both small; its second derivatives are those of `f`. Closed-over arrays count as arguments.
 
-    The derivatives of `f` are compiled only where second ones are asked for.
+    The derivatives of `f` are compiled only where second ones are asked for. `transposes`: whether any derivative is
+    in reverse mode, for which `f` is transposed at once.
     """
     f = eqx.filter_closure_convert(f, *arguments)
     moving, other = eqx.partition((f, arguments), eqx.is_inexact_array)
@@ -110,7 +111,7 @@ def negligible(f: Callable[..., Array], *arguments: Any) -> Array:
             return jnp.concatenate([y_dot - jnp.ravel(slope).astype(both.dtype), x_dot])
 
         right, given = jnp.pad(x_dot, (y.size, 0)), lambda _, right: right
-        solution = jax.lax.custom_linear_solve(equations, right, given, transpose_solve=given)
+        solution = jax.lax.custom_linear_solve(equations, right, given, given if transposes else None)
         return y, solution[: y.size].reshape(y.shape).astype(y.dtype)
 
     return zero(moving, fixed)
