@@ -6,6 +6,7 @@ conditioning all states at once on all measurements.
 """
 
 import dataclasses
+import functools
 
 import diffrax
 import jax
@@ -50,6 +51,7 @@ OPTIONS = {"unknown": {"x": DEVIATION[0], "x_dot": DEVIATION[1]}, "noise": {"x_d
 TIGHT = Simulation(step=0.05, solver=diffrax.Dopri8())
 
 
+@functools.cache
 def transition(h, stiffness, damping, q):
     """Phi (2, 2) over a time h, and the covariance (2, 2) that noise adds."""
     A = np.array([[0.0, 1.0], [-stiffness, -damping]])

@@ -274,9 +274,10 @@ def test_every_crossing_of_a_random_pencil_is_found(seed):
 
 
 @pytest.mark.slow
-@settings(max_examples=2000, deadline=None)
+@settings(max_examples=500, deadline=None)
 @given(st.integers(0, 2**32))
 def test_every_crossing_of_many_random_pencils_is_found(seed):
+    """Others in every run: of a fault in one of a hundred a run hears with a probability of 0.993."""
     every_crossing_is_found(seed)
 
 
@@ -367,11 +368,11 @@ def test_names_of_a_motorcycle_at_one_speed_and_in_coarse_steps():
         for i, j in np.argwhere(conjugate_pairs(values)):
             assert names[i] == names[j] or {*names[[i, j]]} <= {f"mode {k}" for k in range(1, 9)}
     for first in (1.0, 3.0, 5.0):
-        found = critical_speeds(motorcycle, jnp.arange(first, 50.1, 5.0))
+        found = critical_speeds(motorcycle, jnp.repeat(jnp.arange(first, 50.1, 5.0), 10, total_repeat_length=100))
         np.testing.assert_allclose(found.values, [5.934966209, 10.98552992], rtol=1e-9)
         for i, name in zip(found.mode, ("weave", "capsize"), strict=True):
             assert found.modes[i] in (name, f"mode {i + 1}")
-    fine = critical_speeds(motorcycle, jnp.linspace(1.0, 50.0, 99))
+    fine = critical_speeds(motorcycle, jnp.linspace(1.0, 50.0, 100))  # by the same program
     assert [fine.modes[i] for i in fine.mode] == ["weave", "capsize"]
 
 
