@@ -23,7 +23,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._scalarjit.cache_key import Cache, version_of
+from jaxkane._scalarjit.cache_key import Cache, version_of, with_room
 from jaxkane._scalarjit.function import ScalarFunction
 
 RTOL = 1e-12
@@ -725,3 +725,26 @@ def test_every_compiled_function_of_the_library_follows():
     found = {m[2] for path in source.rglob("*.py") for m in re.finditer(wrong, path.read_text(), re.MULTILINE)}
     of_numbers = {"_eliminate", "moved", "_chosen", "_solved_by_lapack", "_det_by_lapack"}
     assert found <= of_numbers, f"compile {found} with `cache_key.jit`, or show that they read no description"
+
+
+def test_calls_have_room_at_any_depth():
+    """At some depth, a call in a loop needs the next piece of memory of 16 kB for frames, in each turn of the loop."""
+    resource = pytest.importorskip("resource")
+
+    def several(n):
+        return several(n - 1) if n else 0
+
+    def loop():
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+        for _ in range(300):
+            several(10)
+        return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+    def at(depth, call):
+        return at(depth - 1, call) if depth else call(loop)
+
+    depths = range(0, 400, 4)
+    faults, with_enough = ([at(depth, call) for depth in depths] for call in (lambda f: f(), with_room))
+    assert sys.version_info >= (3, 14) or max(faults) >= 300
+    assert max(with_enough) < 100
+    assert with_room(dict, [(1, 2)], a=3) == {1: 2, "a": 3}

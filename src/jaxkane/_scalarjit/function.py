@@ -25,7 +25,7 @@ from .backends import native
 from .backends.native import Scalars
 from .backends.numpy import NumPyProgram
 from .backends.xla import as_one_function
-from .cache_key import Cache, CacheKey, explain_leaked_tracer, key_of, trace_with_snapshot
+from .cache_key import Cache, CacheKey, explain_leaked_tracer, key_of, trace_with_snapshot, with_room
 from .compat import (
     MISSING,
     ClosedJaxpr,
@@ -199,7 +199,7 @@ class ScalarFunction:
         label, (numbers, key) = _label(args[0]), key_of(*args)
         try:
             with explain_leaked_tracer(label):
-                return numbers, self._programs.get(key, lambda: self._traced(key, label))
+                return numbers, self._programs.get(key, lambda: with_room(self._traced, key, label))
         except _CapturedTracerError:
             return numbers, None
 
@@ -362,7 +362,7 @@ class Program:
         places = [i for i, m in enumerate(moving) if m]
         fixed = self.loop_invariant | {len(moving) + j for j, i in enumerate(places) if i in self.loop_invariant}
         linear = frozenset(range(len(moving), len(moving) + len(places)))
-        program, moves = tangent_program(self.program, places)
+        program, moves = with_room(tangent_program, self.program, places)
         return Program(
             program,
             self.label,
@@ -378,7 +378,7 @@ class Program:
         """(the other inputs, cotangents of the outputs) -> cotangents of the linear inputs."""
         places = [i for i, is_linear in enumerate(linear) if is_linear]
         fixed = [i for i, is_linear in enumerate(linear) if not is_linear]
-        program = transposed_program(self.program, places)
+        program = with_room(transposed_program, self.program, places)
         invariant = frozenset(j for j, i in enumerate(fixed) if i in self.loop_invariant)
         return Program(program, self.label, invariant, once=self.once, is_reduced=True)
 
@@ -570,7 +570,7 @@ def _by_kernel(*args, program, sizes, where, target):
 
 
 def _lower_on_cpu(context, *args, program, sizes, where):
-    target = program.target(sizes, where)
+    target = with_room(program.target, sizes, where)
     rule = _by_xla if target is None else functools.partial(_by_kernel, target=target)
     return as_lowering(rule)(context, *args, program=program, sizes=sizes, where=where)
 
