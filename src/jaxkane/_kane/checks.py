@@ -17,7 +17,7 @@ import numpy as np
 
 from .._scalarjit.cache_key import Cache
 from .._scalarjit.compat import Tracer, concretely
-from .._scalarjit.components import Component, as_vector, cross, dot, is_exact, mul, stack, sub, total
+from .._scalarjit.components import Component, Triple, as_vector, cross, dot, is_exact, mul, stack, sub, total
 from .._scalarjit.function import ScalarFunction
 from .._system.kinematics import Frame, Point
 from .._system.motion import Force, Load, Motion
@@ -136,11 +136,11 @@ def with_possible_bodies(system: System, t: Any, state: State) -> State:
 @ScalarFunction.once
 def _bodies_are_possible(system: System, t: Any, q: Any) -> Any:
     bodies = _masses_and_inertias.__wrapped__(system, t, q)
-    rows = [(mass, [tuple(row) for row in I]) for mass, I in bodies]
+    rows = [(mass, [(x, y, z) for x, y, z in I]) for mass, I in bodies]
     return functools.reduce(operator.and_, [_is_possible(mass, I, system.check_inertia) for mass, I in rows])
 
 
-Matrix = Sequence[Sequence[Component]]
+Matrix = Sequence[Triple]
 
 
 def _is_possible(mass: Any, I: Matrix, check_inertia: bool) -> Any:
@@ -150,7 +150,9 @@ def _is_possible(mass: Any, I: Matrix, check_inertia: bool) -> Any:
     if check_inertia:
         trace = total(I[i][i] for i in range(3))
         half = mul(1.0 / (2.0 - MEASURED), trace)
-        rest = [[sub(half if i == j else 0.0, I[i][j]) for j in range(3)] for i in range(3)]
+        (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = I
+        xx, yy, zz = sub(half, xx), sub(half, yy), sub(half, zz)
+        rest = [(xx, sub(0.0, xy), sub(0.0, xz)), (sub(0.0, yx), yy, sub(0.0, yz)), (sub(0.0, zx), sub(0.0, zy), zz)]
         is_rotor = total(_minors(I)) <= mul(1e-12, mul(trace, trace))
         possible &= _is_semidefinite(rest) | is_rotor
     return possible

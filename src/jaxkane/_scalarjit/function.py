@@ -252,7 +252,7 @@ class ScalarFunction:
         if program is not None and tangent and tangent.numpy is not None:
             size = moving[0].shape[-1:]
             slopes = iter(tangent.numpy([*numbers, *moving], size))
-            results = zip(tangent.moves, program.out_avals, strict=True)
+            results = zip(tangent.moves, specs_of(program.out_avals), strict=True)
             slopes = [next(slopes) if m else np.zeros((*aval.shape, *size), aval.dtype) for m, aval in results]
             return jax.tree.unflatten(program.structure, slopes)
         leaves, structure = jax.tree.flatten(jax.tree.map(jnp.asarray, tuple(args)))
