@@ -72,7 +72,6 @@ def test_a_dropped_particle(options):
     assert np.isnan(ride["drive"][~reached]).all()
 
 
-@pytest.mark.slow
 def test_second_derivatives_of_the_end():
     """By the velocity at the start, against the formula."""
     h, g = jnp.array(1.0), jnp.array(9.81)
@@ -96,7 +95,8 @@ class Pendulum(jk.System):
         return jk.Motion([jk.Body(1.0, 0.0, O.fixed(-self.length * rod.y), rod)])
 
     def loads(self, t, q, u, motion, inputs):
-        return jk.weight(motion, -9.81 * motion.N.y)
+        gravity = 9.81 + jnp.sin(3.0 * t) if self.way == 2 else 9.81
+        return jk.weight(motion, -gravity * motion.N.y)
 
     def events(self, t, q, u):
         low = jk.falling(jnp.sin(q["angle"]) - 0.05 * t * u["rate"] ** 2 - 0.01 * self.length)
@@ -116,13 +116,13 @@ def test_a_pendulum_through_the_vertical(way, quarters):
     expected = quarters * np.sqrt(1.3 / 9.81) * ellipk(np.sin(0.45) ** 2)
     found, slope = jax.jit(lambda x: jax.jvp(t_end, (x,), (1.0,)))(1.3)
     np.testing.assert_allclose(found, expected, atol=1e-9)
-    np.testing.assert_allclose(slope, expected / 2.6, rtol=1e-6)
+    np.testing.assert_allclose(slope, expected / 2.6, rtol=1e-9)
 
 
 @pytest.mark.slow
 def test_second_derivatives_along_several_directions():
-    """By a length, an angle and a rate, of an event that reads coordinates, speeds and the time: in forward mode, and
-    forward over reverse, against differences of first derivatives."""
+    """By a length, an angle and a rate; rates and the event read coordinates, speeds and the time. In forward mode,
+    and forward over reverse, against differences of first derivatives."""
 
     def end(x, adjoint):
         start, tolerances = jk.State(x[1:2], x[2:]), {"rtol": 1e-12, "atol": 1e-12}
