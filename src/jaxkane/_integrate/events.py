@@ -17,6 +17,7 @@ from .._kane.kanes_method import KaneEquations
 from .._scalarjit.compat import depends_on
 from .._scalarjit.components import Component, as_vector, determinant
 from .._scalarjit.function import ScalarFunction
+from .._scalarjit.nan import constant
 from .._system.system import State, System, unpacked
 from .status import REASONS, Status
 
@@ -204,11 +205,6 @@ def next_point(reach: Array, point: EventPoint, y_dot, quantities: EventValues, 
     moves = happened & is_small & (g_dot != 0)
     step = jnp.where(moves, -g / jnp.where(moves, g_dot, jnp.ones_like(g_dot)), jnp.zeros_like(g))
     return EventPoint(point.t + step, point.y + step * y_dot, step, point.smooth & is_small)
-
-
-def constant(values: Any) -> Any:
-    """The same arrays, of which nothing has a derivative."""
-    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, values)
 
 
 class Limits(eqx.Module):

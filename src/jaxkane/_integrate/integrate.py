@@ -21,6 +21,7 @@ from .._scalarjit.components import as_vector
 from .._scalarjit.function import Packed, ScalarFunction, tree_of
 from .._scalarjit.nan import (
     all_finite,
+    constant,
     derivative_free_where_not_finite,
     flat,
     nan_derivative_where,
@@ -30,7 +31,7 @@ from .._scalarjit.nan import (
 from .._system.parameters import ANY, ParameterInfo, parameters_in
 from .._system.system import State, System, names_of, packed, units_of, unpacked
 from .diffrax_compat import UnrolledERK, saveat_and_adjoint
-from .events import EventPoint, Events, EventValues, constant, event_values, events_of, next_point
+from .events import EventPoint, Events, EventValues, event_values, events_of, next_point
 from .inputs import (
     Discontinuities,
     InputState,

@@ -48,19 +48,18 @@ def flat(values: Any) -> Array:
     return jnp.concatenate(parts) if parts else jnp.zeros(0)
 
 
+def constant(values: Any) -> Any:
+    """The same arrays, of which nothing has a derivative."""
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, values)
+
+
 def derivative_free_where_not_finite(f: Callable[..., Any], *arguments: Any) -> Any:
     """`f(*arguments)`, with the derivative zero where any of its values is not finite.
 
     For trial values that will be thrown away: nobody reads them, but in reverse mode 0 * NaN would spoil the
     derivative of what `f` reads. Closed-over arrays count as arguments.
     """
-    f = eqx.filter_closure_convert(f, *arguments)
-    moving, other = eqx.partition((f, arguments), eqx.is_inexact_array)
-    fixed, rest = eqx.partition(other, eqx.is_array)
-
-    def value(moving: Any, fixed: Any) -> Any:
-        f, arguments = eqx.combine(moving, fixed, rest)
-        return f(*arguments)
+    value, moving, fixed = _of_arrays(f, arguments)
 
     @jax.custom_jvp
     def gated(moving: Any, fixed: Any) -> Any:
@@ -83,20 +82,12 @@ def negligible(f: Callable[..., Array], *arguments: Any, transposes: bool = True
     The derivatives of `f` are compiled only where second ones are asked for. `transposes`: whether any derivative is
     in reverse mode, for which `f` is transposed at once.
     """
-    f = eqx.filter_closure_convert(f, *arguments)
-    moving, other = eqx.partition((f, arguments), eqx.is_inexact_array)
-    fixed, rest = eqx.partition(other, eqx.is_array)
-
-    def value(moving: Any, fixed: Any) -> Array:
-        f, arguments = eqx.combine(moving, fixed, rest)
-        return f(*arguments)
+    value, moving, fixed = _of_arrays(f, arguments)
 
     @jax.custom_jvp
     def zero(moving: Any, fixed: Any) -> Array:
         y = jax.eval_shape(value, moving, fixed)
-        return jnp.where(
-            jnp.any(jnp.isnan(flat(moving))) & False, jnp.nan, jnp.zeros(y.shape, y.dtype)
-        )  # as in `_mask`
+        return jnp.where(_never(flat(moving)), jnp.nan, jnp.zeros(y.shape, y.dtype))
 
     @zero.defjvp
     def _(primals: Any, tangents: Any) -> Any:
@@ -117,6 +108,25 @@ def negligible(f: Callable[..., Array], *arguments: Any, transposes: bool = True
     return zero(moving, fixed)
 
 
+def _of_arrays(f: Callable[..., Any], arguments: Any) -> tuple[Callable[..., Any], Any, Any]:
+    """`f(*arguments)` as a function of its float arrays and its others, closed-over ones among them; and these."""
+    f = eqx.filter_closure_convert(f, *arguments)
+    moving, other = eqx.partition((f, arguments), eqx.is_inexact_array)
+    fixed, rest = eqx.partition(other, eqx.is_array)
+
+    def value(moving: Any, fixed: Any) -> Any:
+        f, arguments = eqx.combine(moving, fixed, rest)
+        return f(*arguments)
+
+    return value, moving, fixed
+
+
+def _never(point: Array) -> Array:
+    """False, and in a batch where `point` is: what is batched in a derivative must be so in the value, or JAX takes the
+    one for the other inside of a loop."""
+    return jnp.any(jnp.isnan(point)) & False
+
+
 def _masked(shown: bool, missing: Array, values: Any, origin: Any) -> Any:
     numbers = flat(origin)
 
@@ -135,8 +145,7 @@ def _masked(shown: bool, missing: Array, values: Any, origin: Any) -> Any:
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _mask(shown: bool, missing: Array, x: Array, point: Array) -> Array:
-    # What is batched in the derivative must be so in the value, or JAX takes the one for the other inside of a loop.
-    missing = missing | (jnp.any(jnp.isnan(point)) & False)
+    missing = missing | _never(point)
     return jnp.where(missing, x if shown else jnp.full_like(x, jnp.nan), x)
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, Complex, Float, Int
 from .._common.lookup import not_there
 from .._kane.arguments import is_concrete
 from .._scalarjit.cache_key import jit
-from .._scalarjit.nan import nan_where
+from .._scalarjit.nan import constant, nan_where
 from .._system.system import System
 from ._eig_of_matrix import Eig, eig
 from ._eigenvalues import MotionAt, eigenvalues, motion_family, names_of_modes, state_matrix, track_modes
@@ -183,7 +183,7 @@ class _Brackets(NamedTuple):
 
 @jit
 def _crossings(system, values, motion, states, groups, most: int):
-    fixed = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, (system, values))
+    fixed = constant((system, values))
     state_names: list[tuple[str, ...]] = []
 
     def at(p):
