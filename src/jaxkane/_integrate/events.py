@@ -7,7 +7,6 @@ import operator
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,7 +16,6 @@ from .._kane.kanes_method import KaneEquations
 from .._scalarjit.compat import depends_on
 from .._scalarjit.components import Component, as_vector, determinant
 from .._scalarjit.function import ScalarFunction
-from .._scalarjit.nan import constant
 from .._system.system import State, System, unpacked
 from .status import REASONS, Status
 
@@ -207,97 +205,38 @@ def next_point(reach: Array, point: EventPoint, y_dot, quantities: EventValues, 
     return EventPoint(point.t + step, point.y + step * y_dot, step, point.smooth & is_small)
 
 
-class Limits(eqx.Module):
-    """What ends a motion: its `end` [s], and events in these `directions` (see `first_crossing`).
+class Progress(NamedTuple):
+    """What one step leaves to the next, as floats: a loop masks, copies and saves each array of its state by a program
+    of its own, and so this is one array where it is `packed`.
 
-    `tolerances` (3,) [s]: how far behind a crossing the last step may end; which times differ by rounding alone; and a
-    step that is not halved at the bound.
+    `status` of the motion: `COMPLETED` until something else ends it; numbers of `steps`, and of those `accepted`;
+    `rejected_end`: the end of a step that an event rejected, else -infinity; `over_bound`: the end of the first step
+    over the bound, else infinity; `start`: the quantities at the start of the step, None where there are none.
     """
 
-    directions: tuple[int, ...] = eqx.field(static=True)
-    end: Array
-    tolerances: Array
-
-
-class EventState(NamedTuple):
-    """`inner`: of the inner controller; `progress`: a `Progress`, packed into one array (n,), since a loop masks,
-    copies and saves each array of its state by a program of its own."""
-
-    inner: Any
-    progress: Array
-
-
-class Progress(NamedTuple):
-    """`status` of the motion, as a float: `COMPLETED` unless an event or the bound ended it; `rejected_end`: the end of
-    a step that an event rejected, else -infinity; `over_bound`: the end of the first step over the bound, else
-    infinity; `start`: the quantities at the start of the step."""
-
     status: Array
+    steps: Array
+    accepted: Array
     rejected_end: Array
     over_bound: Array
     start: EventValues | None
 
     def packed(self) -> Array:
-        start: Any = () if self.start is None else (self.start.bound[None], self.start.values, self.start.rates)
-        return jnp.concatenate([jnp.stack(self[:3]), *start])
+        *numbers, start = self
+        more: Any = () if start is None else (start.bound[None], start.values, start.rates)
+        return jnp.concatenate([jnp.stack(numbers), *more])
 
     @classmethod
     def unpacked(cls, numbers: Array) -> Progress:
-        values = numbers[4:]
-        n = values.size // 2
-        start = EventValues(values[:n], values[n:], numbers[3]) if numbers.size > 3 else None
-        return cls(numbers[0], numbers[1], numbers[2], start)
-
-
-class EventController(diffrax.AbstractStepSizeController[Any, Any]):
-    """A controller that begins with a given step, and whose last step ends at the last time, or where a quantity
-    vanishes. The solution then ends as one with an event.
-
-    A cubic through the values and rates at both ends of a step tells whether an event passes zero. Where it does, the
-    step is rejected and repeated to just beyond that time, until the inner controller accepts a step that ends there.
-
-    A step behind which a quantity is no number is halved. Where it is as short as the resolution, the motion ends
-    before it as one whose steps became too small: whether the quantity passed zero is unknown.
-
-    A step over the bound is halved; where it is as short as the shortest, the motion ends before it. It also ends where
-    the first step over the bound did, if shorter ones do not pass it: so near to it, the outcome is chance.
-
-    `quantities`: (t, y, args) -> `EventValues`; None where there are none.
-    """
-
-    controller: diffrax.AbstractStepSizeController[Any, Any]
-    quantities: Callable[..., EventValues] | None
-    first: Array
-    limits: Limits
-
-    def wrap(self, direction: Any) -> EventController:
-        return eqx.tree_at(lambda c: c.controller, self, self.controller.wrap(direction))
-
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):  # type: ignore[override]
-        end, inner = self.controller.init(terms, t0, t1, y0, self.first, args, func, error_order)
-        return end, EventState(inner, _first_progress(self.limits, t0, self._values(t0, y0, args)))
-
-    def adapt_step_size(self, t0: Any, t1: Any, y0, y1_candidate, args, y_error, error_order, controller_state):  # type: ignore[override]
-        state: EventState = controller_state
-        following: Any = self.controller.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, state.inner
-        )
-        keep, next_t0, next_t1, jumped, inner, result = following
-        step = Step(t0, t1, next_t0, next_t1, jnp.asarray(keep))
-        decision = _decide(self.limits, state.progress, self._values(t1, y1_candidate, args), step)
-        state = EventState(_where(decision.inner_unchanged, state.inner, inner), decision.progress)
-        result = diffrax.RESULTS.where(decision.repeat, diffrax.RESULTS.successful, result)
-        result = diffrax.RESULTS.where(decision.ends, diffrax.RESULTS.event_occurred, result)
-        result = diffrax.RESULTS.where(decision.fails, diffrax.RESULTS.dt_min_reached, result)
-        return decision.keep, decision.next_t0, decision.next_t1, jumped, state, result
-
-    def _values(self, t: Any, y: Any, args: Any) -> EventValues | None:
-        # Where steps end has no derivative, and compiling one would take its time.
-        return None if self.quantities is None else self.quantities(*constant((t, y, args)))
+        n = len(cls._fields) - 1
+        values = numbers[n + 1 :]
+        middle = values.size // 2
+        start = EventValues(values[:middle], values[middle:], numbers[n]) if numbers.size > n else None
+        return cls(*[numbers[i] for i in range(n)], start)
 
 
 class Step(NamedTuple):
-    """A step from `t0` to `t1`, and what the inner controller makes of it: the next step, and whether this is kept."""
+    """A step from `t0` to `t1`; the next step; and whether this one is kept."""
 
     t0: Array
     t1: Array
@@ -306,9 +245,9 @@ class Step(NamedTuple):
     keep: Array
 
 
-class _Decision(NamedTuple):
-    """What becomes of a step: whether it is kept; the next one; whether it is to `repeat`; `ends` the motion; `fails`,
-    since a quantity is no number behind it; whether the inner controller's state stays; and the `progress`, packed."""
+class Verdict(NamedTuple):
+    """What events make of a step: whether it is kept; the next step; whether it is to `repeat`; whether the motion
+    `ends`, or `fails` since a quantity is no number behind it; and the `progress`."""
 
     keep: Array
     next_t0: Array
@@ -316,77 +255,69 @@ class _Decision(NamedTuple):
     repeat: Array
     ends: Array
     fails: Array
-    inner_unchanged: Array
-    progress: Any
+    progress: Progress
 
 
-@ScalarFunction.once
-def _first_progress(limits: Limits, t: Array, start: EventValues | None) -> Array:
-    if start is not None:
-        # What would have vanished within a rounding error of the start is on zero there.
-        on_zero = jnp.abs(start.values) <= jnp.abs(start.rates) * limits.tolerances[1]
-        start = start._replace(values=jnp.where(on_zero, jnp.zeros_like(start.values), start.values))
-    status, past, never = (jnp.full_like(t, x) for x in (Status.COMPLETED, -jnp.inf, jnp.inf))
-    return Progress(status, past, never, start).packed()
+def on_zero(start: EventValues, rounding: Array) -> EventValues:
+    """At the start of a motion: what would have vanished within a rounding error [s] is on zero."""
+    vanishes = jnp.abs(start.values) <= jnp.abs(start.rates) * rounding
+    return start._replace(values=jnp.where(vanishes, jnp.zeros_like(start.values), start.values))
 
 
-@ScalarFunction
-def _decide(limits: Limits, numbers: Array, end: EventValues | None, step: Step) -> _Decision:
-    # One function of scalars: as a hundred operations it would be as many programs, and half of XLA's work.
-    # The rest of a rejected step follows at once: a fixed step stays on its grid.
-    progress = Progress.unpacked(numbers)
-    resumes = step.keep & (step.t1 < progress.rejected_end)
-    step = step._replace(next_t1=jnp.where(resumes, progress.rejected_end, step.next_t1))
+def after_events(
+    directions: tuple[int, ...], times: Any, progress: Progress, end: EventValues | None, step: Step
+) -> Verdict:
+    """What becomes of a step at whose `end` the events have these values.
+
+    A cubic through the values and rates at both ends of a step tells whether an event passes zero. Where it does, the
+    step is rejected and repeated to just beyond that time, until a step is kept that ends there, which is the last.
+
+    A step behind which a quantity is no number is halved. Where it is as short as the resolution, the motion ends
+    before it as one whose steps became too small: whether the quantity passed zero is unknown.
+
+    A step over the bound is halved; where it is as short as `times.at_bound`, the motion ends before it. It also ends
+    where the first step over the bound did, if shorter ones do not pass it: so near to it, the outcome is chance.
+    """
     false = jnp.zeros_like(step.keep)
-    decision = _Decision(step.keep, step.next_t0, step.next_t1, false, false, false, resumes, progress)
-    if end is not None:
-        decision = _decide_by_events(limits, progress, end, step, resumes)
-    # As diffrax does it, a last step is none of a rounding error, and one that was not kept is halved.
-    near = decision.next_t1 > limits.end - 100 * jnp.finfo(limits.end.dtype).eps * jnp.abs(limits.end)
-    last = jnp.where(decision.keep, limits.end, decision.next_t0 + 0.5 * (limits.end - decision.next_t0))
-    arrived = decision.keep & (decision.next_t0 >= limits.end)
-    next_t1 = jnp.where(near, last, decision.next_t1)
-    return decision._replace(next_t1=next_t1, ends=decision.ends | arrived, progress=decision.progress.packed())
-
-
-def _decide_by_events(limits: Limits, progress: Progress, end: EventValues, step: Step, resumes: Array) -> _Decision:
+    if end is None:
+        return Verdict(step.keep, step.next_t0, step.next_t1, false, false, false, progress)
     start: Any = progress.start
-    resolution, _, shortest = limits.tolerances
     t0, t1 = jax.lax.stop_gradient((step.t0, step.t1))
     h, kept = t1 - t0, step.keep
     unknown = kept & functools.reduce(operator.or_, [x != x for x in end.values], jnp.array(False))
-    fails = unknown & (h <= resolution)
+    fails = unknown & (h <= times.resolution)
     kept &= ~unknown
-    event, x = _first_event(limits, start, end, h)
+    event, x = _first_event(directions, times.shortest, start, end, h)
     crossed = kept & (x <= 1)
     over = kept & (start.bound * end.bound < 0)
-    at_bound = (over & (h <= shortest)) | (kept & ~over & (t1 >= progress.over_bound))
+    at_bound = (over & (h <= times.at_bound)) | (kept & ~over & (t1 >= progress.over_bound))
     at_start = crossed & (x == 0) & ~over & ~at_bound
-    at_end = crossed & ((1 - x) * h <= resolution) & ~over & (x != 0) & ~at_bound
+    at_end = crossed & ((1 - x) * h <= times.resolution) & ~over & (x != 0) & ~at_bound
     repeat = ((crossed | over) & ~at_end & ~at_start & ~at_bound) | (unknown & ~fails)
-    beyond = jnp.where(over | unknown, 0.5 * h, jnp.minimum(x, 1.0) * h + 0.5 * resolution)
+    beyond = jnp.where(over | unknown, 0.5 * h, jnp.minimum(x, 1.0) * h + 0.5 * times.resolution)
     rejected = repeat | at_start | at_bound | fails
     status = jnp.where(at_bound, float(Status.SINGULAR_SPEEDS), progress.status)
-    return _Decision(
+    return Verdict(
         keep=step.keep & ~rejected,
         next_t0=jnp.where(rejected, step.t0, step.next_t0),
         next_t1=jnp.where(repeat, t0 + beyond, step.next_t1),
         repeat=repeat,
         ends=at_end | at_start | at_bound,
         fails=fails,
-        inner_unchanged=resumes | rejected,
-        progress=Progress(
+        progress=progress._replace(
             status=jnp.where(at_end | at_start, float(Status.EVENT) + event, status),
             rejected_end=jnp.where(repeat & ~over, jnp.maximum(progress.rejected_end, t1), progress.rejected_end),
             over_bound=jnp.where(over, jnp.minimum(progress.over_bound, t1), progress.over_bound),
-            start=_where(kept & ~rejected, end, start),
+            start=jax.tree.map(lambda new, old: jnp.where(kept & ~rejected, new, old), end, start),
         ),
     )
 
 
-def _first_event(limits: Limits, start: EventValues, end: EventValues, h: Array) -> tuple[Array, Array]:
+def _first_event(
+    directions: tuple[int, ...], rounding: Array, start: EventValues, end: EventValues, h: Array
+) -> tuple[Array, Array]:
     """Which quantity passes zero first in a step, and where in [0, 1]; infinite if none does."""
-    direction, (_, rounding, _) = jnp.asarray(limits.directions, h.dtype), limits.tolerances
+    direction = jnp.asarray(directions, h.dtype)
     # Where a quantity has no rate, as a norm at zero, the chord has to do.
     chord = end.values - start.values
     slopes = [jnp.where(jnp.abs(rates) < jnp.inf, h * rates, chord) for rates in (start.rates, end.rates)]
@@ -396,31 +327,7 @@ def _first_event(limits: Limits, start: EventValues, end: EventValues, h: Array)
     coming &= jnp.abs(end.values) <= jnp.abs(end.rates) * rounding
     x = jnp.where(coming, jnp.minimum(x, 1.0), x)
     event, place = jnp.full_like(h, -1.0), jnp.full_like(h, jnp.inf)
-    for i in reversed(range(len(limits.directions))):
+    for i in reversed(range(len(directions))):
         nearer = x[i] <= place
         event, place = jnp.where(nearer, float(i), event), jnp.where(nearer, x[i], place)
     return event, place
-
-
-class InnerTolerances(diffrax.AbstractAdaptiveStepSizeController[Any, Any]):
-    """The tolerances of a controller are those of its inner one; implicit solvers ask for them."""
-
-    @property
-    def rtol(self) -> Any:  # type: ignore[override]
-        return self.controller.rtol  # type: ignore[attr-defined]
-
-    @property
-    def atol(self) -> Any:  # type: ignore[override]
-        return self.controller.atol  # type: ignore[attr-defined]
-
-    @property
-    def norm(self) -> Any:  # type: ignore[override]
-        return self.controller.norm  # type: ignore[attr-defined]
-
-
-class AdaptiveEventController(EventController, InnerTolerances):
-    """An `EventController` around a controller with tolerances."""
-
-
-def _where(condition: Any, x: Any, y: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), x, y)

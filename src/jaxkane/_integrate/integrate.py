@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -30,7 +30,6 @@ from .._scalarjit.nan import (
 )
 from .._system.parameters import ANY, ParameterInfo, parameters_in
 from .._system.system import State, System, names_of, packed, units_of, unpacked
-from .diffrax_compat import UnrolledERK, saveat_and_adjoint
 from .events import EventPoint, Events, EventValues, event_values, events_of, next_point
 from .inputs import (
     Discontinuities,
@@ -45,15 +44,14 @@ from .inputs import (
     samples_of,
 )
 from .settings import Settings
-from .status import Outcome, Status, outcome_of, status_of
-from .step_control import Times, controller_of, times_of
+from .status import Status
+from .step_control import LARGEST_SMALL, Kinks, Rules, StepControl, Times, times_of
+from .steps import UnrolledERK, take_steps
 from .trajectory import InputDiscontinuities, Trajectory
-
-_LARGEST_SMALL = 64  # a larger array is no argument of a program of scalars
 
 
 def _is_small(x: Any) -> bool:
-    return eqx.is_inexact_array(x) and 0 < x.size <= _LARGEST_SMALL
+    return eqx.is_inexact_array(x) and 0 < x.size <= LARGEST_SMALL
 
 
 def _is_rising(ts: Array) -> Array:
@@ -309,40 +307,57 @@ def _integrated(problem: InitialValueProblem) -> Solution:
         # A step that is rejected since its rates are not finite must not spoil a derivative in reverse mode.
         return derivative_free_where_not_finite(problem.rates, t, y, args)
 
-    forward = isinstance(settings.adjoint, diffrax.ForwardMode)
     inputs = inputs_at(problem.system, problem.signals, times.start, unpacked(problem.system, problem.start))
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(problem.rates if forward else trial_rates),
+    steps = take_steps(
+        problem.rates if isinstance(settings.adjoint, diffrax.ForwardMode) else trial_rates,
         _solver_for(settings, stepped, times.start, problem.start, inputs),
-        times.start,
-        times.end,
-        None,
+        _control_of(problem),
         problem.start,
         problem.args,
-        stepsize_controller=controller_of(
-            times, problem.rates, problem.events, problem.system, problem.discontinuities, settings
-        ),
-        **saveat_and_adjoint(problem.ts, settings.adjoint, as_given=settings.progress),
-        max_steps=settings.max_steps,
-        progress_meter=diffrax.TqdmProgressMeter() if settings.progress else diffrax.NoProgressMeter(),
-        throw=False,
+        problem.ts,
+        settings.adjoint,
+        diffrax.TqdmProgressMeter() if settings.progress else diffrax.NoProgressMeter(),
     )
-    (t_reached, t_last), (motion, last) = cast(Any, (jax.lax.stop_gradient(solution.ts), solution.ys))
-    steps = {"steps": "num_steps", "accepted": "num_accepted_steps", "rejected": "num_rejected_steps"}
+    progress = steps.progress
+    numbers = (progress.steps, progress.accepted, progress.steps - progress.accepted)
     return Solution(
-        motion=motion,
-        reached=jnp.isfinite(t_reached) & problem.valid,
-        ending=_ending(times, outcome_of(solution), problem.valid, t_last[0], last[0], problem.start),
-        stats={name: solution.stats[key] for name, key in steps.items()},
+        motion=steps.motion,
+        reached=(jnp.arange(len(problem.ts)) < steps.count) & problem.valid,
+        ending=_ending(times, progress.status, problem.valid, steps.t_end, steps.end, problem.start),
+        stats={name: x.astype(int) for name, x in zip(("steps", "accepted", "rejected"), numbers, strict=True)},
     )
+
+
+def _control_of(problem: InitialValueProblem) -> StepControl:
+    """What ends the steps: the last time, events, and dependent speeds that are about to be singular."""
+    system, settings, times, events = problem.system, problem.settings, problem.times, problem.events
+
+    def quantities(t: Array, y: Array, args: Any) -> EventValues:
+        return event_values(args[0], t, y, problem.rates(t, y, args) if events.read_speeds else None)
+
+    as_number = lambda x: None if x is None else jnp.asarray(x, times.end.dtype)  # noqa: E731
+    fixed, kinks = settings.step is not None, problem.discontinuities
+    rules = Rules(
+        rtol=None if fixed else as_number(settings.rtol),
+        atol=None if fixed else as_number(settings.atol),
+        # A fixed step is spread evenly over the whole time: a rounding error must not make it one step more, after
+        # which no step would end where a sample of an input stands.
+        step=(1.0 + jnp.finfo(times.end.dtype).eps ** 0.5) * as_number(settings.step) if fixed else None,
+        times=times,
+        order=None if fixed else settings.solver.error_order(diffrax.ODETerm(problem.rates)),
+        max_steps=settings.max_steps,
+        directions=events.directions,
+    )
+    may_end = quantities if events.names or system.dependent_speeds else None
+    return StepControl(rules, may_end, None if kinks is None or fixed else Kinks.of(kinks, times.end))
 
 
 # One function of scalars each: XLA would compute it anew in every program that reads any of it.
 
 
 @ScalarFunction.once
-def _ending(times: Times, outcome: Outcome, valid: Array, t_last: Array, last: Array, start: Array) -> Ending:
-    status = status_of(outcome, valid)
+def _ending(times: Times, status: Array, valid: Array, t_last: Array, last: Array, start: Array) -> Ending:
+    status = jnp.where(valid, status, float(Status.INVALID))
     completed, by_event = status == Status.COMPLETED, status >= Status.EVENT
     t_end, end = jnp.where(completed, times.end, jnp.where(valid, t_last, times.start)), jnp.where(valid, last, start)
     near = jnp.where(by_event, t_end, times.start), jnp.where(by_event, end, start)

@@ -1,13 +1,8 @@
-"""How a motion ended: the status codes, their words, their advice, and the decision which of them it is."""
+"""How a motion ended: the status codes, their words and their advice."""
 
 from __future__ import annotations
 
 import enum
-from typing import NamedTuple
-
-import diffrax
-import jax.numpy as jnp
-from jaxtyping import Array
 
 
 class Status(enum.IntEnum):
@@ -30,40 +25,6 @@ class Status(enum.IntEnum):
     """The equations have no finite solution at the first state: a speed that no mass moves with, angles that lock,
     constraints that cannot be solved for the dependent speeds. One simulation alone raises an error that says which."""
     EVENT = 10
-
-
-class Outcome(NamedTuple):
-    """What a solution says of its end: the status by its `EventController`, whether that ended it, whether it is
-    `successful` or `out_of_steps` to diffrax, and whether it has `no_step` that was accepted."""
-
-    by_controller: Array
-    is_event: Array
-    successful: Array
-    out_of_steps: Array
-    no_step: Array
-
-
-def outcome_of(solution: diffrax.Solution) -> Outcome:
-    result, state = solution.result, solution.controller_state
-    return Outcome(
-        by_controller=state.progress[0],  # pyright: ignore[reportOptionalMemberAccess]
-        is_event=result == diffrax.RESULTS.event_occurred,
-        successful=result == diffrax.RESULTS.successful,
-        out_of_steps=result == diffrax.RESULTS.max_steps_reached,
-        no_step=solution.stats["num_accepted_steps"] == 0,
-    )
-
-
-def status_of(outcome: Outcome, valid: Array) -> Array:
-    """The status, as a float. The `EventController` says why it ended the motion, diffrax why else it ended.
-
-    `valid`: whether the motion could begin.
-    """
-    failed = jnp.where(outcome.no_step, float(Status.NO_SOLUTION), float(Status.STEP_TOO_SMALL))
-    status = jnp.where(outcome.successful, float(Status.COMPLETED), failed)
-    status = jnp.where(outcome.out_of_steps, float(Status.MAX_STEPS), status)
-    status = jnp.where(outcome.is_event, outcome.by_controller, status)
-    return jnp.where(valid, status, float(Status.INVALID))
 
 
 def reason(code: int, events: tuple[str, ...]) -> str:

@@ -1,6 +1,6 @@
-"""Where the step size is chosen: by the error of a step, clipped at the discontinuities of inputs and at events.
+"""What decides on each step: whether it is kept, how long the next one is, and whether the motion has ended.
 
-The error is that of `diffrax.PIDController`.
+A step is as long as its error allows, and ends at the kinks of inputs, at events and at the last time.
 """
 
 from __future__ import annotations
@@ -8,82 +8,33 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from .._system.system import System
-from .events import AdaptiveEventController, EventController, Events, EventValues, InnerTolerances, Limits, event_values
+from .._scalarjit.function import ScalarFunction
+from .._scalarjit.nan import constant
+from .events import EventValues, Progress, Step, after_events, on_zero
 from .inputs import Discontinuities
-from .settings import Settings
+from .status import Status
 
-
-class ClipToDiscontinuities(InnerTolerances):
-    """A controller whose steps do not run over those of `times` (n,), in rising order, that come before `end`.
-
-    A step over a kink would be of first order, whatever the solver. What is left before a kink is gone in one step, or
-    in two halves, so that no step is as short as a rounding error: after that, `dtmin` would end the solution.
-
-    The derivative of a signal by the time of its kink differs on the two sides, and so a step must belong to one of
-    them. Steps therefore end and begin a rounding error beside a kink, and move with it; other ends do not move. With
-    `restart` they begin with a right-hand side of their own: where two signals have a kink at one time, and only one of
-    them moves, the derivative that came from the left would be wrong on the right.
-    """
-
-    controller: diffrax.AbstractAdaptiveStepSizeController[Any, Any]
-    times: Float[Array, " n"]
-    restart: bool = eqx.field(static=True)
-
-    def __init__(self, controller: Any, times: Float[Array, " n"], restart: bool = False, end: Any = jnp.inf):
-        self.controller, self.restart = controller, restart
-        # A step that ends beside a kink at the end would leave the end out.
-        self.times = jnp.where(times < end - _rounding(times), times, jnp.inf)
-
-    def wrap(self, direction: Any) -> ClipToDiscontinuities:
-        return ClipToDiscontinuities(self.controller.wrap(direction), jnp.sort(self.times * direction), self.restart)
-
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):  # type: ignore[override]
-        end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
-        return self._clipped(t0, end), state
-
-    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):  # type: ignore[override]
-        keep, next_t0, next_t1, jumped, state, result = self.controller.adapt_step_size(
-            t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state
-        )
-        rounding = _rounding(self.times)
-        i = jnp.minimum(jnp.searchsorted(self.times, next_t0 - rounding), len(self.times) - 1)
-        at_kink = keep & (jnp.abs(next_t0 - self.times[i]) <= rounding)
-        next_t0 = jnp.where(at_kink, self.times[i] + 0.25 * rounding, next_t0)
-        jumped = jumped | at_kink if self.restart else jumped
-        return keep, next_t0, self._clipped(next_t0, next_t1), jumped, state, result
-
-    def _clipped(self, t0: Any, t1: Any) -> Any:
-        t1, rounding = jax.lax.stop_gradient(t1), _rounding(self.times)
-        i = jnp.searchsorted(self.times, t0 + rounding, side="right")
-        kink = jnp.where(i < len(self.times), self.times[jnp.minimum(i, len(self.times) - 1)], jnp.inf)
-        halfway = jax.lax.stop_gradient(t0 + 0.5 * (kink - t0))
-        return jnp.where(t1 >= kink, kink - 0.25 * rounding, jnp.minimum(t1, halfway))
-
-
-def _rounding(times: Array) -> Array:
-    """How near to one of these times rounding errors keep another."""
-    times = jax.lax.stop_gradient(times)
-    return 64 * jnp.finfo(times.dtype).eps * jnp.max(jnp.where(jnp.isfinite(times), jnp.abs(times), 0.0))
+LARGEST_SMALL = 64  # a larger array is no argument of a program of scalars
 
 
 class Times(NamedTuple):
-    """Of a motion [s]: its `start` and `end`; its `first` step by error control; the `shortest` step; how near to an
-    event it is looked for; by how much times differ through `rounding` alone; and the tolerances of `Limits` (3,)."""
+    """Of a motion [s]: its `start` and `end`; its `first` step by error control; the `shortest` step; how far behind an
+    event the last step may end (`resolution`), and how near to an event it is looked for; a step that is not halved at
+    the bound; and by how much times differ through `rounding` alone."""
 
     start: Array
     end: Array
     first: Array
     shortest: Array
+    resolution: Array
     event_reach: Array
+    at_bound: Array
     rounding: Array
-    limits: Array
 
 
 def times_of(start: Array, second: Array, end: Array) -> Times:
@@ -94,38 +45,226 @@ def times_of(start: Array, second: Array, end: Array) -> Times:
     return Times(
         start=start,
         end=end,
-        # A first step, right or wrong by a factor of ten, spares the two more copies of the right-hand side that
-        # diffrax would compile to choose one.
+        # A first step, right or wrong by a factor of ten, spares the two more copies of the right-hand side by which
+        # the error could choose one.
         first=jnp.minimum(duration / 1000, jax.lax.stop_gradient(second - start)),
         shortest=shortest,
+        resolution=resolution,
         event_reach=4 * resolution,
+        at_bound=duration / 1000,
         rounding=64 * eps * jax.lax.stop_gradient(jnp.maximum(jnp.abs(start), jnp.abs(end))),
-        limits=jnp.stack([resolution, shortest, duration / 1000]),
     )
 
 
-def controller_of(
-    times: Times,
-    vector_field: Callable[..., Array],
-    events: Events,
-    system: System,
-    discontinuities: Discontinuities | None,
-    settings: Settings,
-) -> EventController:
-    """The controller of the steps, which ends the motion: at the last time, at the events, and before the dependent
-    speeds are singular."""
+class Kinks(eqx.Module):
+    """The `times` (n,) of kinks, in rising order, that no step passes over; infinity for those that are none.
 
-    def quantities(t: Array, y: Array, args: Any) -> EventValues:
-        return event_values(args[0], t, y, vector_field(t, y, args) if events.read_speeds else None)
+    A step over a kink would be of first order, whatever the solver. What is left before a kink is gone in one step, or
+    in two halves, so that no step is as short as a rounding error: after that, the shortest would end the motion.
 
-    limits = Limits(events.directions, times.end, times.limits)
-    may_end = quantities if events.names or system.dependent_speeds else None
-    if settings.step is not None:
-        # A fixed step is spread evenly over the whole time: a rounding error must not make it one step more, after
-        # which no step would end where a sample of an input stands.
-        step = (1.0 + jnp.finfo(times.end.dtype).eps ** 0.5) * settings.step
-        return EventController(diffrax.ConstantStepSize(), may_end, step, limits)
-    controller: Any = diffrax.PIDController(settings.rtol, settings.atol, dtmin=times.shortest, force_dtmin=False)
-    if discontinuities is not None:
-        controller = ClipToDiscontinuities(controller, discontinuities.times, discontinuities.restart, end=times.end)
-    return AdaptiveEventController(controller, may_end, times.first, limits)  # pyright: ignore[reportCallIssue]
+    The derivative of a signal by the time of its kink differs on the two sides, and so a step must belong to one of
+    them. Steps therefore end and begin a rounding error beside a kink, and move with it; other ends do not move. With
+    `restart` they begin with a right-hand side of their own: where two signals have a kink at one time, and only one of
+    them moves, the derivative that came from the left would be wrong on the right.
+    """
+
+    times: Float[Array, " n"]
+    rounding: Array
+    restart: bool = eqx.field(static=True)
+
+    @classmethod
+    def of(cls, discontinuities: Discontinuities, end: Array) -> Kinks:
+        """Those before the `end`. A step that ends beside a kink at the end would leave the end out."""
+        rounding = _rounding(discontinuities.times)
+        times = jnp.where(discontinuities.times < end - rounding, discontinuities.times, jnp.inf)
+        return cls(times, _rounding(times), discontinuities.restart)
+
+    def after(self, t: Array) -> Array:
+        """The next kink; infinity where there is none."""
+        i = jnp.searchsorted(self.times, t + self.rounding, side="right")
+        return jnp.where(i < len(self.times), self.times[jnp.minimum(i, len(self.times) - 1)], jnp.inf)
+
+    def beside(self, t0: Array, t1: Array) -> Beside:
+        """Of a step."""
+        kink = self.times[jnp.minimum(jnp.searchsorted(self.times, t1 - self.rounding), len(self.times) - 1)]
+        at_end = jnp.abs(t1 - kink) <= self.rounding
+        start = jnp.where(at_end, kink + 0.25 * self.rounding, t1)
+        return Beside(at_end, start, self.after(start), self.after(t0), self.rounding)
+
+
+def _rounding(times: Array) -> Array:
+    """How near to one of these times rounding errors keep another."""
+    times = jax.lax.stop_gradient(times)
+    return 64 * jnp.finfo(times.dtype).eps * jnp.max(jnp.where(jnp.isfinite(times), jnp.abs(times), 0.0))
+
+
+class Beside(NamedTuple):
+    """The kinks beside a step: whether it ends `at_kink`; the `start` of the next step where this one is kept; the next
+    kinks after that start, and after the start of this step; and their `rounding`."""
+
+    at_kink: Array
+    start: Array
+    after: Array
+    before: Array
+    rounding: Array
+
+
+def _clipped(t0: Array, t1: Array, kink: Array, rounding: Array) -> Array:
+    """The end of a step that would end at t1, where the next kink may come before."""
+    t1, halfway = jax.lax.stop_gradient((t1, t0 + 0.5 * (kink - t0)))
+    return jnp.where(t1 >= kink, kink - 0.25 * rounding, jnp.minimum(t1, halfway))
+
+
+class Decision(NamedTuple):
+    """What becomes of a step: whether it is kept; the ends of the next one; the state there, and the solver's; whether
+    it begins behind a jump; the `progress`, packed; and whether the motion goes on."""
+
+    keep: Array
+    t0: Array
+    t1: Array
+    y: Any
+    solver_state: Any
+    jumped: Array
+    progress: Array
+    goes_on: Array
+
+
+class Rules(eqx.Module):
+    """The numbers by which steps are chosen: tolerances and the `order` of the error, or a fixed `step` [s]; the times;
+    at most `max_steps`; and the directions in which events count (see `first_crossing`)."""
+
+    rtol: Array | None
+    atol: Array | None
+    step: Array | None
+    times: Times
+    order: float | None = eqx.field(static=True)
+    max_steps: int | None = eqx.field(static=True)
+    directions: tuple[int, ...] = eqx.field(static=True)
+
+
+class StepControl(NamedTuple):
+    """The `rules`; `quantities`: (t, y, args) -> `EventValues`, None where there are none; and the kinks."""
+
+    rules: Rules
+    quantities: Callable[..., EventValues] | None
+    kinks: Kinks | None
+
+    def first(self, y0: Array, args: Any) -> tuple[Array, Array]:
+        """The end of the first step, and the progress, packed."""
+        start = self.rules.times.start
+        kink = None if self.kinks is None else (self.kinks.after(start), self.kinks.rounding)
+        return _first(self.rules, self._values(start, y0, args), kink)
+
+    def following(
+        self, progress: Array, t0: Array, t1: Array, new: Any, old: Any, error: Any, failed: Array | None, args: Any
+    ) -> Decision:
+        """What becomes of a step from t0 to t1.
+
+        **Arguments:** `new` and `old`: (y, the solver's state) behind the step and before it; the solver's estimate of
+        the `error`, None where it has none; whether it `failed`, None where it cannot.
+        """
+        beside = None if self.kinks is None else self.kinks.beside(t0, t1)
+        quantities = self._values(t1, new[0], args)
+        measured = constant((old[0], new[0], error)) if self.rules.step is None else None
+        # Large arrays are chosen by themselves.
+        is_small = lambda x: eqx.is_inexact_array(x) and x.size <= LARGEST_SMALL  # noqa: E731
+        small = [eqx.filter(x, is_small) for x in (new, old)]
+        f = _following if is_small(new[0]) else _following.__wrapped__
+        decision = f(self.rules, constant(progress), t0, t1, quantities, measured, failed, beside, *small)
+        large = [eqx.filter(x, is_small, inverse=True) for x in (new, old)]
+        y, state = eqx.combine((decision.y, decision.solver_state), _where(decision.keep, *large))
+        return decision._replace(y=y, solver_state=state)
+
+    def _values(self, t: Any, y: Any, args: Any) -> EventValues | None:
+        # Where steps end has no derivative, and compiling one would take its time.
+        return None if self.quantities is None else self.quantities(*constant((t, y, args)))
+
+
+@ScalarFunction.once
+def _first(rules: Rules, quantities: EventValues | None, kink: Any) -> tuple[Array, Array]:
+    times = rules.times
+    h = jnp.maximum(times.first, times.shortest) if rules.step is None else rules.step
+    end = times.start + h
+    end = end if kink is None else _clipped(times.start, end, *kink)
+    status, none, past, never = (jnp.full_like(h, x) for x in (Status.COMPLETED, 0.0, -jnp.inf, jnp.inf))
+    start = None if quantities is None else on_zero(quantities, times.shortest)
+    return jnp.minimum(end, times.end), Progress(status, none, none, past, never, start).packed()
+
+
+# One function of scalars: as a hundred operations it would be as many programs, and half of XLA's work.
+@ScalarFunction
+def _following(
+    rules: Rules,
+    progress: Array,
+    t0: Array,
+    t1: Array,
+    quantities: EventValues | None,
+    measured: Any,
+    failed: Array | None,
+    beside: Beside | None,
+    new: Any,
+    old: Any,
+) -> Decision:
+    times, before = rules.times, Progress.unpacked(progress)
+    keep, h, too_short = _by_error(rules, t1 - t0, measured)
+    next_t0, jumped = jnp.where(keep, t1, t0), jnp.zeros_like(keep)
+    if beside is not None:
+        next_t0 = jnp.where(keep, beside.start, t0)
+        jumped = keep & beside.at_kink
+    next_t1 = next_t0 + h
+    if beside is not None:
+        next_t1 = _clipped(next_t0, next_t1, jnp.where(keep, beside.after, beside.before), beside.rounding)
+    # The rest of a step that an event rejected follows at once: a fixed step stays on its grid.
+    resumes = keep & (t1 < before.rejected_end)
+    next_t1 = jnp.where(resumes, before.rejected_end, next_t1)
+    step = Step(t0, t1, next_t0, next_t1, keep)
+    verdict = after_events(rules.directions, times, before, quantities, step)
+    too_short &= ~verdict.repeat
+    if failed is not None:
+        too_short |= failed & verdict.keep
+    # A last step is none of a rounding error, and one that was not kept is halved.
+    near = verdict.next_t1 > times.end - 100 * jnp.finfo(times.end.dtype).eps * jnp.abs(times.end)
+    last = jnp.where(verdict.keep, times.end, verdict.next_t0 + 0.5 * (times.end - verdict.next_t0))
+    ends = verdict.ends | (verdict.keep & (verdict.next_t0 >= times.end))
+    fails = (too_short & ~ends) | verdict.fails
+    steps, accepted = before.steps + 1.0, before.accepted + verdict.keep.astype(before.steps.dtype)
+    failure = jnp.where(accepted > 0, float(Status.STEP_TOO_SMALL), float(Status.NO_SOLUTION))
+    status = jnp.where(fails, failure, verdict.progress.status)
+    goes_on = ~(ends | fails)
+    if rules.max_steps is not None:
+        is_last = goes_on & (steps >= rules.max_steps)
+        status, goes_on = jnp.where(is_last, float(Status.MAX_STEPS), status), goes_on & ~is_last
+    return Decision(
+        verdict.keep,
+        verdict.next_t0,
+        jnp.where(near, last, verdict.next_t1),
+        *_where(verdict.keep, new, old),
+        jumped,
+        verdict.progress._replace(status=status, steps=steps, accepted=accepted).packed(),
+        goes_on,
+    )
+
+
+def _by_error(rules: Rules, h: Array, measured: Any) -> tuple[Array, Array, Array]:
+    """Whether a step of the length h is kept, the length of the next one, and whether that is too short.
+
+    As `diffrax.PIDController` with its own coefficients: of the error e by its tolerances,
+
+        e < 1,   h clip(0.9 e^(-1 / order), 1 or 0.2, 10 or 0.9)      (where it is kept, or is not)
+    """
+    if measured is None:
+        return jnp.ones(h.shape, bool), jnp.broadcast_to(rules.step, h.shape), jnp.zeros(h.shape, bool)
+    y0, y1, error = measured
+    y1 = jnp.where(jnp.any(jnp.isnan(y1)), y0, y1)
+    scaled = error / (rules.atol + rules.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1)))
+    e = jnp.sqrt(jnp.mean(scaled * scaled))
+    e = jnp.where(e < jnp.inf, e, jnp.inf)  # as large, where the rates are no numbers
+    keep = e < 1
+    factor = 0.9 * e ** (-1.0 / rules.order)
+    factor = jnp.clip(factor, jnp.where(keep, 1.0, 0.2), jnp.where(keep, 10.0, 0.9))
+    h = h * jax.lax.stop_gradient(factor)
+    return keep, jnp.maximum(h, rules.times.shortest), h < rules.times.shortest
+
+
+def _where(condition: Any, x: Any, y: Any) -> Any:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), x, y)

@@ -1,0 +1,204 @@
+"""The steps of a motion: a loop around a Runge-Kutta method of diffrax, and explicit methods with unrolled stages."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import operator
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import equinox.internal as eqxi
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from .step_control import Progress, StepControl
+
+
+class Steps(NamedTuple):
+    """The `motion` at the sample times (n_t, n), of which the first `count` were reached; the last time and packed
+    state; and the `progress` of the steps."""
+
+    motion: Array
+    count: Array
+    t_end: Array
+    end: Array
+    progress: Progress
+
+
+class _Samples(NamedTuple):
+    """The motion at the sample times (n_t, n), and how many of them have been reached."""
+
+    motion: Array
+    count: Array
+
+
+class _Carry(NamedTuple):
+    """What the loop carries: the ends of the next step, and the state at its start; whether that jumped, None where
+    none can; the `progress`, packed; whether the motion goes on; and what it has left."""
+
+    t0: Array
+    t1: Array
+    y: Array
+    solver_state: Any
+    jumped: Array | None
+    progress: Array
+    goes_on: Array
+    samples: _Samples
+    meter: Any
+
+
+# How equinox's loop is differentiated, by the adjoint.
+_KINDS: dict[type, str] = {
+    diffrax.ForwardMode: "lax",
+    diffrax.RecursiveCheckpointAdjoint: "checkpointed",
+    diffrax.DirectAdjoint: "bounded",
+}
+ADJOINTS = tuple(_KINDS)
+
+
+def take_steps(
+    rates: Callable[..., Array],
+    solver: Any,
+    control: StepControl,
+    y0: Array,
+    args: Any,
+    ts: Array,
+    adjoint: Any,
+    meter: diffrax.AbstractProgressMeter,
+) -> Steps:
+    """The steps from its start until the `control` ends them, and the motion at rising times `ts`.
+
+    As `diffrax.diffeqsolve`, whose loop is not used: the control knows the last time and all ends, so that half of the
+    operations are not needed, and what it decides is one program. It compiles in half of the time.
+
+    **Arguments:** `rates`: (t, y, args) -> y_dot.
+    """
+    kind = _KINDS[type(adjoint)]
+    if control.rules.max_steps is None and getattr(adjoint, "checkpoints", None) is None:
+        kind = "lax"
+    if hasattr(solver, "scan_kind") and solver.scan_kind is None and kind != "checkpointed":
+        solver = dataclasses.replace(solver, scan_kind=kind)  # its loop over stages, which JAX has to differentiate
+    term, loop = diffrax.ODETerm(rates), functools.partial(_loop, kind)  # pyright: ignore[reportArgumentType]
+    start, (end, progress) = control.rules.times.start, control.first(y0, args)
+    jumps = control.kinks is not None and control.kinks.restart
+    zero = jnp.zeros((), int)
+    carry = _Carry(
+        t0=start,
+        t1=end,
+        y=y0,
+        solver_state=solver.init(term, start, end, y0, args),
+        jumped=jnp.array(False) if jumps else None,
+        progress=progress,
+        goes_on=jnp.array(True),
+        samples=_Samples(jnp.zeros((len(ts), *y0.shape), y0.dtype), zero),
+        meter=meter.init(),
+    )
+
+    def step(carry: _Carry) -> _Carry:
+        jumped = False if carry.jumped is None else carry.jumped
+        y, error, dense, solver_state, result = solver.step(
+            term, carry.t0, carry.t1, carry.y, args, carry.solver_state, jumped
+        )
+        failed = None if isinstance(solver, UnrolledERK) else result != diffrax.RESULTS.successful
+        states = (y, solver_state), (carry.y, carry.solver_state)
+        decision = control.following(carry.progress, carry.t0, carry.t1, *states, error, failed, args)
+        interpolation = solver.interpolation_cls(t0=carry.t0, t1=carry.t1, **dense)
+
+        def is_due(samples: _Samples) -> Array:
+            return decision.keep & (samples.count < len(ts)) & (ts[samples.count] <= carry.t1)
+
+        def sampled(samples: _Samples) -> _Samples:
+            y = interpolation.evaluate(ts[samples.count])
+            return _Samples(samples.motion.at[samples.count].set(y), samples.count + 1)
+
+        done = (decision.t0 - start) / (control.rules.times.end - start)
+        return _Carry(
+            t0=decision.t0,
+            t1=decision.t1,
+            y=decision.y,
+            solver_state=decision.solver_state,
+            jumped=None if carry.jumped is None else decision.jumped,
+            progress=decision.progress,
+            goes_on=decision.goes_on,
+            samples=loop(is_due, sampled, carry.samples, len(ts), len(ts), lambda s: s.motion),
+            meter=meter.step(carry.meter, done),
+        )
+
+    last = loop(
+        lambda carry: carry.goes_on,
+        step,
+        carry,
+        control.rules.max_steps,
+        getattr(adjoint, "checkpoints", None),
+        lambda carry: carry.samples.motion,
+    )
+    meter.close(last.meter)
+    return Steps(*last.samples, last.t0, last.y, Progress.unpacked(last.progress))
+
+
+def _loop(
+    kind: Any, condition: Any, body: Any, carry: Any, max_steps: int | None, checkpoints: int | None, buffers: Any
+) -> Any:
+    """One of equinox, which counts its steps where its derivative needs that."""
+    more = {} if kind == "lax" else {"max_steps": max_steps}
+    more |= {"checkpoints": checkpoints} if kind == "checkpointed" else {}
+    return eqxi.while_loop(condition, body, carry, buffers=buffers, kind=kind, **more)
+
+
+class UnrolledERK(diffrax.AbstractAdaptiveSolver[Any]):
+    """An explicit Runge-Kutta method of diffrax whose stages are written out, each a weighted sum and one call.
+
+        y_i = y0 + sum_j a_ij k_j,   k_i = h f(t0 + c_i h, y_i),   y1 = y0 + sum_i b_i k_i
+
+    diffrax makes one loop of the stages, so that the right-hand side is compiled once. Where that is a native kernel, a
+    call of it costs nothing to compile, and the loop costs more than the stages: it carries all of them in one array,
+    which XLA transposes in each. The numbers are those of `method`, to rounding errors.
+    """
+
+    method: diffrax.AbstractERK
+    term_structure = diffrax.AbstractTerm
+
+    @property
+    def interpolation_cls(self) -> Any:  # type: ignore[override]
+        return self.method.interpolation_cls
+
+    def order(self, terms: Any) -> int | None:
+        return self.method.order(terms)
+
+    def error_order(self, terms: Any) -> Any:
+        return self.method.error_order(terms)
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        return terms.vf(t0, y0, args)
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Any:
+        """The rates at the start, where the last stage of a step is the first of the next; else None."""
+        tableau: Any = self.method.tableau
+        return terms.vf(t0, y0, args) if tableau.fsal else None
+
+    def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
+        tableau: Any = self.method.tableau
+        h, rates = terms.contr(t0, t1), jax.jit(lambda t, y: terms.vf(t, y, args))
+        if solver_state is None:
+            f = rates(t0, y0)
+        elif made_jump is False:
+            f = solver_state
+        else:
+            f = jax.lax.cond(made_jump, lambda: rates(t0, y0), lambda: solver_state)
+        k, y = [terms.prod(f, h)], y0
+        for a, c in zip(tableau.a_lower, map(float, tableau.c), strict=True):
+            y = y0 + _weighted(a, k)
+            f = rates(t1 if c == 1 else t0 + c * (t1 - t0), y)
+            k.append(terms.prod(f, h))
+        y1 = y if tableau.ssal else y0 + _weighted(tableau.b_sol, k)
+        dense = {"y0": y0, "y1": y1, "k": jnp.stack(k)}
+        return y1, _weighted(tableau.b_error, k), dense, f if tableau.fsal else None, diffrax.RESULTS.successful
+
+
+def _weighted(weights: np.ndarray, values: list[Any]) -> Any:
+    return functools.reduce(operator.add, [float(w) * x for w, x in zip(weights, values, strict=True) if w != 0])
