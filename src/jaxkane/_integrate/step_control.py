@@ -116,14 +116,12 @@ def _clipped(t0: Array, t1: Array, kink: Array, rounding: Array) -> Array:
 
 
 class Decision(NamedTuple):
-    """What becomes of a step: whether it is kept; the ends of the next one; the state there, and the solver's; whether
-    it begins behind a jump; the `progress`, packed; and whether the motion goes on."""
+    """What becomes of a step: whether it is kept; the ends of the next one; whether that begins behind a jump; the
+    `progress`, packed; and whether the motion goes on."""
 
     keep: Array
     t0: Array
     t1: Array
-    y: Any
-    solver_state: Any
     jumped: Array
     progress: Array
     goes_on: Array
@@ -156,24 +154,17 @@ class StepControl(NamedTuple):
         return _first(self.rules, self._values(start, y0, args), kink)
 
     def following(
-        self, progress: Array, t0: Array, t1: Array, new: Any, old: Any, error: Any, failed: Array | None, args: Any
+        self, progress: Array, t0: Array, t1: Array, y0: Array, y1: Array, error: Any, failed: Array | None, args: Any
     ) -> Decision:
-        """What becomes of a step from t0 to t1.
+        """What becomes of a step from (t0, y0) to (t1, y1).
 
-        **Arguments:** `new` and `old`: (y, the solver's state) behind the step and before it; the solver's estimate of
-        the `error`, None where it has none; whether it `failed`, None where it cannot.
+        **Arguments:** the solver's estimate of the `error`, None where it has none; whether it `failed`, None where it
+        cannot.
         """
         beside = None if self.kinks is None else self.kinks.beside(t0, t1)
-        quantities = self._values(t1, new[0], args)
-        measured = constant((old[0], new[0], error)) if self.rules.step is None else None
-        # Large arrays are chosen by themselves.
-        is_small = lambda x: eqx.is_inexact_array(x) and x.size <= LARGEST_SMALL  # noqa: E731
-        small = [eqx.filter(x, is_small) for x in (new, old)]
-        f = _following if is_small(new[0]) else _following.__wrapped__
-        decision = f(self.rules, constant(progress), t0, t1, quantities, measured, failed, beside, *small)
-        large = [eqx.filter(x, is_small, inverse=True) for x in (new, old)]
-        y, state = eqx.combine((decision.y, decision.solver_state), _where(decision.keep, *large))
-        return decision._replace(y=y, solver_state=state)
+        measured = constant((y0, y1, error)) if self.rules.step is None else None
+        decide = _following if y0.size <= LARGEST_SMALL else _following.__wrapped__
+        return decide(self.rules, constant(progress), t0, t1, self._values(t1, y1, args), measured, failed, beside)
 
     def _values(self, t: Any, y: Any, args: Any) -> EventValues | None:
         # Where steps end has no derivative, and compiling one would take its time.
@@ -202,8 +193,6 @@ def _following(
     measured: Any,
     failed: Array | None,
     beside: Beside | None,
-    new: Any,
-    old: Any,
 ) -> Decision:
     times, before = rules.times, Progress.unpacked(progress)
     keep, h, too_short = _by_error(rules, t1 - t0, measured)
@@ -238,7 +227,6 @@ def _following(
         verdict.keep,
         verdict.next_t0,
         jnp.where(near, last, verdict.next_t1),
-        *_where(verdict.keep, new, old),
         jumped,
         verdict.progress._replace(status=status, steps=steps, accepted=accepted).packed(),
         goes_on,
@@ -264,7 +252,3 @@ def _by_error(rules: Rules, h: Array, measured: Any) -> tuple[Array, Array, Arra
     factor = jnp.clip(factor, jnp.where(keep, 1.0, 0.2), jnp.where(keep, 10.0, 0.9))
     h = h * jax.lax.stop_gradient(factor)
     return keep, jnp.maximum(h, rules.times.shortest), h < rules.times.shortest
-
-
-def _where(condition: Any, x: Any, y: Any) -> Any:
-    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), x, y)

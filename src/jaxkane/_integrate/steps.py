@@ -105,8 +105,8 @@ def take_steps(
             term, carry.t0, carry.t1, carry.y, args, carry.solver_state, jumped
         )
         failed = None if isinstance(solver, UnrolledERK) else result != diffrax.RESULTS.successful
-        states = (y, solver_state), (carry.y, carry.solver_state)
-        decision = control.following(carry.progress, carry.t0, carry.t1, *states, error, failed, args)
+        decision = control.following(carry.progress, carry.t0, carry.t1, carry.y, y, error, failed, args)
+        chosen = lambda new, old: jax.tree.map(functools.partial(jnp.where, decision.keep), new, old)  # noqa: E731
         interpolation = solver.interpolation_cls(t0=carry.t0, t1=carry.t1, **dense)
 
         def is_due(samples: _Samples) -> Array:
@@ -120,8 +120,8 @@ def take_steps(
         return _Carry(
             t0=decision.t0,
             t1=decision.t1,
-            y=decision.y,
-            solver_state=decision.solver_state,
+            y=chosen(y, carry.y),
+            solver_state=chosen(solver_state, carry.solver_state),
             jumped=None if carry.jumped is None else decision.jumped,
             progress=decision.progress,
             goes_on=decision.goes_on,
