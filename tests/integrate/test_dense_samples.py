@@ -94,7 +94,7 @@ def test_steps_end_where_a_derivative_by_samples_is_asked_for():
     # By d at d = 0, of the integral of (1 - t) wave(t - d).
     by_delay = -(1 - np.cos(5)) / 5
     np.testing.assert_allclose(slopes, [by_delay, place(1.0)], atol=atol)
-    assert steps > n / 3 - 2
+    assert steps > n // 3 - 2
 
 
 def test_each_jump_of_a_zero_order_hold_ends_a_step():

@@ -1,17 +1,16 @@
 """The steps of a motion: their length by their error, and the loop that takes them."""
 
 import diffrax
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._integrate import diffrax_compat
-from jaxkane._integrate.integrate import solve
-from jaxkane._integrate.settings import settings_for
-from jaxkane._integrate.step_control import ClipToDiscontinuities
+from jaxkane._integrate.inputs import Discontinuities
+from jaxkane._integrate.settings import ADJOINTS, with_tolerances
+from jaxkane._integrate.step_control import Kinks, Rules, StepControl, evenly_spread, times_of
+from jaxkane._integrate.steps import UnrolledERK, take_steps
 from jaxkane._scalarjit.function import ScalarFunction
 
 
@@ -19,7 +18,7 @@ def test_a_solver_without_an_estimate_of_its_error_asks_for_a_step():
     system, state = pendulum()
     with pytest.raises(ValueError, match="step=1e-3"):
         jk.simulate(system, state, jnp.linspace(0.0, 0.5, 3), solver=diffrax.Euler())
-    with pytest.raises(TypeError, match="KenCarp4 takes equations in two parts"):
+    with pytest.raises(TypeError, match="KenCarp4 takes equations in several parts"):
         jk.simulate(system, state, jnp.linspace(0.0, 0.5, 3), solver=diffrax.KenCarp4(), step=0.01)
 
 
@@ -39,37 +38,66 @@ def pendulum():
     return jk.catalog.DoublePendulum(mass=1.0, length=0.7), jk.State(jnp.array([1.0, -0.5]), jnp.zeros(2))
 
 
-@pytest.mark.parametrize("adjoint", ["forward", pytest.param("reverse", marks=pytest.mark.slow)])
-def test_the_loop_of_known_times_is_that_of_diffrax(adjoint, monkeypatch):
-    """The way back, for a release of diffrax whose insides are others."""
-    system, state = pendulum()
-    ts = jnp.linspace(0.2, 1.0, 7)
-    settings = settings_for(ts, adjoint=adjoint, rising=True)
+def steps_and_slope(solve, adjoint):
+    """(ys, t_end, number of steps), and the derivative of the last y by both arguments."""
+    args = jnp.array([9.81, 0.3])
+    if adjoint == "reverse":
+        return solve(args), jax.jit(jax.grad(lambda x: solve(x)[0][-1, 0]))(args)
+    return solve(args), jax.jit(jax.jacfwd(lambda x: solve(x)[0][-1, 0]))(args)
 
-    def ends(q):
-        ride_of = eqx.filter_jit(solve.__wrapped__)(system, jk.State(q, state.u), ts, {}, settings)
-        return jnp.sum(ride_of.q[-1] ** 2), ride_of
 
-    def found():
-        (_, motion), slope = (
-            eqx.filter_value_and_grad(ends, has_aux=True)(state.q)
-            if adjoint == "reverse"
-            else (
-                ends(state.q),
-                jax.jvp(lambda q: ends(q)[0], (state.q,), (jnp.ones(2),))[1],
-            )
+@pytest.mark.parametrize(
+    ("solver", "adjoint", "step"),
+    [
+        (diffrax.Tsit5(), "forward", None),
+        (UnrolledERK(diffrax.Dopri5()), "reverse", None),
+        (diffrax.Kvaerno5(), "forward", None),
+        (diffrax.HalfSolver(diffrax.Euler()), "forward", None),
+        (diffrax.Ralston(), "forward", 0.03),
+        pytest.param(diffrax.Tsit5(), "reverse", None, marks=pytest.mark.slow),
+        pytest.param(diffrax.Kvaerno5(), "reverse", None, marks=pytest.mark.slow),
+        pytest.param(diffrax.Bosh3(), "both", None, marks=pytest.mark.slow),
+    ],
+)
+def test_the_steps_are_those_of_diffrax(solver, adjoint, step):
+    """Its `diffeqsolve` takes as many steps, to the same numbers and derivatives."""
+    ts, first, shortest, kind = jnp.linspace(0.2, 2.0, 7), 0.01, 1e-10, ADJOINTS[adjoint]()
+    tolerance = 1e-4 if isinstance(solver, diffrax.HalfSolver) else 1e-7
+
+    def rates(t, y, args):
+        return jnp.stack([y[1], -args[0] * jnp.sin(y[0]) - args[1] * t * y[1]])
+
+    y0, order = jnp.array([1.0, 0.3]), solver.error_order(diffrax.ODETerm(rates))
+
+    def ours(args):
+        times = times_of(ts[0], ts[1], ts[-1])._replace(first=jnp.array(first), shortest=jnp.array(shortest))
+        tolerances = (jnp.array(tolerance),) * 2 if step is None else (None, None)
+        spread = None if step is None else evenly_spread(times, jnp.array(step))
+        control = StepControl(Rules(*tolerances, spread, times, order, 4096, ()), None, None)
+        method = with_tolerances(solver, tolerance, tolerance)
+        steps = take_steps(rates, method, control, y0, args, ts, kind, diffrax.NoProgressMeter())
+        return steps.motion, steps.t_end, steps.progress.steps
+
+    def theirs(args):
+        control = diffrax.PIDController(tolerance, tolerance, dtmin=shortest, force_dtmin=False)
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(rates),
+            solver,
+            ts[0],
+            ts[-1],
+            first if step is None else step,
+            y0,
+            args,
+            saveat=diffrax.SaveAt(ts=ts),
+            stepsize_controller=control if step is None else diffrax.ConstantStepSize(),
+            adjoint=kind,
         )
-        return motion, slope
+        return solution.ys, solution.ts[-1], solution.stats["num_steps"]
 
-    assert diffrax_compat._AS_EXPECTED
-    motion, slope = found()
-    monkeypatch.setattr(diffrax_compat, "_AS_EXPECTED", False)
-    other, other_slope = found()
-    for x, y in zip(jax.tree.leaves(motion), jax.tree.leaves(other), strict=True):
+    (found, slope), (expected, expected_slope) = steps_and_slope(ours, adjoint), steps_and_slope(theirs, adjoint)
+    for x, y in zip(found, expected, strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-12, atol=1e-12)
-    np.testing.assert_allclose(slope, other_slope, rtol=1e-11)
-    assert motion.status == jk.Status.COMPLETED
-    assert motion.t_end == ts[-1]
+    np.testing.assert_allclose(slope, expected_slope, rtol=1e-10)
 
 
 @ScalarFunction
@@ -121,7 +149,9 @@ def test_the_last_time_and_the_first_have_derivatives(jacobian):
 
 
 def test_a_step_ends_beside_a_kink_or_leaves_half_of_the_way_to_it():
-    clip = ClipToDiscontinuities(diffrax.PIDController(1e-6, 1e-6), jnp.array([0.5, 1.0]))
+    kinks = Kinks.of(Discontinuities(jnp.array([0.5, 1.0]), jumps=False, restart=False), jnp.array(2.0))
     for length in (0.1, 0.3, 0.5 - 1e-9, 0.5, 0.7, 1.2):
-        end, _ = clip.init(None, jnp.array(0.0), jnp.array(2.0), jnp.zeros(1), jnp.array(length), None, None, 5)
+        times = times_of(jnp.array(0.0), jnp.array(1.0), jnp.array(2.0))._replace(first=jnp.array(length))
+        rules = Rules(jnp.array(1e-6), jnp.array(1e-6), None, times, 5.0, None, ())
+        end, _ = StepControl(rules, None, kinks).first(jnp.zeros(1), None)
         assert abs(0.5 - end) < 1e-13 or end == min(length, 0.25)

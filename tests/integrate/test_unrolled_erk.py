@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxkane as jk
-from jaxkane._integrate.diffrax_compat import UnrolledERK
+from jaxkane._integrate.steps import UnrolledERK
 from jaxkane._kane.rhs import rates_are_native
 from jaxkane._scalarjit.backends import native
 from jaxkane._system.system import packed

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import operator
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -232,7 +232,7 @@ class Progress(NamedTuple):
         values = numbers[n + 1 :]
         middle = values.size // 2
         start = EventValues(values[:middle], values[middle:], numbers[n]) if numbers.size > n else None
-        return cls(*[numbers[i] for i in range(n)], start)
+        return cls(numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], start)
 
 
 class Step(NamedTuple):

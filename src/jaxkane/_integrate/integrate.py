@@ -43,9 +43,9 @@ from .inputs import (
     restore_times,
     samples_of,
 )
-from .settings import Settings
+from .settings import Settings, with_tolerances
 from .status import Status
-from .step_control import LARGEST_SMALL, Kinks, Rules, StepControl, Times, times_of
+from .step_control import LARGEST_SMALL, Kinks, Rules, StepControl, Times, evenly_spread, times_of
 from .steps import UnrolledERK, take_steps
 from .trajectory import InputDiscontinuities, Trajectory
 
@@ -235,8 +235,9 @@ def one_step(
 
 def _solver_for(settings: Settings, system: System, t: Array, y: Array, inputs: dict[str, Array]) -> Any:
     solver: Any = settings.solver
-    is_native = isinstance(solver, diffrax.AbstractERK) and rates_are_native(system, t, y, inputs)
-    return UnrolledERK(solver) if is_native else solver
+    if isinstance(solver, diffrax.AbstractERK):
+        return UnrolledERK(solver) if rates_are_native(system, t, y, inputs) else solver
+    return with_tolerances(solver, settings.rtol, settings.atol)
 
 
 def ends_between(system: System, t0: Array, y0: Array, t1: Array, y1: Array, signals: Any) -> Array:
@@ -335,14 +336,12 @@ def _control_of(problem: InitialValueProblem) -> StepControl:
     def quantities(t: Array, y: Array, args: Any) -> EventValues:
         return event_values(args[0], t, y, problem.rates(t, y, args) if events.read_speeds else None)
 
-    as_number = lambda x: None if x is None else jnp.asarray(x, times.end.dtype)  # noqa: E731
+    as_number = lambda x: jnp.asarray(x, times.end.dtype)  # noqa: E731
     fixed, kinks = settings.step is not None, problem.discontinuities
     rules = Rules(
         rtol=None if fixed else as_number(settings.rtol),
         atol=None if fixed else as_number(settings.atol),
-        # A fixed step is spread evenly over the whole time: a rounding error must not make it one step more, after
-        # which no step would end where a sample of an input stands.
-        step=(1.0 + jnp.finfo(times.end.dtype).eps ** 0.5) * as_number(settings.step) if fixed else None,
+        step=evenly_spread(times, as_number(settings.step)) if fixed else None,
         times=times,
         order=None if fixed else settings.solver.error_order(diffrax.ODETerm(problem.rates)),
         max_steps=settings.max_steps,

@@ -84,10 +84,10 @@ def settings_for(
     default = 1e-8 if ts.dtype == jnp.float64 else 1e-5
     if step is not None:
         method = _for_one_length(method, default)
-    if isinstance(adjoint, diffrax.BacksolveAdjoint):
+    if not isinstance(adjoint, str) and type(adjoint) not in ADJOINTS.values():
         raise ValueError(
-            "adjoint=BacksolveAdjoint() solves the motion backwards, without its events, inputs and samples: its "
-            'derivatives would be those of another motion. Use "reverse", or "forward" for few parameters.'
+            f"adjoint={type(adjoint).__name__}() does not differentiate the steps, with their events and inputs. "
+            'Use "reverse", or "forward" for few parameters.'
         )
     for label, number in (("rtol", rtol), ("atol", atol), ("step", step)):
         if number is not None and not isinstance(number, Tracer):
@@ -112,11 +112,23 @@ def settings_for(
 def _for_one_length(solver: Any, tolerance: float) -> Any:
     """An implicit solver for steps of one length. As diffrax makes it, it takes the tolerances of its equations from
     those of the steps, and leaves what converges slowly to a shorter step: here Newton's method solves them."""
-    of_steps = type(diffrax.with_stepsize_controller_tols(diffrax.VeryChord)().rtol)
-    if not isinstance(getattr(getattr(solver, "root_finder", None), "rtol", None), of_steps):
+    if not _takes_tolerances(solver):
         return solver
     changed = {"root_finder": optx.Newton(rtol=tolerance, atol=tolerance), "root_find_max_steps": 50}
     return dataclasses.replace(solver, **{name: x for name, x in changed.items() if hasattr(solver, name)})
+
+
+def with_tolerances(solver: Any, rtol: Any, atol: Any) -> Any:
+    """A solver whose equations, if it has any, are solved with the tolerances of the steps."""
+    if not _takes_tolerances(solver):
+        return solver
+    finder = dataclasses.replace(solver.root_finder, rtol=rtol, atol=atol, norm=optx.rms_norm)
+    return dataclasses.replace(solver, root_finder=finder)
+
+
+def _takes_tolerances(solver: Any) -> bool:
+    of_steps = type(diffrax.with_stepsize_controller_tols(diffrax.VeryChord)().rtol)
+    return isinstance(getattr(getattr(solver, "root_finder", None), "rtol", None), of_steps)
 
 
 def _check_types(solver: Any, adjoint: Any, **flags: Any) -> None:
@@ -132,10 +144,10 @@ def _check_types(solver: Any, adjoint: Any, **flags: Any) -> None:
             raise TypeError(f"`{label}` is an instance, not a class: {label}=diffrax.{value.__name__}().")
         if value is not None and not isinstance(value, kind):
             raise TypeError(f"`{label}` is one of diffrax, as diffrax.Tsit5() is a solver; got {value!r}.")
-    if isinstance(getattr(solver, "tableau", None), diffrax.MultiButcherTableau):
+    if solver is not None and solver.term_structure is not diffrax.AbstractTerm:
         raise TypeError(
-            f"{type(solver).__name__} takes equations in two parts, stiff and not, and these are in one. A solver for "
-            "stiff ones is diffrax.Kvaerno5()."
+            f"{type(solver).__name__} takes equations in several parts, such as stiff and other ones. These are in one "
+            "part. A solver for stiff equations is diffrax.Kvaerno5()."
         )
     for label, value in flags.items():
         if not isinstance(value, (bool, np.bool_)):

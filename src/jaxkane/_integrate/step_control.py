@@ -56,6 +56,15 @@ def times_of(start: Array, second: Array, end: Array) -> Times:
     )
 
 
+def evenly_spread(times: Times, step: Array) -> Array:
+    """The longest of the fixed steps, not longer than `step`, of which a whole number makes the whole time.
+
+    A rounding error must not make it one step more, after which no step would end where a sample of an input stands.
+    """
+    duration, longest = times.end - times.start, step * (1.0 + jnp.finfo(step.dtype).eps ** 0.5)
+    return duration / jax.lax.stop_gradient(jnp.ceil(duration / longest))
+
+
 class Kinks(eqx.Module):
     """The `times` (n,) of kinks, in rising order, that no step passes over; infinity for those that are none.
 
@@ -131,11 +140,11 @@ class Rules(eqx.Module):
     """The numbers by which steps are chosen: tolerances and the `order` of the error, or a fixed `step` [s]; the times;
     at most `max_steps`; and the directions in which events count (see `first_crossing`)."""
 
-    rtol: Array | None
-    atol: Array | None
-    step: Array | None
+    rtol: Any
+    atol: Any
+    step: Any
     times: Times
-    order: float | None = eqx.field(static=True)
+    order: Any = eqx.field(static=True)
     max_steps: int | None = eqx.field(static=True)
     directions: tuple[int, ...] = eqx.field(static=True)
 
@@ -195,7 +204,11 @@ def _following(
     beside: Beside | None,
 ) -> Decision:
     times, before = rules.times, Progress.unpacked(progress)
-    keep, h, too_short = _by_error(rules, t1 - t0, measured)
+    if measured is None:
+        keep, too_short = jnp.ones(t1.shape, bool), jnp.zeros(t1.shape, bool)
+        h = _to_next(rules, t1)
+    else:
+        keep, h, too_short = _by_error(rules, t1 - t0, *measured)
     next_t0, jumped = jnp.where(keep, t1, t0), jnp.zeros_like(keep)
     if beside is not None:
         next_t0 = jnp.where(keep, beside.start, t0)
@@ -233,16 +246,20 @@ def _following(
     )
 
 
-def _by_error(rules: Rules, h: Array, measured: Any) -> tuple[Array, Array, Array]:
+def _to_next(rules: Rules, t: Array) -> Array:
+    """From a time to the next end of a fixed step. These stand on a grid from the start on, which rounding errors of
+    the steps do not move; nor does a step that was halved."""
+    start, step = rules.times.start, rules.step
+    return start + step * (jnp.floor((t - start) / step + 0.01) + 1.0) - t
+
+
+def _by_error(rules: Rules, h: Array, y0: Array, y1: Array, error: Array) -> tuple[Array, Array, Array]:
     """Whether a step of the length h is kept, the length of the next one, and whether that is too short.
 
     As `diffrax.PIDController` with its own coefficients: of the error e by its tolerances,
 
         e < 1,   h clip(0.9 e^(-1 / order), 1 or 0.2, 10 or 0.9)      (where it is kept, or is not)
     """
-    if measured is None:
-        return jnp.ones(h.shape, bool), jnp.broadcast_to(rules.step, h.shape), jnp.zeros(h.shape, bool)
-    y0, y1, error = measured
     y1 = jnp.where(jnp.any(jnp.isnan(y1)), y0, y1)
     scaled = error / (rules.atol + rules.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1)))
     e = jnp.sqrt(jnp.mean(scaled * scaled))

@@ -9,7 +9,6 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import diffrax
-import equinox as eqx
 import equinox.internal as eqxi
 import jax
 import jax.numpy as jnp
@@ -58,7 +57,6 @@ _KINDS: dict[type, str] = {
     diffrax.RecursiveCheckpointAdjoint: "checkpointed",
     diffrax.DirectAdjoint: "bounded",
 }
-ADJOINTS = tuple(_KINDS)
 
 
 def take_steps(
@@ -138,14 +136,15 @@ def take_steps(
         lambda carry: carry.samples.motion,
     )
     meter.close(last.meter)
-    return Steps(*last.samples, last.t0, last.y, Progress.unpacked(last.progress))
+    motion, count = last.samples
+    return Steps(motion, count, last.t0, last.y, Progress.unpacked(last.progress))
 
 
 def _loop(
     kind: Any, condition: Any, body: Any, carry: Any, max_steps: int | None, checkpoints: int | None, buffers: Any
 ) -> Any:
     """One of equinox, which counts its steps where its derivative needs that."""
-    more = {} if kind == "lax" else {"max_steps": max_steps}
+    more: dict[str, Any] = {} if kind == "lax" else {"max_steps": max_steps}
     more |= {"checkpoints": checkpoints} if kind == "checkpointed" else {}
     return eqxi.while_loop(condition, body, carry, buffers=buffers, kind=kind, **more)
 
