@@ -22,6 +22,13 @@ def test_a_solver_without_an_estimate_of_its_error_asks_for_a_step():
         jk.simulate(system, state, jnp.linspace(0.0, 0.5, 3), solver=diffrax.KenCarp4(), step=0.01)
 
 
+def test_half_steps_of_an_implicit_solver_take_the_tolerances():
+    system, state = pendulum()
+    ts, solver = jnp.linspace(0.0, 0.2, 3), diffrax.HalfSolver(diffrax.Kvaerno3())
+    exact = jk.simulate(system, state, ts, rtol=1e-11).q
+    np.testing.assert_allclose(jk.simulate(system, state, ts, solver=solver, rtol=1e-7).q, exact, atol=1e-6)
+
+
 @pytest.mark.parametrize("solver", [diffrax.Kvaerno5(), diffrax.ImplicitEuler()])
 def test_implicit_steps_of_one_length(solver):
     system, state = pendulum()

@@ -110,25 +110,25 @@ def settings_for(
 
 
 def _for_one_length(solver: Any, tolerance: float) -> Any:
-    """An implicit solver for steps of one length. As diffrax makes it, it takes the tolerances of its equations from
-    those of the steps, and leaves what converges slowly to a shorter step: here Newton's method solves them."""
-    if not _takes_tolerances(solver):
-        return solver
-    changed = {"root_finder": optx.Newton(rtol=tolerance, atol=tolerance), "root_find_max_steps": 50}
-    return dataclasses.replace(solver, **{name: x for name, x in changed.items() if hasattr(solver, name)})
+    """An implicit solver for steps of one length. As diffrax makes it, it leaves what converges slowly to a shorter
+    step: here Newton's method solves its equations."""
+    newton = {"root_finder": optx.Newton(rtol=tolerance, atol=tolerance), "root_find_max_steps": 50}
+    return _changed(solver, lambda method: {name: x for name, x in newton.items() if hasattr(method, name)})
 
 
 def with_tolerances(solver: Any, rtol: Any, atol: Any) -> Any:
-    """A solver whose equations, if it has any, are solved with the tolerances of the steps."""
-    if not _takes_tolerances(solver):
-        return solver
-    finder = dataclasses.replace(solver.root_finder, rtol=rtol, atol=atol, norm=optx.rms_norm)
-    return dataclasses.replace(solver, root_finder=finder)
+    """An implicit solver whose equations are solved with the tolerances of the steps; any other as it is."""
+    of_steps = {"rtol": rtol, "atol": atol, "norm": optx.rms_norm}
+    return _changed(solver, lambda method: {"root_finder": dataclasses.replace(method.root_finder, **of_steps)})
 
 
-def _takes_tolerances(solver: Any) -> bool:
+def _changed(solver: Any, fields: Callable[[Any], dict[str, Any]]) -> Any:
+    """The solver with other fields, where it takes the tolerances of its equations from those of the steps."""
+    if isinstance(solver, diffrax.HalfSolver):
+        return dataclasses.replace(solver, solver=_changed(solver.solver, fields))
     of_steps = type(diffrax.with_stepsize_controller_tols(diffrax.VeryChord)().rtol)
-    return isinstance(getattr(getattr(solver, "root_finder", None), "rtol", None), of_steps)
+    takes = isinstance(getattr(getattr(solver, "root_finder", None), "rtol", None), of_steps)
+    return dataclasses.replace(solver, **fields(solver)) if takes else solver
 
 
 def _check_types(solver: Any, adjoint: Any, **flags: Any) -> None:
