@@ -425,7 +425,7 @@ class Program:
     def scalars(self) -> Scalars | None:
         """The program as a graph of scalars for machine code, where it can be written so."""
         try:
-            return Scalars(self.program, self.once)
+            return Scalars(self.program, self.once, bool(self.tangents))
         except NotScalarError as error:
             self._tell_not_scalar(error)
             return None

@@ -207,10 +207,20 @@ class Writer:
 
     An argument that `varies` holds its elements lane after lane; one that does not is read once. The last lanes of the
     last group repeat lane n - 1, so that what a lane gives never depends on its place.
+
+    `is_derivative`: sums of products along several directions may be added up in any order, which saves an eighth.
     """
 
-    def __init__(self, graph: Graph, varies: Sequence[bool], lanes: int, of_lanes: Callable[[str, int], str | None]):
+    def __init__(
+        self,
+        graph: Graph,
+        varies: Sequence[bool],
+        lanes: int,
+        of_lanes: Callable[[str, int], str | None],
+        is_derivative: bool = False,
+    ):
         self.graph, self.varies, self.lanes, self.of_lanes = graph, varies, lanes, of_lanes
+        self.any_order = "reassoc contract" if is_derivative and lanes > 1 else "contract"
         self.lines: list[str] = []
         self.declared: set[str] = set()
         self.bases: set[str] = set()
@@ -324,7 +334,8 @@ class Writer:
                 verb = "uitofp" if source == "bool" else "fpext" if node.dtype == "float64" else "fptrunc"
                 text = f"{verb} {first} {xs[0]} to {kind}"
             case _ if name in BINARY:
-                text = f"{BINARY[name]} contract {kind} {', '.join(xs)}"
+                flags = self.any_order if k in self.wide else "contract"
+                text = f"{BINARY[name]} {flags} {kind} {', '.join(xs)}"
             case _ if name in LOGIC:
                 text = f"{LOGIC[name]} {kind} {', '.join(xs)}"
             case _ if name in COMPARISONS:

@@ -240,7 +240,7 @@ FMOD = "fmod"  # in the C library what is `rem` in JAX
 
 class Scalars:
     """A program as a graph, or what `as_graph` makes of it, and the targets compiled from that; those of what is called
-    `once` quickly.
+    `once` quickly, those of what `is_derivative` with sums in any order.
 
     Raises `NotScalarError` where the program cannot be written so.
     """
@@ -249,9 +249,10 @@ class Scalars:
         self,
         program: ClosedJaxpr,
         once: bool = False,
+        is_derivative: bool = False,
         as_graph: Callable[..., tuple[Graph, list[np.ndarray]]] = graph_of,
     ):
-        self.level = 0 if once else 2
+        self.level, self.is_derivative = 0 if once else 2, is_derivative
         self.graph, self.outputs = as_graph(program)
         nodes, inputs = self.graph.nodes, types_of(program)[0]
         results = [[np.dtype(nodes[k].dtype) for k in x.flat] for x in self.outputs]
@@ -267,7 +268,8 @@ class Scalars:
     def _kernel(self, groups: Groups, varies: tuple[bool, ...], lanes: int) -> tuple[str, str]:
         """Its name; and its text, where that is to be part of the one function that calls it."""
         of_lanes = functools.partial(llvm_compiler().of_lanes, lanes=lanes)
-        text = Writer(self.graph.reading_groups(groups), varies, lanes, of_lanes).text(len(varies), self.outputs)
+        writer = Writer(self.graph.reading_groups(groups), varies, lanes, of_lanes, self.is_derivative)
+        text = writer.text(len(varies), self.outputs)
         if self.level:
             return _compiled(text, self.level)[1], ""
         return "kernel", text.replace("define void @it(", "define internal void @kernel(")
