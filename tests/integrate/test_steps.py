@@ -9,7 +9,7 @@ import pytest
 import jaxkane as jk
 from jaxkane._integrate.inputs import Discontinuities
 from jaxkane._integrate.settings import ADJOINTS, with_tolerances
-from jaxkane._integrate.step_control import Kinks, Rules, StepControl, evenly_spread, times_of
+from jaxkane._integrate.step_control import ControlSettings, Kinks, StepControl, evenly_spread, times_of
 from jaxkane._integrate.steps import UnrolledERK, take_steps
 from jaxkane._scalarjit.function import ScalarFunction
 
@@ -22,11 +22,19 @@ def test_a_solver_without_an_estimate_of_its_error_asks_for_a_step():
         jk.simulate(system, state, jnp.linspace(0.0, 0.5, 3), solver=diffrax.KenCarp4(), step=0.01)
 
 
-def test_half_steps_of_an_implicit_solver_take_the_tolerances():
-    system, state = pendulum()
-    ts, solver = jnp.linspace(0.0, 0.2, 3), diffrax.HalfSolver(diffrax.Kvaerno3())
-    exact = jk.simulate(system, state, ts, rtol=1e-11).q
-    np.testing.assert_allclose(jk.simulate(system, state, ts, solver=solver, rtol=1e-7).q, exact, atol=1e-6)
+@pytest.mark.parametrize("method", [diffrax.Heun(), pytest.param(diffrax.Kvaerno3(), marks=pytest.mark.slow)])
+def test_half_steps_have_the_tolerances_and_the_derivatives_of_the_method(method):
+    _, state = pendulum()
+
+    def last(length, **options):
+        system = jk.catalog.DoublePendulum(mass=1.0, length=length)
+        return jk.simulate(system, state, jnp.linspace(0.0, 0.1, 3), **options).q[-1, 0]
+
+    of_length = lambda **options: jax.jit(jax.jacfwd(lambda x: (last(x, **options),) * 2, has_aux=True))(0.7)  # noqa: E731
+    slope, value = of_length(solver=diffrax.HalfSolver(method), rtol=1e-6)
+    exact_slope, exact = of_length(rtol=1e-11)
+    assert float(value) == pytest.approx(float(exact), abs=1e-5)
+    assert float(slope) == pytest.approx(float(exact_slope), abs=1e-4)
 
 
 @pytest.mark.parametrize("solver", [diffrax.Kvaerno5(), diffrax.ImplicitEuler()])
@@ -80,7 +88,7 @@ def test_the_steps_are_those_of_diffrax(solver, adjoint, step):
         times = times_of(ts[0], ts[1], ts[-1])._replace(first=jnp.array(first), shortest=jnp.array(shortest))
         tolerances = (jnp.array(tolerance),) * 2 if step is None else (None, None)
         spread = None if step is None else evenly_spread(times, jnp.array(step))
-        control = StepControl(Rules(*tolerances, spread, times, order, 4096, ()), None, None)
+        control = StepControl(ControlSettings(*tolerances, spread, times, order, 4096, ()), None, None)
         method = with_tolerances(solver, tolerance, tolerance)
         steps = take_steps(rates, method, control, y0, args, ts, kind, diffrax.NoProgressMeter())
         return steps.motion, steps.t_end, steps.progress.steps
@@ -159,6 +167,6 @@ def test_a_step_ends_beside_a_kink_or_leaves_half_of_the_way_to_it():
     kinks = Kinks.of(Discontinuities(jnp.array([0.5, 1.0]), jumps=False, restart=False), jnp.array(2.0))
     for length in (0.1, 0.3, 0.5 - 1e-9, 0.5, 0.7, 1.2):
         times = times_of(jnp.array(0.0), jnp.array(1.0), jnp.array(2.0))._replace(first=jnp.array(length))
-        rules = Rules(jnp.array(1e-6), jnp.array(1e-6), None, times, 5.0, None, ())
-        end, _ = StepControl(rules, None, kinks).first(jnp.zeros(1), None)
+        settings = ControlSettings(jnp.array(1e-6), jnp.array(1e-6), None, times, 5.0, None, ())
+        end, _ = StepControl(settings, None, kinks).first(jnp.zeros(1), None)
         assert abs(0.5 - end) < 1e-13 or end == min(length, 0.25)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import functools
-import operator
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -17,7 +15,7 @@ from .._scalarjit.compat import depends_on
 from .._scalarjit.components import Component, as_vector, determinant
 from .._scalarjit.function import ScalarFunction
 from .._system.system import State, System, unpacked
-from .status import REASONS, Status
+from .status import REASONS
 
 
 class Crossing(eqx.Module):
@@ -203,131 +201,3 @@ def next_point(reach: Array, point: EventPoint, y_dot, quantities: EventValues, 
     moves = happened & is_small & (g_dot != 0)
     step = jnp.where(moves, -g / jnp.where(moves, g_dot, jnp.ones_like(g_dot)), jnp.zeros_like(g))
     return EventPoint(point.t + step, point.y + step * y_dot, step, point.smooth & is_small)
-
-
-class Progress(NamedTuple):
-    """What one step leaves to the next, as floats: a loop masks, copies and saves each array of its state by a program
-    of its own, and so this is one array where it is `packed`.
-
-    `status` of the motion: `COMPLETED` until something else ends it; numbers of `steps`, and of those `accepted`;
-    `rejected_end`: the end of a step that an event rejected, else -infinity; `over_bound`: the end of the first step
-    over the bound, else infinity; `start`: the quantities at the start of the step, None where there are none.
-    """
-
-    status: Array
-    steps: Array
-    accepted: Array
-    rejected_end: Array
-    over_bound: Array
-    start: EventValues | None
-
-    def packed(self) -> Array:
-        *numbers, start = self
-        more: Any = () if start is None else (start.bound[None], start.values, start.rates)
-        return jnp.concatenate([jnp.stack(numbers), *more])
-
-    @classmethod
-    def unpacked(cls, numbers: Array) -> Progress:
-        n = len(cls._fields) - 1
-        values = numbers[n + 1 :]
-        middle = values.size // 2
-        start = EventValues(values[:middle], values[middle:], numbers[n]) if numbers.size > n else None
-        return cls(numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], start)
-
-
-class Step(NamedTuple):
-    """A step from `t0` to `t1`; the next step; and whether this one is kept."""
-
-    t0: Array
-    t1: Array
-    next_t0: Array
-    next_t1: Array
-    keep: Array
-
-
-class Verdict(NamedTuple):
-    """What events make of a step: whether it is kept; the next step; whether it is to `repeat`; whether the motion
-    `ends`, or `fails` since a quantity is no number behind it; and the `progress`."""
-
-    keep: Array
-    next_t0: Array
-    next_t1: Array
-    repeat: Array
-    ends: Array
-    fails: Array
-    progress: Progress
-
-
-def on_zero(start: EventValues, rounding: Array) -> EventValues:
-    """At the start of a motion: what would have vanished within a rounding error [s] is on zero."""
-    vanishes = jnp.abs(start.values) <= jnp.abs(start.rates) * rounding
-    return start._replace(values=jnp.where(vanishes, jnp.zeros_like(start.values), start.values))
-
-
-def after_events(
-    directions: tuple[int, ...], times: Any, progress: Progress, end: EventValues | None, step: Step
-) -> Verdict:
-    """What becomes of a step at whose `end` the events have these values.
-
-    A cubic through the values and rates at both ends of a step tells whether an event passes zero. Where it does, the
-    step is rejected and repeated to just beyond that time, until a step is kept that ends there, which is the last.
-
-    A step behind which a quantity is no number is halved. Where it is as short as the resolution, the motion ends
-    before it as one whose steps became too small: whether the quantity passed zero is unknown.
-
-    A step over the bound is halved; where it is as short as `times.at_bound`, the motion ends before it. It also ends
-    where the first step over the bound did, if shorter ones do not pass it: so near to it, the outcome is chance.
-    """
-    false = jnp.zeros_like(step.keep)
-    if end is None:
-        return Verdict(step.keep, step.next_t0, step.next_t1, false, false, false, progress)
-    start: Any = progress.start
-    t0, t1 = jax.lax.stop_gradient((step.t0, step.t1))
-    h, kept = t1 - t0, step.keep
-    unknown = kept & functools.reduce(operator.or_, [x != x for x in end.values], jnp.array(False))
-    fails = unknown & (h <= times.resolution)
-    kept &= ~unknown
-    event, x = _first_event(directions, times.shortest, start, end, h)
-    crossed = kept & (x <= 1)
-    over = kept & (start.bound * end.bound < 0)
-    at_bound = (over & (h <= times.at_bound)) | (kept & ~over & (t1 >= progress.over_bound))
-    at_start = crossed & (x == 0) & ~over & ~at_bound
-    at_end = crossed & ((1 - x) * h <= times.resolution) & ~over & (x != 0) & ~at_bound
-    repeat = ((crossed | over) & ~at_end & ~at_start & ~at_bound) | (unknown & ~fails)
-    beyond = jnp.where(over | unknown, 0.5 * h, jnp.minimum(x, 1.0) * h + 0.5 * times.resolution)
-    rejected = repeat | at_start | at_bound | fails
-    status = jnp.where(at_bound, float(Status.SINGULAR_SPEEDS), progress.status)
-    return Verdict(
-        keep=step.keep & ~rejected,
-        next_t0=jnp.where(rejected, step.t0, step.next_t0),
-        next_t1=jnp.where(repeat, t0 + beyond, step.next_t1),
-        repeat=repeat,
-        ends=at_end | at_start | at_bound,
-        fails=fails,
-        progress=progress._replace(
-            status=jnp.where(at_end | at_start, float(Status.EVENT) + event, status),
-            rejected_end=jnp.where(repeat & ~over, jnp.maximum(progress.rejected_end, t1), progress.rejected_end),
-            over_bound=jnp.where(over, jnp.minimum(progress.over_bound, t1), progress.over_bound),
-            start=jax.tree.map(lambda new, old: jnp.where(kept & ~rejected, new, old), end, start),
-        ),
-    )
-
-
-def _first_event(
-    directions: tuple[int, ...], rounding: Array, start: EventValues, end: EventValues, h: Array
-) -> tuple[Array, Array]:
-    """Which quantity passes zero first in a step, and where in [0, 1]; infinite if none does."""
-    direction = jnp.asarray(directions, h.dtype)
-    # Where a quantity has no rate, as a norm at zero, the chord has to do.
-    chord = end.values - start.values
-    slopes = [jnp.where(jnp.abs(rates) < jnp.inf, h * rates, chord) for rates in (start.rates, end.rates)]
-    x = first_crossing(start.values, slopes[0], end.values, slopes[1], direction)
-    # What is to vanish within a rounding error behind the step vanishes at its end.
-    coming = (end.values * end.rates < 0) & (direction * end.rates >= 0)
-    coming &= jnp.abs(end.values) <= jnp.abs(end.rates) * rounding
-    x = jnp.where(coming, jnp.minimum(x, 1.0), x)
-    event, place = jnp.full_like(h, -1.0), jnp.full_like(h, jnp.inf)
-    for i in reversed(range(len(directions))):
-        nearer = x[i] <= place
-        event, place = jnp.where(nearer, float(i), event), jnp.where(nearer, x[i], place)
-    return event, place

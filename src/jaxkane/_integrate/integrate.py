@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -19,6 +18,7 @@ from .._kane.rhs import outputs_at, rates_are_native, values_of, vector_field
 from .._scalarjit.cache_key import captured_tracers, captures_any, jit
 from .._scalarjit.components import as_vector
 from .._scalarjit.function import Packed, ScalarFunction, tree_of
+from .._scalarjit.jaxpr import LARGEST_SUM
 from .._scalarjit.nan import (
     all_finite,
     constant,
@@ -45,13 +45,13 @@ from .inputs import (
 )
 from .settings import Settings, with_tolerances
 from .status import Status
-from .step_control import LARGEST_SMALL, Kinks, Rules, StepControl, Times, evenly_spread, times_of
-from .steps import UnrolledERK, take_steps
+from .step_control import ControlSettings, Kinks, StepControl, Times, evenly_spread, times_of
+from .steps import UnrolledERK, take_steps, with_scan_kind
 from .trajectory import InputDiscontinuities, Trajectory
 
 
 def _is_small(x: Any) -> bool:
-    return eqx.is_inexact_array(x) and 0 < x.size <= LARGEST_SMALL
+    return eqx.is_inexact_array(x) and 0 < x.size <= LARGEST_SUM
 
 
 def _is_rising(ts: Array) -> Array:
@@ -225,9 +225,7 @@ def one_step(
     constrained = has_configuration_constraints(system, t0, unpacked(system, y).q)
     rates = _rates(jnp.array(True), settings.stabilize if constrained else 0.0)
     inputs = inputs_at(system, signals, t0, unpacked(system, y))
-    solver, term = _solver_for(settings, system, t0, y, inputs), diffrax.ODETerm(rates)
-    if hasattr(solver, "scan_kind"):
-        solver = dataclasses.replace(solver, scan_kind="lax")  # as diffrax does it for derivatives in forward mode
+    solver, term = with_scan_kind(_solver_for(settings, system, t0, y, inputs), "lax"), diffrax.ODETerm(rates)
     state = solver.init(term, t0, t1, y, args)
     y1, _, _, _, result = solver.step(term, t0, t1, y, args, state, False)
     return jnp.where(result == diffrax.RESULTS.successful, y1, jnp.nan)
@@ -235,7 +233,7 @@ def one_step(
 
 def _solver_for(settings: Settings, system: System, t: Array, y: Array, inputs: dict[str, Array]) -> Any:
     solver: Any = settings.solver
-    if isinstance(solver, diffrax.AbstractERK):
+    if isinstance(solver, diffrax.AbstractERK) and not isinstance(solver, diffrax.HalfSolver):  # which may seem one
         return UnrolledERK(solver) if rates_are_native(system, t, y, inputs) else solver
     return with_tolerances(solver, settings.rtol, settings.atol)
 
@@ -338,7 +336,7 @@ def _control_of(problem: InitialValueProblem) -> StepControl:
 
     as_number = lambda x: jnp.asarray(x, times.end.dtype)  # noqa: E731
     fixed, kinks = settings.step is not None, problem.discontinuities
-    rules = Rules(
+    control = ControlSettings(
         rtol=None if fixed else as_number(settings.rtol),
         atol=None if fixed else as_number(settings.atol),
         step=evenly_spread(times, as_number(settings.step)) if fixed else None,
@@ -348,7 +346,7 @@ def _control_of(problem: InitialValueProblem) -> StepControl:
         directions=events.directions,
     )
     may_end = quantities if events.names or system.dependent_speeds else None
-    return StepControl(rules, may_end, None if kinks is None or fixed else Kinks.of(kinks, times.end))
+    return StepControl(control, may_end, None if kinks is None or fixed else Kinks.of(kinks, times.end))
 
 
 # One function of scalars each: XLA would compute it anew in every program that reads any of it.

@@ -5,6 +5,8 @@ A step is as long as its error allows, and ends at the kinks of inputs, at event
 
 from __future__ import annotations
 
+import functools
+import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,12 +16,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from .._scalarjit.function import ScalarFunction
+from .._scalarjit.jaxpr import LARGEST_SUM
 from .._scalarjit.nan import constant
-from .events import EventValues, Progress, Step, after_events, on_zero
+from .events import EventValues, first_crossing
 from .inputs import Discontinuities
 from .status import Status
-
-LARGEST_SMALL = 64  # a larger array is no argument of a program of scalars
 
 
 class Times(NamedTuple):
@@ -93,12 +94,12 @@ class Kinks(eqx.Module):
         i = jnp.searchsorted(self.times, t + self.rounding, side="right")
         return jnp.where(i < len(self.times), self.times[jnp.minimum(i, len(self.times) - 1)], jnp.inf)
 
-    def beside(self, t0: Array, t1: Array) -> Beside:
+    def beside(self, t0: Array, t1: Array) -> NearbyKinks:
         """Of a step."""
         kink = self.times[jnp.minimum(jnp.searchsorted(self.times, t1 - self.rounding), len(self.times) - 1)]
         at_end = jnp.abs(t1 - kink) <= self.rounding
         start = jnp.where(at_end, kink + 0.25 * self.rounding, t1)
-        return Beside(at_end, start, self.after(start), self.after(t0), self.rounding)
+        return NearbyKinks(at_end, start, self.after(start), self.after(t0), self.rounding)
 
 
 def _rounding(times: Array) -> Array:
@@ -107,7 +108,7 @@ def _rounding(times: Array) -> Array:
     return 64 * jnp.finfo(times.dtype).eps * jnp.max(jnp.where(jnp.isfinite(times), jnp.abs(times), 0.0))
 
 
-class Beside(NamedTuple):
+class NearbyKinks(NamedTuple):
     """The kinks beside a step: whether it ends `at_kink`; the `start` of the next step where this one is kept; the next
     kinks after that start, and after the start of this step; and their `rounding`."""
 
@@ -124,6 +125,59 @@ def _clipped(t0: Array, t1: Array, kink: Array, rounding: Array) -> Array:
     return jnp.where(t1 >= kink, kink - 0.25 * rounding, jnp.minimum(t1, halfway))
 
 
+class Progress(NamedTuple):
+    """What one step leaves to the next, as floats: a loop masks, copies and saves each array of its state by a program
+    of its own, and so this is one array where it is `packed`.
+
+    `status` of the motion: `COMPLETED` until something else ends it; numbers of `steps`, and of those `accepted`;
+    `rejected_end`: the end of a step that an event rejected, else -infinity; `over_bound`: the end of the first step
+    over the bound, else infinity; `start`: the quantities at the start of the step, None where there are none.
+    """
+
+    status: Array
+    steps: Array
+    accepted: Array
+    rejected_end: Array
+    over_bound: Array
+    start: EventValues | None
+
+    def packed(self) -> Array:
+        *numbers, start = self
+        more: Any = () if start is None else (start.bound[None], start.values, start.rates)
+        return jnp.concatenate([jnp.stack(numbers), *more])
+
+    @classmethod
+    def unpacked(cls, numbers: Array) -> Progress:
+        n = len(cls._fields) - 1
+        values = numbers[n + 1 :]
+        middle = values.size // 2
+        start = EventValues(values[:middle], values[middle:], numbers[n]) if numbers.size > n else None
+        return cls(numbers[0], numbers[1], numbers[2], numbers[3], numbers[4], start)
+
+
+class Step(NamedTuple):
+    """A step from `t0` to `t1`; the next step; and whether this one is kept."""
+
+    t0: Array
+    t1: Array
+    next_t0: Array
+    next_t1: Array
+    keep: Array
+
+
+class EventDecision(NamedTuple):
+    """What events make of a step: whether it is kept; the next step; whether it is to `repeat`; whether the motion
+    `ends`, or `fails` since a quantity is no number behind it; and the `progress`."""
+
+    keep: Array
+    next_t0: Array
+    next_t1: Array
+    repeat: Array
+    ends: Array
+    fails: Array
+    progress: Progress
+
+
 class Decision(NamedTuple):
     """What becomes of a step: whether it is kept; the ends of the next one; whether that begins behind a jump; the
     `progress`, packed; and whether the motion goes on."""
@@ -133,10 +187,10 @@ class Decision(NamedTuple):
     t1: Array
     jumped: Array
     progress: Array
-    goes_on: Array
+    is_running: Array
 
 
-class Rules(eqx.Module):
+class ControlSettings(eqx.Module):
     """The numbers by which steps are chosen: tolerances and the `order` of the error, or a fixed `step` [s]; the times;
     at most `max_steps`; and the directions in which events count (see `first_crossing`)."""
 
@@ -150,17 +204,17 @@ class Rules(eqx.Module):
 
 
 class StepControl(NamedTuple):
-    """The `rules`; `quantities`: (t, y, args) -> `EventValues`, None where there are none; and the kinks."""
+    """The `settings`; `quantities`: (t, y, args) -> `EventValues`, None where there are none; and the kinks."""
 
-    rules: Rules
+    settings: ControlSettings
     quantities: Callable[..., EventValues] | None
     kinks: Kinks | None
 
     def first(self, y0: Array, args: Any) -> tuple[Array, Array]:
         """The end of the first step, and the progress, packed."""
-        start = self.rules.times.start
+        start = self.settings.times.start
         kink = None if self.kinks is None else (self.kinks.after(start), self.kinks.rounding)
-        return _first(self.rules, self._values(start, y0, args), kink)
+        return _first(self.settings, self._values(start, y0, args), kink)
 
     def following(
         self, progress: Array, t0: Array, t1: Array, y0: Array, y1: Array, error: Any, failed: Array | None, args: Any
@@ -171,9 +225,9 @@ class StepControl(NamedTuple):
         cannot.
         """
         beside = None if self.kinks is None else self.kinks.beside(t0, t1)
-        measured = constant((y0, y1, error)) if self.rules.step is None else None
-        decide = _following if y0.size <= LARGEST_SMALL else _following.__wrapped__
-        return decide(self.rules, constant(progress), t0, t1, self._values(t1, y1, args), measured, failed, beside)
+        measured = constant((y0, y1, error)) if self.settings.step is None else None
+        decide = _following if y0.size <= LARGEST_SUM else _following.__wrapped__
+        return decide(self.settings, constant(progress), t0, t1, self._values(t1, y1, args), measured, failed, beside)
 
     def _values(self, t: Any, y: Any, args: Any) -> EventValues | None:
         # Where steps end has no derivative, and compiling one would take its time.
@@ -181,34 +235,34 @@ class StepControl(NamedTuple):
 
 
 @ScalarFunction.once
-def _first(rules: Rules, quantities: EventValues | None, kink: Any) -> tuple[Array, Array]:
-    times = rules.times
-    h = jnp.maximum(times.first, times.shortest) if rules.step is None else rules.step
+def _first(settings: ControlSettings, quantities: EventValues | None, kink: Any) -> tuple[Array, Array]:
+    times = settings.times
+    h = jnp.maximum(times.first, times.shortest) if settings.step is None else settings.step
     end = times.start + h
     end = end if kink is None else _clipped(times.start, end, *kink)
     status, none, past, never = (jnp.full_like(h, x) for x in (Status.COMPLETED, 0.0, -jnp.inf, jnp.inf))
-    start = None if quantities is None else on_zero(quantities, times.shortest)
+    start = None if quantities is None else _on_zero(quantities, times.shortest)
     return jnp.minimum(end, times.end), Progress(status, none, none, past, never, start).packed()
 
 
 # One function of scalars: as a hundred operations it would be as many programs, and half of XLA's work.
 @ScalarFunction
 def _following(
-    rules: Rules,
+    settings: ControlSettings,
     progress: Array,
     t0: Array,
     t1: Array,
     quantities: EventValues | None,
     measured: Any,
     failed: Array | None,
-    beside: Beside | None,
+    beside: NearbyKinks | None,
 ) -> Decision:
-    times, before = rules.times, Progress.unpacked(progress)
+    times, before = settings.times, Progress.unpacked(progress)
     if measured is None:
         keep, too_short = jnp.ones(t1.shape, bool), jnp.zeros(t1.shape, bool)
-        h = _to_next(rules, t1)
+        h = _to_next(settings, t1)
     else:
-        keep, h, too_short = _by_error(rules, t1 - t0, *measured)
+        keep, h, too_short = _by_error(settings, t1 - t0, *measured)
     next_t0, jumped = jnp.where(keep, t1, t0), jnp.zeros_like(keep)
     if beside is not None:
         next_t0 = jnp.where(keep, beside.start, t0)
@@ -220,40 +274,40 @@ def _following(
     resumes = keep & (t1 < before.rejected_end)
     next_t1 = jnp.where(resumes, before.rejected_end, next_t1)
     step = Step(t0, t1, next_t0, next_t1, keep)
-    verdict = after_events(rules.directions, times, before, quantities, step)
-    too_short &= ~verdict.repeat
+    by_events = _after_events(settings.directions, times, before, quantities, step)
+    too_short &= ~by_events.repeat
     if failed is not None:
-        too_short |= failed & verdict.keep
+        too_short |= failed & by_events.keep
     # A last step is none of a rounding error, and one that was not kept is halved.
-    near = verdict.next_t1 > times.end - 100 * jnp.finfo(times.end.dtype).eps * jnp.abs(times.end)
-    last = jnp.where(verdict.keep, times.end, verdict.next_t0 + 0.5 * (times.end - verdict.next_t0))
-    ends = verdict.ends | (verdict.keep & (verdict.next_t0 >= times.end))
-    fails = (too_short & ~ends) | verdict.fails
-    steps, accepted = before.steps + 1.0, before.accepted + verdict.keep.astype(before.steps.dtype)
+    near = by_events.next_t1 > times.end - 100 * jnp.finfo(times.end.dtype).eps * jnp.abs(times.end)
+    last = jnp.where(by_events.keep, times.end, by_events.next_t0 + 0.5 * (times.end - by_events.next_t0))
+    ends = by_events.ends | (by_events.keep & (by_events.next_t0 >= times.end))
+    fails = (too_short & ~ends) | by_events.fails
+    steps, accepted = before.steps + 1.0, before.accepted + by_events.keep.astype(before.steps.dtype)
     failure = jnp.where(accepted > 0, float(Status.STEP_TOO_SMALL), float(Status.NO_SOLUTION))
-    status = jnp.where(fails, failure, verdict.progress.status)
-    goes_on = ~(ends | fails)
-    if rules.max_steps is not None:
-        is_last = goes_on & (steps >= rules.max_steps)
-        status, goes_on = jnp.where(is_last, float(Status.MAX_STEPS), status), goes_on & ~is_last
+    status = jnp.where(fails, failure, by_events.progress.status)
+    is_running = ~(ends | fails)
+    if settings.max_steps is not None:
+        is_last = is_running & (steps >= settings.max_steps)
+        status, is_running = jnp.where(is_last, float(Status.MAX_STEPS), status), is_running & ~is_last
     return Decision(
-        verdict.keep,
-        verdict.next_t0,
-        jnp.where(near, last, verdict.next_t1),
+        by_events.keep,
+        by_events.next_t0,
+        jnp.where(near, last, by_events.next_t1),
         jumped,
-        verdict.progress._replace(status=status, steps=steps, accepted=accepted).packed(),
-        goes_on,
+        by_events.progress._replace(status=status, steps=steps, accepted=accepted).packed(),
+        is_running,
     )
 
 
-def _to_next(rules: Rules, t: Array) -> Array:
+def _to_next(settings: ControlSettings, t: Array) -> Array:
     """From a time to the next end of a fixed step. These stand on a grid from the start on, which rounding errors of
     the steps do not move; nor does a step that was halved."""
-    start, step = rules.times.start, rules.step
+    start, step = settings.times.start, settings.step
     return start + step * (jnp.floor((t - start) / step + 0.01) + 1.0) - t
 
 
-def _by_error(rules: Rules, h: Array, y0: Array, y1: Array, error: Array) -> tuple[Array, Array, Array]:
+def _by_error(settings: ControlSettings, h: Array, y0: Array, y1: Array, error: Array) -> tuple[Array, Array, Array]:
     """Whether a step of the length h is kept, the length of the next one, and whether that is too short.
 
     As `diffrax.PIDController` with its own coefficients: of the error e by its tolerances,
@@ -261,11 +315,86 @@ def _by_error(rules: Rules, h: Array, y0: Array, y1: Array, error: Array) -> tup
         e < 1,   h clip(0.9 e^(-1 / order), 1 or 0.2, 10 or 0.9)      (where it is kept, or is not)
     """
     y1 = jnp.where(jnp.any(jnp.isnan(y1)), y0, y1)
-    scaled = error / (rules.atol + rules.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1)))
+    scaled = error / (settings.atol + settings.rtol * jnp.maximum(jnp.abs(y0), jnp.abs(y1)))
     e = jnp.sqrt(jnp.mean(scaled * scaled))
     e = jnp.where(e < jnp.inf, e, jnp.inf)  # as large, where the rates are no numbers
     keep = e < 1
-    factor = 0.9 * e ** (-1.0 / rules.order)
+    factor = 0.9 * e ** (-1.0 / settings.order)
     factor = jnp.clip(factor, jnp.where(keep, 1.0, 0.2), jnp.where(keep, 10.0, 0.9))
     h = h * jax.lax.stop_gradient(factor)
-    return keep, jnp.maximum(h, rules.times.shortest), h < rules.times.shortest
+    return keep, jnp.maximum(h, settings.times.shortest), h < settings.times.shortest
+
+
+def _on_zero(start: EventValues, rounding: Array) -> EventValues:
+    """At the start of a motion: what would have vanished within a rounding error [s] is on zero."""
+    vanishes = jnp.abs(start.values) <= jnp.abs(start.rates) * rounding
+    return start._replace(values=jnp.where(vanishes, jnp.zeros_like(start.values), start.values))
+
+
+def _after_events(
+    directions: tuple[int, ...], times: Times, progress: Progress, end: EventValues | None, step: Step
+) -> EventDecision:
+    """What becomes of a step at whose `end` the events have these values.
+
+    A cubic through the values and rates at both ends of a step tells whether an event passes zero. Where it does, the
+    step is rejected and repeated to just beyond that time, until a step is kept that ends there, which is the last.
+
+    A step behind which a quantity is no number is halved. Where it is as short as the resolution, the motion ends
+    before it as one whose steps became too small: whether the quantity passed zero is unknown.
+
+    A step over the bound is halved; where it is as short as `times.at_bound`, the motion ends before it. It also ends
+    where the first step over the bound did, if shorter ones do not pass it: so near to it, the outcome is chance.
+    """
+    false = jnp.zeros_like(step.keep)
+    if end is None:
+        return EventDecision(step.keep, step.next_t0, step.next_t1, false, false, false, progress)
+    start: Any = progress.start
+    t0, t1 = jax.lax.stop_gradient((step.t0, step.t1))
+    h, kept = t1 - t0, step.keep
+    unknown = kept & functools.reduce(operator.or_, [x != x for x in end.values], jnp.array(False))
+    fails = unknown & (h <= times.resolution)
+    kept &= ~unknown
+    event, x = _first_event(directions, times.shortest, start, end, h)
+    crossed = kept & (x <= 1)
+    over = kept & (start.bound * end.bound < 0)
+    at_bound = (over & (h <= times.at_bound)) | (kept & ~over & (t1 >= progress.over_bound))
+    at_start = crossed & (x == 0) & ~over & ~at_bound
+    at_end = crossed & ((1 - x) * h <= times.resolution) & ~over & (x != 0) & ~at_bound
+    repeat = ((crossed | over) & ~at_end & ~at_start & ~at_bound) | (unknown & ~fails)
+    beyond = jnp.where(over | unknown, 0.5 * h, jnp.minimum(x, 1.0) * h + 0.5 * times.resolution)
+    rejected = repeat | at_start | at_bound | fails
+    status = jnp.where(at_bound, float(Status.SINGULAR_SPEEDS), progress.status)
+    return EventDecision(
+        keep=step.keep & ~rejected,
+        next_t0=jnp.where(rejected, step.t0, step.next_t0),
+        next_t1=jnp.where(repeat, t0 + beyond, step.next_t1),
+        repeat=repeat,
+        ends=at_end | at_start | at_bound,
+        fails=fails,
+        progress=progress._replace(
+            status=jnp.where(at_end | at_start, float(Status.EVENT) + event, status),
+            rejected_end=jnp.where(repeat & ~over, jnp.maximum(progress.rejected_end, t1), progress.rejected_end),
+            over_bound=jnp.where(over, jnp.minimum(progress.over_bound, t1), progress.over_bound),
+            start=jax.tree.map(lambda new, old: jnp.where(kept & ~rejected, new, old), end, start),
+        ),
+    )
+
+
+def _first_event(
+    directions: tuple[int, ...], rounding: Array, start: EventValues, end: EventValues, h: Array
+) -> tuple[Array, Array]:
+    """Which quantity passes zero first in a step, and where in [0, 1]; infinite if none does."""
+    direction = jnp.asarray(directions, h.dtype)
+    # Where a quantity has no rate, as a norm at zero, the chord has to do.
+    chord = end.values - start.values
+    slopes = [jnp.where(jnp.abs(rates) < jnp.inf, h * rates, chord) for rates in (start.rates, end.rates)]
+    x = first_crossing(start.values, slopes[0], end.values, slopes[1], direction)
+    # What is to vanish within a rounding error behind the step vanishes at its end.
+    coming = (end.values * end.rates < 0) & (direction * end.rates >= 0)
+    coming &= jnp.abs(end.values) <= jnp.abs(end.rates) * rounding
+    x = jnp.where(coming, jnp.minimum(x, 1.0), x)
+    event, place = jnp.full_like(h, -1.0), jnp.full_like(h, jnp.inf)
+    for i in reversed(range(len(directions))):
+        nearer = x[i] <= place
+        event, place = jnp.where(nearer, float(i), event), jnp.where(nearer, x[i], place)
+    return event, place

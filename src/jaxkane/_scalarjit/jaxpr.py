@@ -62,7 +62,7 @@ _PLAIN = frozenset(
     "reduce_or reduce_prod reduce_sum rem reshape rev round rsqrt select_n sign sin sinh slice split sqrt square "
     "squeeze stack stop_gradient sub tan tanh transpose unstack xor".split()
 )
-_LARGEST_SUM = 64  # XLA may hand larger ones to a library
+LARGEST_SUM = 64  # XLA may hand larger ones to a library
 
 # In the name of each call of the method itself into LAPACK.
 BY_LAPACK = "by_lapack"
@@ -175,8 +175,8 @@ def unsupported_primitives(program: Jaxpr, is_ours: bool = False) -> Iterator[tu
             continue  # see `cse`
         elif name not in _PLAIN:
             yield name, not is_ours
-        elif name.startswith("reduce_") and getattr(equation.invars[0].aval, "size", 0) > _LARGEST_SUM:
-            yield f"{name} of more than {_LARGEST_SUM}", not is_ours
+        elif name.startswith("reduce_") and getattr(equation.invars[0].aval, "size", 0) > LARGEST_SUM:
+            yield f"{name} of more than {LARGEST_SUM}", not is_ours
 
 
 def replaced(values: Sequence[Any], places: Sequence[int], new: Sequence[Any]) -> list[Any]:
