@@ -59,6 +59,15 @@ def test_steps_of_one_length_that_end_at_the_samples():
         jk.simulate(Cart(), jk.State([0.0], [0.0]), ts, {"push": push}, step=0.1)
 
 
+def test_a_rejected_step_behind_a_jump_begins_anew():
+    """Its first stage is not the last one before the jump, for the step that is repeated neither."""
+    system, state = jk.catalog.DoublePendulum(), jk.State([0.5, -0.2], [0.7, 1.0])
+    torque = jk.Samples(ts, values, zero_order_hold=True)
+    ride, exact = (jk.simulate(system, state, ts, {"elbow_torque": torque}, rtol=x, atol=x) for x in (1e-8, 1e-12))
+    assert ride.stats["rejected"] > 3
+    np.testing.assert_allclose(ride.q, exact.q, atol=1e-8)
+
+
 def test_what_is_no_hold_is_refused():
     with pytest.raises(TypeError, match="`zero_order_hold` is True or False, got 'zero'"):
         jk.Samples(ts, values, zero_order_hold="zero")

@@ -119,7 +119,7 @@ def take_steps(
             t1=decision.t1,
             y=chosen(y, carry.y),
             solver_state=chosen(solver_state, carry.solver_state),
-            jumped=None if carry.jumped is None else decision.jumped,
+            jumped=None if carry.jumped is None else chosen(decision.jumped, carry.jumped),
             progress=decision.progress,
             is_running=decision.is_running,
             samples=loop(is_due, sampled, carry.samples, len(ts), len(ts), lambda s: s.motion),
