@@ -396,12 +396,13 @@ def test_options_that_contradict_themselves(options, message):
     ("options", "message"),
     [
         ({"solver": diffrax.Tsit5}, r"`solver` is an instance, not a class: solver=diffrax.Tsit5\(\)"),
-        ({"solver": "Tsit5"}, r"`solver` is one of diffrax, as diffrax.Tsit5\(\) is a solver; got 'Tsit5'"),
+        ({"solver": "Tsit5"}, r"`solver` is one of diffrax, as diffrax.Tsit5\(\) is; got 'Tsit5'"),
         (
             {"adjoint": diffrax.DirectAdjoint},
             r"`adjoint` is an instance, not a class: adjoint=diffrax.DirectAdjoint\(\)",
         ),
-        ({"adjoint": True}, "`adjoint` is one of diffrax"),
+        ({"adjoint": True}, "`adjoint` is one of auto, reverse, forward, both, or a diffrax adjoint; got True"),
+        ({"adjoint": None}, "`adjoint` is one of auto, reverse, forward, both, or a diffrax adjoint; got None"),
         ({"project": "no"}, "`project` is True or False, got 'no'"),
         ({"progress": 1}, "`progress` is True or False, got 1"),
     ],

@@ -11,6 +11,7 @@ from jaxkane._integrate.inputs import Discontinuities
 from jaxkane._integrate.settings import ADJOINTS, with_tolerances
 from jaxkane._integrate.step_control import ControlSettings, Kinks, StepControl, evenly_spread, times_of
 from jaxkane._integrate.steps import UnrolledERK, take_steps
+from jaxkane._scalarjit.backends import native
 from jaxkane._scalarjit.function import ScalarFunction
 
 
@@ -113,6 +114,57 @@ def test_the_steps_are_those_of_diffrax(solver, adjoint, step):
     for x, y in zip(found, expected, strict=True):
         np.testing.assert_allclose(x, y, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(slope, expected_slope, rtol=1e-10)
+
+
+class Oscillator(jk.System):
+    mass: jk.Scalar = jk.parameter(1.0)
+    stiffness: jk.Scalar = jk.parameter(4.0)
+    level: jk.Scalar = jk.parameter(-2.0)
+    coordinates, speeds, inputs = ("x",), ("v",), ("push",)
+
+    def motion(self, t, q, u):
+        N, O = jk.inertial()
+        return jk.Motion([jk.Body(self.mass, 0.0, O.moving(q["x"] * N.x, u["v"] * N.x), name="mass")])
+
+    def loads(self, t, q, u, motion, inputs):
+        return jk.Force((inputs["push"] - self.stiffness * q["x"]) * motion.N.x, motion["mass"])
+
+    def events(self, t, q, u):
+        return {"level": jk.falling(q["x"] - self.level)}
+
+
+AT_REST = jk.State([1.0], [0.0])
+
+
+@pytest.mark.parametrize("adjoint", ["forward", "reverse"])
+def test_a_fixed_step_to_what_is_no_number_ends_the_motion(adjoint):
+    """As one with tolerances: with a reason, and derivatives that are NaN where there is no motion."""
+
+    def ride(stiffness, mass=1.0):
+        push = {"push": lambda t, _: jnp.where(t > 0.55, jnp.nan, 0.0)}
+        system = Oscillator(mass=mass, stiffness=stiffness)
+        return jk.simulate(system, AT_REST, [0.0, 0.5, 1.0], push, step=0.01, adjoint=adjoint)
+
+    motion = ride(4.0)
+    assert motion.status == jk.Status.STEP_TOO_SMALL
+    assert 0.5 < motion.t_end < 0.6
+    np.testing.assert_allclose(motion["x"], [1.0, np.cos(1.0), np.nan], atol=1e-8)
+    jacobian = jax.jacfwd if adjoint == "forward" else jax.jacrev
+    slopes = jax.jit(jacobian(lambda k: ride(k)["x"]))(4.0)
+    np.testing.assert_allclose(slopes, [0.0, -np.sin(1.0) / 8, np.nan], atol=1e-8)
+    first = jax.vmap(lambda m: jacobian(lambda m: ride(4.0, m)["x"][1])(m))(jnp.array([1.0, 0.0]))
+    np.testing.assert_allclose(first, [np.sin(1.0) / 2, np.nan], atol=1e-8)
+
+
+@pytest.mark.skipif(not native.is_on(), reason="XLA alone leaves out a term for the time that it takes to compile")
+def test_the_derivative_of_an_event_early_in_a_long_motion():
+    def end(level):
+        system = Oscillator(stiffness=1e6, level=level)
+        return jk.simulate(system, AT_REST, [0.0, 1e4], rtol=1e-11, atol=1e-11).t_end
+
+    t, slope = jax.jit(jax.value_and_grad(end))(0.9)
+    assert float(t) == pytest.approx(np.arccos(0.9) / 1e3, rel=1e-11)
+    assert float(slope) == pytest.approx(-1e-3 / np.sqrt(1 - 0.81), rel=1e-7)
 
 
 @ScalarFunction

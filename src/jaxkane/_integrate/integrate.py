@@ -370,9 +370,10 @@ def _by_event(point: EventPoint, ending: Ending) -> Ending:
 def _located(problem: InitialValueProblem, ending: Ending) -> EventPoint:
     """Where the event is that ended the motion, with derivatives up to the second order; the start if none did.
 
-    The last step ends so near to it that the first step of Newton's method is exact, and that its first derivative is
-    that of the implicit function theorem. The second step has the second derivatives. In these alone the rates are
-    those halfway, and have a derivative.
+    The last step ends so near to it that the first step of Newton's method is exact. The second step has the
+    derivatives by the implicit function theorem, for which the rates are those halfway. Their own first derivative is
+    negligible unless the motion is very much longer than what is fastest in it. XLA alone would compile it for seconds,
+    and leaves it out.
     """
     system, events = problem.args[0], problem.events
     t, y = jax.lax.stop_gradient(ending.near[0]), ending.near[1]
@@ -387,6 +388,9 @@ def _located(problem: InitialValueProblem, ending: Ending) -> EventPoint:
         return step * (problem.rates(t + 0.5 * step, y + 0.5 * step * y_dot, args) - y_dot)
 
     near = stepped(EventPoint(t, y, jnp.zeros_like(t), jnp.array(True)))
+    inputs = inputs_at(problem.system, problem.signals, t, unpacked(problem.system, y))
+    if rates_are_native(system, t, y, inputs):
+        return stepped(near._replace(y=near.y + bend(near.step, y, problem.args)))
     reverse = not isinstance(problem.settings.adjoint, diffrax.ForwardMode)
     return stepped(near._replace(y=near.y + negligible(bend, near.step, y, problem.args, transposes=reverse)))
 

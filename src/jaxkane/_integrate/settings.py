@@ -34,6 +34,9 @@ ADJOINTS = {
 }
 
 
+_ADJOINT = f"`adjoint` is one of {', '.join(ADJOINTS)}, or a diffrax adjoint; got {{!r}}."
+
+
 class Settings(eqx.Module):
     """The options of `simulate`, with their defaults filled in.
 
@@ -134,8 +137,10 @@ def _changed(solver: Any, fields: Callable[[Any], dict[str, Any]]) -> Any:
 def _check_types(solver: Any, adjoint: Any, **flags: Any) -> None:
     if isinstance(adjoint, str):
         if adjoint not in ADJOINTS:
-            raise ValueError(f"`adjoint` is one of {', '.join(ADJOINTS)}, or a diffrax adjoint; got {adjoint!r}.")
+            raise ValueError(_ADJOINT.format(adjoint))
         adjoint = None
+    elif adjoint is None:
+        raise TypeError(_ADJOINT.format(adjoint))
     for label, value, kind in (
         ("solver", solver, diffrax.AbstractSolver),
         ("adjoint", adjoint, diffrax.AbstractAdjoint),
@@ -143,7 +148,8 @@ def _check_types(solver: Any, adjoint: Any, **flags: Any) -> None:
         if isinstance(value, type) and issubclass(value, kind):
             raise TypeError(f"`{label}` is an instance, not a class: {label}=diffrax.{value.__name__}().")
         if value is not None and not isinstance(value, kind):
-            raise TypeError(f"`{label}` is one of diffrax, as diffrax.Tsit5() is a solver; got {value!r}.")
+            is_solver = f"`solver` is one of diffrax, as diffrax.Tsit5() is; got {value!r}."
+            raise TypeError(is_solver if label == "solver" else _ADJOINT.format(value))
     if solver is not None and solver.term_structure is not diffrax.AbstractTerm:
         raise TypeError(
             f"{type(solver).__name__} takes equations in several parts, such as stiff and other ones. These are in one "

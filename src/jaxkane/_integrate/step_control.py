@@ -225,7 +225,7 @@ class StepControl(NamedTuple):
         cannot.
         """
         beside = None if self.kinks is None else self.kinks.beside(t0, t1)
-        measured = constant((y0, y1, error)) if self.settings.step is None else None
+        measured = constant((y0, y1, error))
         decide = _following if y0.size <= LARGEST_SUM else _following.__wrapped__
         return decide(self.settings, constant(progress), t0, t1, self._values(t1, y1, args), measured, failed, beside)
 
@@ -258,9 +258,9 @@ def _following(
     beside: NearbyKinks | None,
 ) -> Decision:
     times, before = settings.times, Progress.unpacked(progress)
-    if measured is None:
-        keep, too_short = jnp.ones(t1.shape, bool), jnp.zeros(t1.shape, bool)
-        h = _to_next(settings, t1)
+    if settings.step is not None:
+        keep = jnp.all(jnp.isfinite(measured[1]))
+        h, too_short = _to_next(settings, t1), ~keep
     else:
         keep, h, too_short = _by_error(settings, t1 - t0, *measured)
     next_t0, jumped = jnp.where(keep, t1, t0), jnp.zeros_like(keep)
