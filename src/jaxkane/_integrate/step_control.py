@@ -253,16 +253,17 @@ def _following(
     t0: Array,
     t1: Array,
     quantities: EventValues | None,
-    measured: Any,
+    measured: tuple[Array, Array, Any],
     failed: Array | None,
     beside: NearbyKinks | None,
 ) -> Decision:
     times, before = settings.times, Progress.unpacked(progress)
+    y0, y1, error = measured
     if settings.step is not None:
-        keep = jnp.all(jnp.isfinite(measured[1]))
+        keep = jnp.all(jnp.isfinite(y1))
         h, too_short = _to_next(settings, t1), ~keep
     else:
-        keep, h, too_short = _by_error(settings, t1 - t0, *measured)
+        keep, h, too_short = _by_error(settings, t1 - t0, y0, y1, error)
     next_t0, jumped = jnp.where(keep, t1, t0), jnp.zeros_like(keep)
     if beside is not None:
         next_t0 = jnp.where(keep, beside.start, t0)

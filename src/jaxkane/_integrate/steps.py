@@ -150,7 +150,7 @@ def with_scan_kind(solver: Any, kind: str) -> Any:
 def _loop(
     kind: Any, condition: Any, body: Any, carry: Any, max_steps: int | None, checkpoints: int | None, buffers: Any
 ) -> Any:
-    """One of equinox, which counts its steps where its derivative needs that."""
+    """The one of equinox that diffrax uses; it counts its steps where its derivative needs that."""
     more: dict[str, Any] = {} if kind == "lax" else {"max_steps": max_steps}
     more |= {"checkpoints": checkpoints} if kind == "checkpointed" else {}
     return eqxi.while_loop(condition, body, carry, buffers=buffers, kind=kind, **more)
