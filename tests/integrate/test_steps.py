@@ -156,6 +156,30 @@ def test_a_fixed_step_to_what_is_no_number_ends_the_motion(adjoint):
     np.testing.assert_allclose(first, [np.sin(1.0) / 2, np.nan], atol=1e-8)
 
 
+def test_as_many_steps_as_are_allowed():
+    system, state = pendulum()
+    ride = lambda most: jk.simulate(system, state, [0.0, 0.5], max_steps=most)  # noqa: E731
+    n = int(ride(1000).stats["steps"])
+    assert ride(n).status == jk.Status.COMPLETED
+    short = ride(n - 1)
+    assert short.status == jk.Status.MAX_STEPS
+    assert short.stats["steps"] == n - 1 == short.stats["accepted"] + short.stats["rejected"]
+
+
+class Growth(Oscillator):
+    states = ("size",)
+
+    def state_rates(self, t, q, u, x, motion, now):
+        return [x[0] ** 2 + 1.0]
+
+
+def test_an_implicit_step_without_a_solution_ends_the_motion():
+    """Of y = y0 + h (y^2 + 1), for h = 1."""
+    state = jk.State([1.0], [0.0], [0.0])
+    with pytest.raises(ValueError, match=r"cannot take a first step: .* or an implicit step has no solution"):
+        jk.simulate(Growth(), state, [0.0, 1.0, 2.0], step=1.0, solver=diffrax.ImplicitEuler())
+
+
 @pytest.mark.skipif(not native.is_on(), reason="XLA alone leaves out a term for the time that it takes to compile")
 def test_the_derivative_of_an_event_early_in_a_long_motion():
     def end(level):

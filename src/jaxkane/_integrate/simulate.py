@@ -103,7 +103,7 @@ def simulate(
         raise ValueError(
             diagnosis(system, ts[0], state.q, state.u, values)
             or f"{type(system).__name__}: the solver cannot take a first step: accelerations, rates or events are not "
-            "finite beside the first state."
+            "finite beside the first state, or an implicit step has no solution."
         )
     return trajectory
 

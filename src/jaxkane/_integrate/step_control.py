@@ -259,6 +259,8 @@ def _following(
 ) -> Decision:
     times, before = settings.times, Progress.unpacked(progress)
     y0, y1, error = measured
+    if failed is not None:
+        y1, error = jax.tree.map(lambda x: jnp.where(failed, jnp.inf, x), (y1, error))
     if settings.step is not None:
         keep = jnp.all(jnp.isfinite(y1))
         h, too_short = _to_next(settings, t1), ~keep
@@ -277,8 +279,6 @@ def _following(
     step = Step(t0, t1, next_t0, next_t1, keep)
     by_events = _after_events(settings.directions, times, before, quantities, step)
     too_short &= ~by_events.repeat
-    if failed is not None:
-        too_short |= failed & by_events.keep
     # A last step is none of a rounding error, and one that was not kept is halved.
     near = by_events.next_t1 > times.end - 100 * jnp.finfo(times.end.dtype).eps * jnp.abs(times.end)
     last = jnp.where(by_events.keep, times.end, by_events.next_t0 + 0.5 * (times.end - by_events.next_t0))
