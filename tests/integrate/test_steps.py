@@ -9,7 +9,13 @@ import pytest
 import jaxkane as jk
 from jaxkane._integrate.inputs import Discontinuities
 from jaxkane._integrate.settings import ADJOINTS, with_tolerances
-from jaxkane._integrate.step_control import ControlSettings, Kinks, StepControl, evenly_spread, times_of
+from jaxkane._integrate.step_control import (
+    ClipToDiscontinuities,
+    ControlSettings,
+    StepSizeController,
+    evenly_spread,
+    times_of,
+)
 from jaxkane._integrate.steps import UnrolledERK, take_steps
 from jaxkane._scalarjit.backends import native
 from jaxkane._scalarjit.function import ScalarFunction
@@ -89,7 +95,7 @@ def test_the_steps_are_those_of_diffrax(solver, adjoint, step):
         times = times_of(ts[0], ts[1], ts[-1])._replace(first=jnp.array(first), shortest=jnp.array(shortest))
         tolerances = (jnp.array(tolerance),) * 2 if step is None else (None, None)
         spread = None if step is None else evenly_spread(times, jnp.array(step))
-        control = StepControl(ControlSettings(*tolerances, spread, times, order, 4096, ()), None, None)
+        control = StepSizeController(ControlSettings(*tolerances, spread, times, order, 4096, ()), None, None)
         method = with_tolerances(solver, tolerance, tolerance)
         steps = take_steps(rates, method, control, y0, args, ts, kind, diffrax.NoProgressMeter())
         return steps.motion, steps.t_end, steps.progress.steps
@@ -240,9 +246,9 @@ def test_the_last_time_and_the_first_have_derivatives(jacobian):
 
 
 def test_a_step_ends_beside_a_kink_or_leaves_half_of_the_way_to_it():
-    kinks = Kinks.of(Discontinuities(jnp.array([0.5, 1.0]), jumps=False, restart=False), jnp.array(2.0))
+    kinks = ClipToDiscontinuities.of(Discontinuities(jnp.array([0.5, 1.0]), jumps=False, restart=False), jnp.array(2.0))
     for length in (0.1, 0.3, 0.5 - 1e-9, 0.5, 0.7, 1.2):
         times = times_of(jnp.array(0.0), jnp.array(1.0), jnp.array(2.0))._replace(first=jnp.array(length))
         settings = ControlSettings(jnp.array(1e-6), jnp.array(1e-6), None, times, 5.0, None, ())
-        end, _ = StepControl(settings, None, kinks).first(jnp.zeros(1), None)
+        end, _ = StepSizeController(settings, None, kinks).first(jnp.zeros(1), None)
         assert abs(0.5 - end) < 1e-13 or end == min(length, 0.25)

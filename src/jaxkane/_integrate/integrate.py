@@ -43,10 +43,10 @@ from .inputs import (
     restore_times,
     samples_of,
 )
-from .settings import Settings, with_tolerances
+from .settings import Settings, with_scan_kind, with_tolerances
 from .status import Status
-from .step_control import ControlSettings, Kinks, StepControl, Times, evenly_spread, times_of
-from .steps import UnrolledERK, take_steps, with_scan_kind
+from .step_control import ClipToDiscontinuities, ControlSettings, StepSizeController, Times, evenly_spread, times_of
+from .steps import UnrolledERK, take_steps
 from .trajectory import InputDiscontinuities, Trajectory
 
 
@@ -310,7 +310,7 @@ def _integrated(problem: InitialValueProblem) -> Solution:
     steps = take_steps(
         problem.rates if isinstance(settings.adjoint, diffrax.ForwardMode) else trial_rates,
         _solver_for(settings, stepped, times.start, problem.start, inputs),
-        _control_of(problem),
+        _controller_of(problem),
         problem.start,
         problem.args,
         problem.ts,
@@ -327,7 +327,7 @@ def _integrated(problem: InitialValueProblem) -> Solution:
     )
 
 
-def _control_of(problem: InitialValueProblem) -> StepControl:
+def _controller_of(problem: InitialValueProblem) -> StepSizeController:
     """What ends the steps: the last time, events, and dependent speeds that are about to be singular."""
     system, settings, times, events = problem.system, problem.settings, problem.times, problem.events
 
@@ -346,7 +346,9 @@ def _control_of(problem: InitialValueProblem) -> StepControl:
         directions=events.directions,
     )
     may_end = quantities if events.names or system.dependent_speeds else None
-    return StepControl(control, may_end, None if kinks is None or fixed else Kinks.of(kinks, times.end))
+    return StepSizeController(
+        control, may_end, None if kinks is None or fixed else ClipToDiscontinuities.of(kinks, times.end)
+    )
 
 
 # One function of scalars each: XLA would compute it anew in every program that reads any of it.

@@ -116,22 +116,34 @@ def _for_one_length(solver: Any, tolerance: float) -> Any:
     """An implicit solver for steps of one length. As diffrax makes it, it leaves what converges slowly to a shorter
     step: here Newton's method solves its equations."""
     newton = {"root_finder": optx.Newton(rtol=tolerance, atol=tolerance), "root_find_max_steps": 50}
-    return _changed(solver, lambda method: {name: x for name, x in newton.items() if hasattr(method, name)})
+    changes = lambda method: {name: x for name, x in newton.items() if hasattr(method, name)}  # noqa: E731
+    return _changed(solver, lambda method: changes(method) if _takes_tolerances(method) else {})
 
 
 def with_tolerances(solver: Any, rtol: Any, atol: Any) -> Any:
     """An implicit solver whose equations are solved with the tolerances of the steps; any other as it is."""
     of_steps = {"rtol": rtol, "atol": atol, "norm": optx.rms_norm}
-    return _changed(solver, lambda method: {"root_finder": dataclasses.replace(method.root_finder, **of_steps)})
+    changes = lambda method: {"root_finder": dataclasses.replace(method.root_finder, **of_steps)}  # noqa: E731
+    return _changed(solver, lambda method: changes(method) if _takes_tolerances(method) else {})
 
 
-def _changed(solver: Any, fields: Callable[[Any], dict[str, Any]]) -> Any:
-    """The solver with other fields, where it takes the tolerances of its equations from those of the steps."""
-    if isinstance(solver, diffrax.HalfSolver):
-        return dataclasses.replace(solver, solver=_changed(solver.solver, fields))
+def with_scan_kind(solver: Any, kind: str) -> Any:
+    """A solver whose loop over its stages has derivatives in forward mode; as it is where it has no such loop."""
+    return _changed(solver, lambda method: {"scan_kind": kind} if getattr(method, "scan_kind", kind) is None else {})
+
+
+def _takes_tolerances(method: Any) -> bool:
+    """Whether it takes the tolerances of its equations from those of the steps."""
     of_steps = type(diffrax.with_stepsize_controller_tols(diffrax.VeryChord)().rtol)
-    takes = isinstance(getattr(getattr(solver, "root_finder", None), "rtol", None), of_steps)
-    return dataclasses.replace(solver, **fields(solver)) if takes else solver
+    return isinstance(getattr(getattr(method, "root_finder", None), "rtol", None), of_steps)
+
+
+def _changed(solver: Any, changes: Callable[[Any], dict[str, Any]]) -> Any:
+    """The solver whose method, the one that takes the half steps of a `HalfSolver` too, has other fields."""
+    if isinstance(solver, diffrax.HalfSolver):
+        return dataclasses.replace(solver, solver=_changed(solver.solver, changes))
+    fields = changes(solver)
+    return dataclasses.replace(solver, **fields) if fields else solver
 
 
 def _check_types(solver: Any, adjoint: Any, **flags: Any) -> None:

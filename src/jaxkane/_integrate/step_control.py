@@ -66,7 +66,7 @@ def evenly_spread(times: Times, step: Array) -> Array:
     return duration / jax.lax.stop_gradient(jnp.ceil(duration / longest))
 
 
-class Kinks(eqx.Module):
+class ClipToDiscontinuities(eqx.Module):
     """The `times` (n,) of kinks, in rising order, that no step passes over; infinity for those that are none.
 
     A step over a kink would be of first order, whatever the solver. What is left before a kink is gone in one step, or
@@ -83,7 +83,7 @@ class Kinks(eqx.Module):
     restart: bool = eqx.field(static=True)
 
     @classmethod
-    def of(cls, discontinuities: Discontinuities, end: Array) -> Kinks:
+    def of(cls, discontinuities: Discontinuities, end: Array) -> ClipToDiscontinuities:
         """Those before the `end`. A step that ends beside a kink at the end would leave the end out."""
         rounding = _rounding(discontinuities.times)
         times = jnp.where(discontinuities.times < end - rounding, discontinuities.times, jnp.inf)
@@ -94,12 +94,12 @@ class Kinks(eqx.Module):
         i = jnp.searchsorted(self.times, t + self.rounding, side="right")
         return jnp.where(i < len(self.times), self.times[jnp.minimum(i, len(self.times) - 1)], jnp.inf)
 
-    def beside(self, t0: Array, t1: Array) -> NearbyKinks:
+    def beside(self, t0: Array, t1: Array) -> NearbyDiscontinuities:
         """Of a step."""
         kink = self.times[jnp.minimum(jnp.searchsorted(self.times, t1 - self.rounding), len(self.times) - 1)]
         at_end = jnp.abs(t1 - kink) <= self.rounding
         start = jnp.where(at_end, kink + 0.25 * self.rounding, t1)
-        return NearbyKinks(at_end, start, self.after(start), self.after(t0), self.rounding)
+        return NearbyDiscontinuities(at_end, start, self.after(start), self.after(t0), self.rounding)
 
 
 def _rounding(times: Array) -> Array:
@@ -108,7 +108,7 @@ def _rounding(times: Array) -> Array:
     return 64 * jnp.finfo(times.dtype).eps * jnp.max(jnp.where(jnp.isfinite(times), jnp.abs(times), 0.0))
 
 
-class NearbyKinks(NamedTuple):
+class NearbyDiscontinuities(NamedTuple):
     """The kinks beside a step: whether it ends `at_kink`; the `start` of the next step where this one is kept; the next
     kinks after that start, and after the start of this step; and their `rounding`."""
 
@@ -203,12 +203,12 @@ class ControlSettings(eqx.Module):
     directions: tuple[int, ...] = eqx.field(static=True)
 
 
-class StepControl(NamedTuple):
+class StepSizeController(NamedTuple):
     """The `settings`; `quantities`: (t, y, args) -> `EventValues`, None where there are none; and the kinks."""
 
     settings: ControlSettings
     quantities: Callable[..., EventValues] | None
-    kinks: Kinks | None
+    kinks: ClipToDiscontinuities | None
 
     def first(self, y0: Array, args: Any) -> tuple[Array, Array]:
         """The end of the first step, and the progress, packed."""
@@ -255,7 +255,7 @@ def _following(
     quantities: EventValues | None,
     measured: tuple[Array, Array, Any],
     failed: Array | None,
-    beside: NearbyKinks | None,
+    beside: NearbyDiscontinuities | None,
 ) -> Decision:
     times, before = settings.times, Progress.unpacked(progress)
     y0, y1, error = measured
@@ -266,13 +266,12 @@ def _following(
         h, too_short = _to_next(settings, t1), ~keep
     else:
         keep, h, too_short = _by_error(settings, t1 - t0, y0, y1, error)
-    next_t0, jumped = jnp.where(keep, t1, t0), jnp.zeros_like(keep)
-    if beside is not None:
-        next_t0 = jnp.where(keep, beside.start, t0)
-        jumped = keep & beside.at_kink
-    next_t1 = next_t0 + h
-    if beside is not None:
-        next_t1 = _clipped(next_t0, next_t1, jnp.where(keep, beside.after, beside.before), beside.rounding)
+    if beside is None:
+        next_t0, jumped = jnp.where(keep, t1, t0), jnp.zeros_like(keep)
+        next_t1 = next_t0 + h
+    else:
+        next_t0, jumped = jnp.where(keep, beside.start, t0), keep & beside.at_kink
+        next_t1 = _clipped(next_t0, next_t0 + h, jnp.where(keep, beside.after, beside.before), beside.rounding)
     # The rest of a step that an event rejected follows at once: a fixed step stays on its grid.
     resumes = keep & (t1 < before.rejected_end)
     next_t1 = jnp.where(resumes, before.rejected_end, next_t1)

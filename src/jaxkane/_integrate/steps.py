@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 import operator
 from collections.abc import Callable
@@ -15,7 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from .step_control import Progress, StepControl
+from .settings import with_scan_kind
+from .step_control import Progress, StepSizeController
 
 
 class Steps(NamedTuple):
@@ -62,7 +62,7 @@ _KINDS: dict[type, str] = {
 def take_steps(
     rates: Callable[..., Array],
     solver: Any,
-    control: StepControl,
+    control: StepSizeController,
     y0: Array,
     args: Any,
     ts: Array,
@@ -137,14 +137,6 @@ def take_steps(
     meter.close(last.meter)
     motion, count = last.samples
     return Steps(motion, count, last.t0, last.y, Progress.unpacked(last.progress))
-
-
-def with_scan_kind(solver: Any, kind: str) -> Any:
-    """The solver whose loop over its stages has derivatives in forward mode, where it has such a loop."""
-    if isinstance(solver, diffrax.HalfSolver):
-        return dataclasses.replace(solver, solver=with_scan_kind(solver.solver, kind))
-    has_choice = hasattr(solver, "scan_kind") and solver.scan_kind is None
-    return dataclasses.replace(solver, scan_kind=kind) if has_choice else solver
 
 
 def _loop(
