@@ -145,7 +145,7 @@ def _switched(native):
     native_kernels.use(was)
 
 
-@pytest.fixture(scope="module", params=["native", "XLA"])
+@pytest.fixture(params=["native", "XLA"])
 def kernels(request):
     """A test once with native kernels, and once without."""
     with _switched(request.param == "native"):

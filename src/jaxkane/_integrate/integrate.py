@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from .._kane.checks import bodies_are_possible
 from .._kane.constraints import configuration_is_met, correction, has_configuration_constraints, projected
 from .._kane.kanes_method import KaneEquations
 from .._kane.rhs import outputs_at, rates_are_native, values_of, vector_field
@@ -23,10 +24,10 @@ from .._scalarjit.nan import (
     all_finite,
     constant,
     derivative_free_where_not_finite,
-    flat,
     nan_derivative_where,
     nan_where,
     negligible,
+    parts_of,
 )
 from .._system.parameters import ANY, ParameterInfo, parameters_in
 from .._system.system import State, System, names_of, packed, units_of, unpacked
@@ -183,10 +184,12 @@ def solve(
     signals = restore_times(signals)
     if settings.step is not None:
         signals = for_fixed_steps(signals, settings.solver)
-    origin = flat((system, state, ts, signals, disturbance, closures))
+    origin = parts_of((system, state, ts, signals, disturbance, closures))
     rises = None if settings.rising else _is_rising(ts)
     ts = ts if rises is None else jnp.where(rises, ts, jnp.arange(ts.shape[0], dtype=ts.dtype))
     others_are_valid = inputs_are_valid(signals) & (True if rises is None else rises)
+    if settings.check_bodies:
+        others_are_valid &= bodies_are_possible(system, ts[0], state.q)
     # What is not finite must not enter the solver, where it would spoil the gradient of what is shared.
     times, valid, system, state, stepped = beginning(system, state, ts, others_are_valid)
     if not isinstance(settings.adjoint, diffrax.ForwardMode):
@@ -427,7 +430,7 @@ def _filled(problem: InitialValueProblem, solution: Solution, project: bool) -> 
     return solution._replace(motion=motion, ending=ending)
 
 
-def _trajectory(problem: InitialValueProblem, solution: Solution, origin: Array) -> Trajectory:
+def _trajectory(problem: InitialValueProblem, solution: Solution, origin: list[Array]) -> Trajectory:
     """What follows from the motion, and NaN where there is none. `origin`: what all of it comes from."""
     system, ts, kinks = problem.system, problem.ts, problem.discontinuities
     states = unpacked(system, solution.motion)

@@ -53,6 +53,7 @@ class Settings(eqx.Module):
     project: bool = eqx.field(static=True)
     stabilize: float = eqx.field(static=True)
     rising: bool = eqx.field(static=True, default=False)  # the times are known to rise
+    check_bodies: bool = eqx.field(static=True, default=False)  # a motion of bodies that cannot be is invalid
 
 
 def settings_for(
@@ -68,9 +69,11 @@ def settings_for(
     max_steps: int | None = 16384,
     progress: bool = False,
     rising: bool = False,
+    check_bodies: bool = False,
 ) -> Settings:
     """The options of `simulate`, with defaults that follow the type of the times; `rising`: whether these are known to
-    rise, as where `checked_times` saw their values.
+    rise, as where `checked_times` saw their values; `check_bodies`: whether bodies that cannot be make a motion
+    invalid, as those of members of a batch do.
 
     **Raises:** `ValueError` or `TypeError` for options that are no such, and for those that contradict one another.
     """
@@ -109,6 +112,7 @@ def settings_for(
         project=project,
         stabilize=float(stabilize),
         rising=rising,
+        check_bodies=check_bodies,
     )
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._kane.arguments import by_names, check_is_system, is_concrete, refuse_incomplete
-from .._kane.checks import check_system, with_possible_bodies
+from .._kane.checks import check_system
 from .._kane.constraints import check_state
 from .._kane.equations import diagnosis
 from .._kane.rhs import values_of
@@ -77,8 +77,6 @@ def simulate(
     t = ts[0] if isinstance(ts, Tracer) else np.asarray(ts)[0]
     check_state(system, t, state.q)
     check_system(system, t, state.q)
-    if not is_concrete(system):
-        state = with_possible_bodies(system, t, state)
     settings = settings_for(
         ts,
         rtol=rtol,
@@ -91,6 +89,7 @@ def simulate(
         max_steps=max_steps,
         progress=progress,
         rising=not isinstance(ts, Tracer),
+        check_bodies=not is_concrete(system),
     )
     arguments = (system, state, ts, share_times(signals)), captured_tracers(signals)
     settings, (arguments, closures) = resolve_adjoint(settings, adjoint, arguments)

@@ -22,7 +22,7 @@ from .._scalarjit.function import ScalarFunction
 from .._system.kinematics import Frame, Point
 from .._system.motion import Force, Load, Motion
 from .._system.parameters import in_batches
-from .._system.system import State, System
+from .._system.system import System
 from .arguments import is_concrete
 from .constraints import configuration_residual
 from .kanes_method import DescriptionEvaluator, at_random_point, frames_of, structure_of, turning_bodies
@@ -126,11 +126,9 @@ def _listed(moments: np.ndarray) -> str:
     return ", ".join(f"{x:.6g}" for x in moments)
 
 
-def with_possible_bodies(system: System, t: Any, state: State) -> State:
-    """The state, or NaN where the system has a body that `check_bodies` refuses: for members of a batch."""
-    # Whether a body can be does not depend on the state; where it is NaN, it is another check's.
-    possible = _bodies_are_possible(*jax.tree.map(_value, (system, t, state.q)))
-    return jax.tree.map(lambda x: jnp.where(possible, x, jnp.nan), state)
+def bodies_are_possible(system: System, t: Any, q: Any) -> Any:
+    """Whether the system has no body that `check_bodies` refuses: for members of a batch."""
+    return _bodies_are_possible(*jax.tree.map(_value, (system, t, q)))
 
 
 @ScalarFunction.once

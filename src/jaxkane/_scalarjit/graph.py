@@ -169,6 +169,8 @@ def applied(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.ndarra
 
 
 def _each(f: Callable[..., int], *xs: np.ndarray) -> np.ndarray:
+    if all(x.shape == () for x in xs):
+        return np.array(f(*(x.item() for x in xs)), np.int64)
     if any(x.shape != xs[0].shape for x in xs):
         xs = np.broadcast_arrays(*xs)
     results = [f(*numbers) for numbers in zip(*(x.ravel().tolist() for x in xs), strict=True)]
@@ -194,7 +196,7 @@ def _operation(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.nda
         return [_each(lambda v: graph.constant(v, dtype), xs[0])]  # whole numbers are constants here
     if x_dtype not in DTYPES or dtype not in DTYPES:
         raise NotScalarError(f"{name} of {x_dtype}")
-    one = np.array(graph.constant(1.0, dtype)) if dtype in FLOATS else xs[0]
+    number = functools.partial(_full, (), graph=graph, dtype=dtype)
     match name:
         case "eq" | "ne" if x_dtype == "bool":  # as jnp.mod asks whether two signs differ
             differ = each("xor", *xs)
@@ -209,19 +211,18 @@ def _operation(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.nda
             to_even = params["rounding_method"] == RoundingMethod.TO_NEAREST_EVEN
             return [_rounded(xs[0], to_even, each, graph, dtype)]
         case "sign":
-            zero = _full((), 0.0, graph, dtype)
-            positive, negative = each("gt", xs[0], zero, dtype="bool"), each("lt", xs[0], zero, dtype="bool")
-            return [each("select", positive, one, each("select", negative, each("neg", one), xs[0]))]
+            positive, negative = (each(x, xs[0], number(0.0), dtype="bool") for x in ("gt", "lt"))
+            return [each("select", positive, number(1.0), each("select", negative, number(-1.0), xs[0]))]
         case "logistic":
-            return [each("div", one, each("add", one, each("exp", each("neg", xs[0]))))]
+            return [each("div", number(1.0), each("add", number(1.0), each("exp", each("neg", xs[0]))))]
         case "square":
             return [each("mul", xs[0], xs[0])]
         case "one_minus_square":  # of JAX 0.12, in the derivative of tanh
-            return [each("mul", each("sub", one, xs[0]), each("add", one, xs[0]))]
+            return [each("mul", each("sub", number(1.0), xs[0]), each("add", number(1.0), xs[0]))]
         case "integer_pow":
-            return [_power(xs[0], params["y"], each, one)]
+            return [_power(xs[0], params["y"], each, number(1.0))]
         case "rsqrt":
-            return [each("div", one, each("sqrt", xs[0]))]
+            return [each("div", number(1.0), each("sqrt", xs[0]))]
         case "is_finite":
             return [each("lt", each("abs", xs[0], dtype=x_dtype), _full((), np.inf, graph, x_dtype))]
         case "not" if dtype == "bool":
@@ -233,7 +234,7 @@ def _operation(equation: Any, xs: list[np.ndarray], graph: Graph) -> list[np.nda
         case "convert_element_type" if dtype in FLOATS:
             return [each("convert", xs[0])]
         case "reduce_sum":
-            return [_reduced("add", xs[0], params["axes"], each, _full((), 0.0, graph, dtype))]
+            return [_reduced("add", xs[0], params["axes"], each, number(0.0))]
         case "reduce_max" | "reduce_min" | "reduce_prod" | "reduce_and" | "reduce_or" if xs[0].size:
             return [_reduced(_OF_MANY[name], xs[0], params["axes"], each)]
     if name in LOGIC and dtype == "bool":

@@ -13,6 +13,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool
 
@@ -43,9 +44,20 @@ def all_finite(values: Any) -> Bool[Array, ""]:
 
 def flat(values: Any) -> Array:
     """All float arrays one after the other, real and imaginary parts apart."""
-    parts = [jnp.ravel(x) for x in jax.tree.leaves(values) if eqx.is_inexact_array(x)]
-    parts = [part for x in parts for part in ((x.real, x.imag) if jnp.iscomplexobj(x) else (x,))]
+    parts = _raveled(values)
     return jnp.concatenate(parts) if parts else jnp.zeros(0)
+
+
+def parts_of(values: Any) -> list[Array]:
+    """All float arrays, real and imaginary parts apart: single numbers are one array, the others stay what they are."""
+    parts = _raveled(values)
+    single = [x for x in parts if x.size == 1]
+    return [*([jnp.concatenate(single)] if single else []), *[x for x in parts if x.size > 1]]
+
+
+def _raveled(values: Any) -> list[Array]:
+    parts = [jnp.ravel(x) for x in jax.tree.leaves(values) if eqx.is_inexact_array(x)]
+    return [part for x in parts for part in ((x.real, x.imag) if jnp.iscomplexobj(x) else (x,))]
 
 
 def constant(values: Any) -> Any:
@@ -121,21 +133,21 @@ def _of_arrays(f: Callable[..., Any], arguments: Any) -> tuple[Callable[..., Any
     return value, moving, fixed
 
 
-def _never(point: Array) -> Array:
-    """False, and in a batch where `point` is: what is batched in a derivative must be so in the value, or JAX takes the
-    one for the other inside of a loop."""
-    return jnp.any(jnp.isnan(point)) & False
+def _never(*points: Array) -> Array:
+    """False, and in a batch where any of `points` is: what is batched in a derivative must be so in the value, or JAX
+    takes the one for the other inside of a loop."""
+    return functools.reduce(jnp.logical_or, [jnp.any(jnp.isnan(x)) for x in points], jnp.array(False)) & False
 
 
 def _masked(shown: bool, missing: Array, values: Any, origin: Any) -> Any:
-    numbers = flat(origin)
+    parts = parts_of(origin)
 
     def one(x: Array) -> Array:
         if x.size == 0:
             return x
         real = jnp.finfo(x.dtype).dtype
         there = jnp.broadcast_to(jnp.reshape(missing, (*missing.shape, *(1,) * (x.ndim - missing.ndim))), x.shape)
-        point = numbers.astype(real)
+        point = [part.astype(real) for part in parts]
         if jnp.iscomplexobj(x):
             return jax.lax.complex(_mask(shown, there, x.real, point), _mask(shown, there, x.imag, point))
         return _mask(shown, there, x, point)
@@ -144,24 +156,29 @@ def _masked(shown: bool, missing: Array, values: Any, origin: Any) -> Any:
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _mask(shown: bool, missing: Array, x: Array, point: Array) -> Array:
-    missing = missing | _never(point)
+def _mask(shown: bool, missing: Array, x: Array, point: list[Array]) -> Array:
+    missing = missing | _never(*point)
     return jnp.where(missing, x if shown else jnp.full_like(x, jnp.nan), x)
 
 
-@_mask.defjvp
+# A part of the point that does not move, as the times of samples, takes no part in the derivative.
+@functools.partial(_mask.defjvp, symbolic_zeros=True)
 def _(shown: bool, primals: Any, tangents: Any) -> Any:
     (missing, x, point), (_, x_dot, point_dot) = primals, tangents
-    return _mask(shown, missing, x, point), jnp.where(missing, _spread(point_dot, point, x.shape), x_dot)
+    if isinstance(x_dot, SymbolicZero):
+        x_dot = jnp.zeros_like(x)
+    moving = [tangent for tangent in point_dot if not isinstance(tangent, SymbolicZero)]
+    return _mask(shown, missing, x, point), jnp.where(missing, nan_if_moved(moving, point, x), x_dot)
 
 
-def _spread(point_dot: Array, point: Array, shape: tuple[int, ...]) -> Array:
-    """NaN everywhere if `point` moves. Twice, so that neither tangents nor cotangents cancel in the sum."""
-    moves = jnp.sum(_nan_if_not_zero(point_dot, point))
-    return _nan_if_not_zero(jnp.broadcast_to(moves, shape), point)
+def nan_if_moved(tangents: list[Array], point: list[Array], like: Array) -> Array:
+    """NaN everywhere if a `point`, which has these tangents or some of them, moves; else zero. `like`: of what shape
+    and type. Twice, so that neither tangents nor cotangents cancel in the sum."""
+    moves = sum([jnp.sum(_nan_if_not_zero(x, point)) for x in tangents], jnp.zeros((), like.dtype))
+    return _nan_if_not_zero(jnp.broadcast_to(moves, like.shape), point)
 
 
-def _nan_if_not_zero(b: Array, point: Array) -> Array:
+def _nan_if_not_zero(b: Array, point: list[Array]) -> Array:
     """The x of 0 x = b: zero for b = 0, else there is none. Linear in b, and its own transpose.
 
     The zero belongs to a `point`: where it moves, the derivative of an x that does not exist does not exist either.
@@ -172,12 +189,12 @@ def _nan_if_not_zero(b: Array, point: Array) -> Array:
 
 
 @jax.custom_jvp
-def _zero_times(x: Array, point: Array) -> Array:
-    return 0.0 * (x + jnp.sum(point))  # not a constant: what is batched in the derivative must be so in the value
+def _zero_times(x: Array, point: list[Array]) -> Array:
+    # Not a constant: what is batched in the derivative must be so in the value.
+    return 0.0 * (x + sum(map(jnp.sum, point), jnp.zeros((), x.dtype)))
 
 
 @_zero_times.defjvp
 def _(primals: Any, tangents: Any) -> Any:
-    (x, point), (_, point_dot) = primals, tangents
-    moved = _spread(point_dot, point, x.shape)
-    return _zero_times(x, point), jnp.where(x == 0, jnp.zeros_like(x), moved)
+    (x, point), (_, tangents) = primals, tangents
+    return _zero_times(x, point), jnp.where(x == 0, jnp.zeros_like(x), nan_if_moved(tangents, point, x))

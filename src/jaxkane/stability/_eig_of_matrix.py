@@ -14,7 +14,7 @@ from jaxtyping import Array, Complex, Float
 
 from .._scalarjit.backends import native
 from .._scalarjit.function import ScalarFunction
-from .._scalarjit.nan import _spread
+from .._scalarjit.nan import nan_if_moved
 
 SIZES = range(2, 7)  # of matrices; larger ones are better off with LAPACK
 CHUNK = 256  # matrices at once: one that is slow holds up few others
@@ -302,7 +302,7 @@ def _(primals, tangents):
     d_values = jnp.einsum("ji,jk,ki->i", y.conj(), dA_c, x) / jnp.where(lost, 1.0, jnp.sum(y.conj() * x, axis=0))
     dX = _turned(A_c, dA_c, still, x, lost)
     dY = _turned(A_c.conj().T, dA_c.conj().T, still.conj(), y, lost)
-    none = _spread(dA, A, lost.shape)
+    none = nan_if_moved([dA], [A], jnp.zeros_like(lost, A.dtype))
     none = jax.lax.complex(none, none)
     return (values, Y, X), tuple(jnp.where(lost, none, d) for d in (d_values, dY, dX))
 

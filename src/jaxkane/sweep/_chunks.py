@@ -18,7 +18,6 @@ from jax.sharding import PartitionSpec as P
 from .._integrate.integrate import solve
 from .._integrate.settings import Settings
 from .._integrate.trajectory import Trajectory
-from .._kane.checks import with_possible_bodies
 from .._scalarjit.backends import native as kernels
 from .._scalarjit.cache_key import Cache, jit, version_of
 from .._scalarjit.captured_values import CapturedValues
@@ -57,7 +56,6 @@ class Task(eqx.Module):
     def simulate_from(self, own: Any, start: State) -> ChunkResult:
         """The motion of one member from its first state."""
         system, signals = system_and_signals(own, self.shared)
-        start = with_possible_bodies(system, self.ts[0], start)
         motion = solve(system, start, self.ts, signals, self.settings, closures=self.closures)
         if self.reduce is None:
             values: Any = dataclasses.replace(motion, t=None, status=None, t_end=None, stats=None)

@@ -89,7 +89,7 @@ def sweep(
     if isinstance(state, State) and isinstance(system, System):
         state = as_state(system, state)
     ts = checked_times(ts, getattr(state.q, "dtype", float) if isinstance(state, State) else float)
-    settings = settings_for(ts, progress=False, rising=is_concrete(ts), **options)
+    settings = settings_for(ts, progress=False, rising=is_concrete(ts), check_bodies=True, **options)
     if isinstance(system, System):
         refuse_captured(system)
     members, shared, n = members_of(system, state, inputs, table, ts)

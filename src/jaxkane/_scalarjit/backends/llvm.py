@@ -7,7 +7,7 @@ before this one does, and every call compares the sizes that the structures stat
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence, Set
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -202,6 +202,10 @@ COMPARISONS = {"eq": "oeq", "ne": "une", "lt": "olt", "le": "ole", "gt": "ogt", 
 INTRINSICS = {"sqrt": "sqrt", "abs": "fabs", "floor": "floor", "max": "maximum", "min": "minimum"}
 
 
+# LLVM's time for a block grows faster than its length: in blocks of so many nodes, a long kernel takes half of it.
+_BLOCK = 1500
+
+
 class Writer:
     """The text of one function: `void it(ptr in, ptr out, i64 n)`, with pointers to n lanes of every argument.
 
@@ -241,24 +245,25 @@ class Writer:
                 self.lines.append(f"%{where}{i}.at = getelementptr ptr, ptr %{where}, i64 {i}")
                 self.lines.append(f"%{where}{i} = load ptr, ptr %{where}{i}.at")
         self.lines.append(f"%kept = alloca double, i64 {max(len(shared & read), 1)}, align 64")
-        for k in sorted(shared):
+        self.lines.append("%is.empty = icmp eq i64 %n, 0")
+        for k in self._in_blocks("entry", shared):
             self._node(k, 1)
             if k in read:
-                self.lines.append(f"%kept{k} = getelementptr double, ptr %kept, i64 {len(self.places)}")
-                self.lines.append(f"store {TYPES[nodes[k].dtype]} %v{k}, ptr %kept{k}")
                 self.places[k] = len(self.places)
+                self.lines.append(f"store {TYPES[nodes[k].dtype]} %v{k}, ptr {self._kept(k, 'kept')}")
         self.lines += [
             "%last = sub i64 %n, 1",
             "br label %lanes",
             "lanes:",
-            "%i = phi i64 [0, %entry], [%next, %lanes]",
+            f"%i = phi i64 [0, %{self.block}], [%next, %stored]",
         ]
         self.declared.add("declare i64 @llvm.umin.i64(i64, i64)")
         for lane in range(self.lanes):
             self.lines.append(f"%i{lane}.open = add i64 %i, {lane}")
             self.lines.append(f"%i{lane} = call i64 @llvm.umin.i64(i64 %i{lane}.open, i64 %last)")
-        for k in sorted(wide):
+        for k in self._in_blocks("lanes", wide):
             self._node(k, self.lanes)
+        self.lines += ["br label %stored", "stored:"]
         for j, array in enumerate(outputs):
             for e, k in enumerate(map(int, array.flat)):
                 self._store(f"out{j}", e, array.size, self._in_lanes(k), nodes[k].dtype)
@@ -268,6 +273,16 @@ class Writer:
         return "\n".join(
             [*sorted(self.declared), "define void @it(ptr %in, ptr %out, i64 %n) nounwind {", "entry:", body, "}", ""]
         )
+
+    def _in_blocks(self, label: str, nodes: Set[int]) -> Iterator[int]:
+        """The nodes one after the other, with a branch that is never taken between blocks of them, lest LLVM join them:
+        the first block has this label, `self.block` is the last."""
+        self.block = label
+        for i, k in enumerate(sorted(nodes)):
+            if i and i % _BLOCK == 0:
+                self.block = f"{label}.{i}"
+                self.lines += [f"br i1 %is.empty, label %done, label %{self.block}", f"{self.block}:"]
+            yield k
 
     def _wide(self, used: Sequence[int]) -> set[int]:
         """Those that may differ from lane to lane."""
@@ -300,9 +315,14 @@ class Writer:
         if k not in self.places:
             return f"%v{k}"
         if k not in self.splats:
-            self.lines.append(f"%s{k} = load {kind}, ptr %kept{k}")
+            # LLVM would move an address that is made outside the loop into it, and takes long for it.
+            self.lines.append(f"%s{k} = load {kind}, ptr {self._kept(k, 'read')}")
             self.splats[k] = self._splat(f"%s{k}", kind, lanes)
         return self.splats[k]
+
+    def _kept(self, k: int, tag: str) -> str:
+        self.lines.append(f"%{tag}{k} = getelementptr double, ptr %kept, i64 {self.places[k]}")
+        return f"%{tag}{k}"
 
     def _splat(self, scalar: str, kind: str, lanes: int) -> str:
         if lanes == 1:

@@ -252,7 +252,7 @@ class Scalars:
         is_derivative: bool = False,
         as_graph: Callable[..., tuple[Graph, list[np.ndarray]]] = graph_of,
     ):
-        self.level, self.is_derivative = 0 if once else 2, is_derivative
+        self.once, self.is_derivative = once, is_derivative
         self.graph, self.outputs = as_graph(program)
         nodes, inputs = self.graph.nodes, types_of(program)[0]
         results = [[np.dtype(nodes[k].dtype) for k in x.flat] for x in self.outputs]
@@ -270,8 +270,8 @@ class Scalars:
         of_lanes = functools.partial(llvm_compiler().of_lanes, lanes=lanes)
         writer = Writer(self.graph.reading_groups(groups), varies, lanes, of_lanes, self.is_derivative)
         text = writer.text(len(varies), self.outputs)
-        if self.level:
-            return _compiled(text, self.level)[1], ""
+        if not self.once:
+            return _compiled(text)[1], ""
         return "kernel", text.replace("define void @it(", "define internal void @kernel(")
 
     def _target(self, sizes: tuple[int, ...], where: tuple[tuple[bool, ...], ...], groups: Groups) -> str:
@@ -287,16 +287,17 @@ class Scalars:
         where = tuple(where[group[0]] for group in groups)
         if all(all(w) or not any(w) for w in where):  # one long batch
             sizes, where = (int(np.prod(sizes)),) if sizes else (), tuple((any(w),) if sizes else () for w in where)
-        lanes = min(llvm_compiler().lanes, 1 << (sizes[-1] - 1).bit_length()) if sizes else 1
+        # What is called once is to have a short text.
+        lanes = min(llvm_compiler().lanes, 1 << (sizes[-1] - 1).bit_length()) if sizes and not self.once else 1
         with llvm_compiler().lock:
             kernel, text = self.kernel(groups, tuple(bool(w and w[-1]) for w in where), lanes)
             wrapper = wrapper_text(kernel, sizes, where, len(self.outputs), bytes_of, text)
-            address, name = _compiled(wrapper, self.level)
+            address, name = _compiled(wrapper, level=0)
             _register(address, name)
         return name
 
 
-def _compiled(text: str, level: int) -> tuple[int, str]:
+def _compiled(text: str, level: int = 2) -> tuple[int, str]:
     folder = cache_folder()
     return llvm_compiler().compile(text, ObjectCache(folder) if folder else None, level)
 
