@@ -76,6 +76,18 @@ def test_what_does_not_move_has_the_derivative_zero():
     np.testing.assert_array_equal(x_dot[:2], np.zeros((2, 2)))
 
 
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_the_derivative_by_a_part_of_the_origin(mode):
+    """Single numbers are one part of an origin, each other array is one; those that do not move take no part."""
+    f = lambda a, b, c: nan_where(MISSING[1:3], jnp.stack([a * b[0], b[1] * c]), (a, b, c, jnp.arange(4.0)))  # noqa: E731
+    first = [mode(f, argnums=i) for i in range(3)]
+    at = jnp.array(0.7), jnp.array([0.2, -0.4]), jnp.array(2.0)
+    for slope, (want, missing) in zip(first, [(0.2, np.nan), ([0.7, 0.0], [np.nan] * 2), (0.0, np.nan)], strict=True):
+        np.testing.assert_allclose(slope(*at), [want, missing])
+    for i, j in ((0, 1), (2, 0), (1, 1)):
+        assert np.isnan(jax.jacfwd(first[i], argnums=j)(*at)[1]).all(), (i, j)
+
+
 def test_members_of_a_batch_are_told_apart():
     """In a shared parameter only the sum over who exists is clean; each member's own are its own."""
     missing = jnp.stack([MISSING, jnp.zeros(4, bool), jnp.ones(4, bool)])

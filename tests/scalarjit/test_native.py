@@ -11,6 +11,7 @@ from operations import ODD, OPERATIONS
 import jaxkane as jk
 from jaxkane._kane.kanes_method import _motion_rates, motion_rates
 from jaxkane._scalarjit import function
+from jaxkane._scalarjit.backends import llvm
 from jaxkane._scalarjit.backends import native as native_kernels
 from jaxkane._scalarjit.function import Program, ScalarFunction
 
@@ -73,6 +74,24 @@ def test_a_member_does_not_depend_on_its_place():
 
 
 @pytest.mark.usefixtures("native")
+@pytest.mark.parametrize("made", [ScalarFunction, ScalarFunction.once], ids=["optimized", "once"])
+def test_a_kernel_of_many_blocks(made, native, monkeypatch):
+    """What all lanes share, what differs from lane to lane, and both."""
+    monkeypatch.setattr(llvm, "_BLOCK", 2)
+
+    def f(a, x):
+        shared = jnp.sin(a) * a[::-1] + a**2
+        return shared, x * shared - jnp.exp(x), jnp.where(x[0] < shared[1], x, -x)
+
+    a, x = jnp.arange(1.0, 4.0), jnp.linspace(-1.0, 2.0, 57).reshape(19, 3)
+    program = made(f)
+    for n in (1, 19):
+        found, expected = (jax.jit(jax.vmap(g, (None, 0)))(a, x[:n]) for g in (program, f))
+        jax.tree.map(lambda got, want: np.testing.assert_allclose(got, want, rtol=1e-14, atol=1e-14), found, expected)
+    jax.tree.map(lambda got, want: np.testing.assert_allclose(got, want, rtol=1e-14), program(a, x[0]), f(a, x[0]))
+    assert program.is_native(a, x[0])
+
+
 def test_batches_of_batches():
     def plain(a, b, x):
         return jnp.stack([jnp.sin(a) * x[0], b * x[1] + a, a / b])

@@ -186,13 +186,15 @@ class EventPoint(NamedTuple):
 
 
 @ScalarFunction.once
-def next_point(reach: Array, point: EventPoint, y_dot, quantities: EventValues, which, happened) -> EventPoint:
+def next_point(system: System, point: EventPoint, y_dot, read_rates, reach, which, happened) -> EventPoint:
     """After a step of Newton's method towards the event `which`, a float; no step where none `happened`.
 
         t - g / g_dot,   y - (g / g_dot) y_dot
 
-    It is smooth where the event is within `reach` [s]. The rates g_dot and y_dot are taken for numbers.
+    It is smooth where the event is within `reach` [s]. The rates g_dot and y_dot are taken for numbers. `read_rates`:
+    y_dot, None where no event reads speeds.
     """
+    quantities = event_values(system, point.t, point.y, read_rates)
     g, g_dot = quantities.values[0], quantities.rates[0]
     for i in range(1, len(quantities.values)):
         g, g_dot = (jnp.where(which == i, x[i], x0) for x, x0 in ((quantities.values, g), (quantities.rates, g_dot)))

@@ -385,9 +385,9 @@ def _located(problem: InitialValueProblem, ending: Ending) -> EventPoint:
     y_dot = problem.rates(*constant((t, y, problem.args)))
 
     def stepped(point: EventPoint) -> EventPoint:
-        quantities = event_values(system, point.t, point.y, y_dot if events.read_speeds else None)
         which = (ending.status - Status.EVENT, ending.by_event)
-        return next_point(problem.times.event_reach, point, y_dot, quantities, *which)
+        read_rates = y_dot if events.read_speeds else None
+        return next_point(system, point, y_dot, read_rates, problem.times.event_reach, *which)
 
     def bend(step: Array, y: Array, args: Any) -> Array:
         return step * (problem.rates(t + 0.5 * step, y + 0.5 * step * y_dot, args) - y_dot)
