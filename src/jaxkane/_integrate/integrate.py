@@ -60,21 +60,21 @@ def _is_rising(ts: Array) -> Array:
     return all_finite(ts) & jnp.all(ts[1:] >= ts[:-1]) & (ts[-1] > ts[0])
 
 
-def is_valid(system: System, state: State, t: Array, signals: Any) -> Array:
-    """Whether a motion can begin at `t`."""
-    others = _large_are_valid(system, state) & inputs_are_valid(signals)
-    return _small_are_valid(*constant((system, state, t)), others)
+def is_valid(system: System, y: Array, t: Array, signals: Any) -> Array:
+    """Whether a motion can begin at `t`, with a packed state."""
+    others = _large_are_valid(system, y) & inputs_are_valid(signals)
+    return _small_are_valid(*constant((system, y, t)), others)
 
 
-def _large_are_valid(system: System, state: State) -> Array:
+def _large_are_valid(system: System, y: Array) -> Array:
     allowed = [jnp.all(info.allows(x)) for x, info in _limited(system) if not _is_small(x)]
-    return functools.reduce(jnp.logical_and, allowed, all_finite(eqx.filter((system, state), _is_small, inverse=True)))
+    return functools.reduce(jnp.logical_and, allowed, all_finite(eqx.filter((system, y), _is_small, inverse=True)))
 
 
 @ScalarFunction.once
-def _small_are_valid(system: System, state: State, t: Array, others_are_valid: Array) -> Array:
-    conditions = [others_are_valid, configuration_is_met(system, t, state.q)]
-    conditions += [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((system, state)) if _is_small(x)]
+def _small_are_valid(system: System, y: Array, t: Array, others_are_valid: Array) -> Array:
+    conditions = [others_are_valid, configuration_is_met(system, t, unpacked(system, y).q)]
+    conditions += [jnp.all(jnp.isfinite(x)) for x in jax.tree.leaves((system, y)) if _is_small(x)]
     conditions += [jnp.all(info.allows(x)) for x, info in _limited(system) if _is_small(x)]
     return functools.reduce(jnp.logical_and, conditions)
 
@@ -85,7 +85,7 @@ def _limited(system: System) -> list[tuple[Array, ParameterInfo]]:
 
 
 class Beginning(NamedTuple):
-    """The `times` of a motion; whether it can begin; its `system` and `state`, ones where it cannot.
+    """The `times` of a motion; whether it can begin; its `system` and packed state at the `start`, ones if it cannot.
 
     `stepped`: the system that the steps read, with ones for parameters that are not finite, or that no description can
     have: behind a mask these would still spoil the reverse gradient of what is shared. What all members of a batch
@@ -95,41 +95,42 @@ class Beginning(NamedTuple):
     times: Times
     valid: Array
     system: System
-    state: State
+    start: Array
     stepped: System
 
 
-def beginning(system: System, state: State, ts: Array, others_are_valid: Array) -> Beginning:
-    """Of the times (n_t,) at which a motion is kept. Small arrays all in one program, large ones each by itself."""
-    others = _large_are_valid(system, state) & others_are_valid
-    small = _beginning(system, state, ts[0], ts[1], ts[-1], others)
-    large = _harmless(system, state, small.valid, lambda x: eqx.is_inexact_array(x) and not _is_small(x))
-    rest = eqx.filter((system, state, system), eqx.is_inexact_array, inverse=True)
+def beginning(system: System, y: Array, ts: Array, others_are_valid: Array) -> Beginning:
+    """From a packed state, at the first of the times (n_t,) at which a motion is kept. Small arrays all in one program,
+    large ones each by itself."""
+    others = _large_are_valid(system, y) & others_are_valid
+    small = _beginning(system, y, ts[0], ts[1], ts[-1], others)
+    large = _harmless(system, y, small.valid, lambda x: eqx.is_inexact_array(x) and not _is_small(x))
+    rest = eqx.filter((system, y, system), eqx.is_inexact_array, inverse=True)
     return Beginning(small.times, small.valid, *eqx.combine(small[2:], large, rest))
 
 
 @ScalarFunction.once
-def _beginning(system: System, state: State, first: Array, second: Array, last: Array, others: Array) -> Beginning:
-    valid = _small_are_valid.__wrapped__(system, state, first, others)
-    masked, start, stepped = _harmless(system, state, valid, _is_small)
+def _beginning(system: System, y: Array, first: Array, second: Array, last: Array, others: Array) -> Beginning:
+    valid = _small_are_valid.__wrapped__(system, y, first, others)
+    masked, start, stepped = _harmless(system, y, valid, _is_small)
     # To JAX the state moves with the parameters, so that the derivative of the first rates is the program of the loop.
-    numbers = [jnp.sum(x) for x in jax.tree.leaves(stepped) if x.dtype == state.q.dtype]
+    numbers = [jnp.sum(x) for x in jax.tree.leaves(stepped) if x.dtype == y.dtype]
     start = jax.tree.map(lambda x: jnp.where(valid, x, x + 0.0 * sum(numbers)), start)
     return Beginning(times_of(first, second, last), valid, masked, start, stepped)
 
 
-def _harmless(system: System, state: State, valid: Array, is_chosen: Callable[[Any], bool]) -> Any:
+def _harmless(system: System, y: Array, valid: Array, is_chosen: Callable[[Any], bool]) -> Any:
     """The last three of a `Beginning`: those of their arrays that are chosen, None for the others."""
     limits = {id(x): info for x, info in _limited(system)}
     where = lambda condition, x: jnp.where(condition, x, jnp.ones_like(x))  # noqa: E731
     masked = lambda x: where(valid, x) if is_chosen(x) else None  # noqa: E731
     possible = lambda x: where(limits.get(id(x), ANY).allows(x), x) if is_chosen(x) else None  # noqa: E731
-    return *jax.tree.map(masked, (system, state)), jax.tree.map(possible, system)
+    return *jax.tree.map(masked, (system, y)), jax.tree.map(possible, system)
 
 
 class InitialValueProblem(NamedTuple):
     """`system`, `signals`: harmless ones where no motion can begin; `start`: the packed state; `rates`: (t, y, args) ->
-    y_dot, and the `args` that the steps pass to it."""
+    y_dot, whether these `are_native`, and the `args` that the steps pass to them."""
 
     system: System
     signals: Any
@@ -139,6 +140,7 @@ class InitialValueProblem(NamedTuple):
     discontinuities: Discontinuities | None
     valid: Array
     rates: Callable[..., Any]
+    are_native: bool
     args: Any
     events: Events
     settings: Settings
@@ -191,24 +193,26 @@ def solve(
     if settings.check_bodies:
         others_are_valid &= bodies_are_possible(system, ts[0], state.q)
     # What is not finite must not enter the solver, where it would spoil the gradient of what is shared.
-    times, valid, system, state, stepped = beginning(system, state, ts, others_are_valid)
-    if not isinstance(settings.adjoint, diffrax.ForwardMode):
+    times, valid, system, start, stepped = beginning(system, packed(state), ts, others_are_valid)
+    forward = isinstance(settings.adjoint, diffrax.ForwardMode)
+    if not forward:
         # In reverse mode the cotangent of each number would be a sum of its own, in each of the loops. In forward mode
         # they stay apart, since in a batch some of them may be shared.
-        stepped = Packed.of(stepped, state.q.dtype)
-    signals = mask_invalid_inputs(signals, valid)
+        stepped = Packed.of(stepped, start.dtype)
+    signals, state = mask_invalid_inputs(signals, valid), unpacked(system, start)
     constrained = has_configuration_constraints(system, times.start, state.q)
     problem = InitialValueProblem(
         system=system,
         signals=signals,
-        start=packed(state),
+        start=start,
         ts=ts,
         times=times,
         discontinuities=discontinuities_of(
             system, signals, _reads_samples(system), times.start, state, settings.step is not None, settings.rtol
         ),
         valid=valid,
-        rates=_rates(valid, settings.stabilize if constrained else 0.0),
+        rates=_rates(valid, settings.stabilize if constrained else 0.0, forward),
+        are_native=rates_are_native(stepped, times.start, start, inputs_at(system, signals, times.start, state)),
         args=(stepped, signals, disturbance),
         events=events_of(system, times.start, state),
         settings=settings,
@@ -228,16 +232,17 @@ def one_step(
     constrained = has_configuration_constraints(system, t0, unpacked(system, y).q)
     rates = _rates(jnp.array(True), settings.stabilize if constrained else 0.0)
     inputs = inputs_at(system, signals, t0, unpacked(system, y))
-    solver, term = with_scan_kind(_solver_for(settings, system, t0, y, inputs), "lax"), diffrax.ODETerm(rates)
+    solver = with_scan_kind(_solver_for(settings, rates_are_native(system, t0, y, inputs)), "lax")
+    term = diffrax.ODETerm(rates)
     state = solver.init(term, t0, t1, y, args)
     y1, _, _, _, result = solver.step(term, t0, t1, y, args, state, False)
     return jnp.where(result == diffrax.RESULTS.successful, y1, jnp.nan)
 
 
-def _solver_for(settings: Settings, system: System, t: Array, y: Array, inputs: dict[str, Array]) -> Any:
+def _solver_for(settings: Settings, rates_are_native: bool) -> Any:
     solver: Any = settings.solver
     if isinstance(solver, diffrax.AbstractERK) and not isinstance(solver, diffrax.HalfSolver):  # which may seem one
-        return UnrolledERK(solver) if rates_are_native(system, t, y, inputs) else solver
+        return UnrolledERK(solver) if rates_are_native else solver
     return with_tolerances(solver, settings.rtol, settings.atol)
 
 
@@ -280,8 +285,9 @@ def refuse_captured(system: System) -> None:
         )
 
 
-def _rates(valid: Array, stabilize: float) -> Callable[..., Any]:
-    """(t, y, args) -> y_dot, zero where no motion can begin. `stabilize` [1/s]: how fast constraints are led back."""
+def _rates(valid: Array, stabilize: float, forward: bool = False) -> Callable[..., Any]:
+    """(t, y, args) -> y_dot, zero where no motion can begin. `stabilize` [1/s]: how fast constraints are led back;
+    `forward`: see `vector_field`."""
 
     def rates(t: Array, y: Array, args: Any) -> Array:
         packed_system, signals, disturbance = args
@@ -290,7 +296,7 @@ def _rates(valid: Array, stabilize: float) -> Callable[..., Any]:
         inputs, extra = inputs_at(system, signals, t, state), None
         if disturbance is not None:
             inputs, extra = disturbance(t, inputs, state)
-        y_dot = vector_field(packed_system, t, y, inputs)
+        y_dot = vector_field(packed_system, t, y, inputs, forward)
         if extra is not None:
             y_dot += packed(extra)
         if stabilize:
@@ -303,16 +309,15 @@ def _rates(valid: Array, stabilize: float) -> Callable[..., Any]:
 
 def _integrated(problem: InitialValueProblem) -> Solution:
     """The motion at the times that its steps reach."""
-    settings, times, (stepped, *_) = problem.settings, problem.times, problem.args
+    settings, times = problem.settings, problem.times
 
     def trial_rates(t: Any, y: Any, args: Any) -> Any:
         # A step that is rejected since its rates are not finite must not spoil a derivative in reverse mode.
         return derivative_free_where_not_finite(problem.rates, t, y, args)
 
-    inputs = inputs_at(problem.system, problem.signals, times.start, unpacked(problem.system, problem.start))
     steps = take_steps(
         problem.rates if isinstance(settings.adjoint, diffrax.ForwardMode) else trial_rates,
-        _solver_for(settings, stepped, times.start, problem.start, inputs),
+        _solver_for(settings, problem.are_native),
         _controller_of(problem),
         problem.start,
         problem.args,
@@ -382,7 +387,10 @@ def _located(problem: InitialValueProblem, ending: Ending) -> EventPoint:
     """
     system, events = problem.args[0], problem.events
     t, y = jax.lax.stop_gradient(ending.near[0]), ending.near[1]
-    y_dot = problem.rates(*constant((t, y, problem.args)))
+    if problem.are_native:
+        y_dot = constant(problem.rates(t, y, problem.args))  # by the program of the steps, also in forward mode
+    else:
+        y_dot = problem.rates(*constant((t, y, problem.args)))
 
     def stepped(point: EventPoint) -> EventPoint:
         which = (ending.status - Status.EVENT, ending.by_event)
@@ -393,8 +401,7 @@ def _located(problem: InitialValueProblem, ending: Ending) -> EventPoint:
         return step * (problem.rates(t + 0.5 * step, y + 0.5 * step * y_dot, args) - y_dot)
 
     near = stepped(EventPoint(t, y, jnp.zeros_like(t), jnp.array(True)))
-    inputs = inputs_at(problem.system, problem.signals, t, unpacked(problem.system, y))
-    if rates_are_native(system, t, y, inputs):
+    if problem.are_native:
         return stepped(near._replace(y=near.y + bend(near.step, y, problem.args)))
     reverse = not isinstance(problem.settings.adjoint, diffrax.ForwardMode)
     return stepped(near._replace(y=near.y + negligible(bend, near.step, y, problem.args, transposes=reverse)))

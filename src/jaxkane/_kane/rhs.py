@@ -216,12 +216,13 @@ def rates(system: System, t: Array, q: Array, u: Array, values: dict[str, Array]
     return unpacked(system, vector_field(system, t, packed(State(q, u, x)), values))
 
 
-def vector_field(system: System, t: Array, y: Array, inputs: Mapping[str, Any]) -> Array:
+def vector_field(system: System, t: Array, y: Array, inputs: Mapping[str, Any], forward: bool = False) -> Array:
     """The right-hand side as a solver asks for it: of a packed state (n_q + n_u + n_x,), packed, so that one array goes
-    through the steps."""
+    through the steps. `forward`: with its derivative in forward mode as one operation."""
     packed_system, system = system, tree_of(system)
     if is_written_out(len(system.speeds)):
-        return _vector_field(packed_system, t, y, dict(inputs))
+        written_out = _vector_field.in_forward_mode if forward else _vector_field
+        return written_out(packed_system, t, y, dict(inputs))
     state = unpacked(system, y)
     values = values_of(system, state.x, inputs)
     q_dot, u_dot = motion_rates(system, t, state.q, state.u, values)

@@ -20,6 +20,7 @@ Jaxprs are read in this room alone: equation by equation by `interpret`, and by 
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib
 import os
 import warnings
@@ -35,7 +36,7 @@ try:
     from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Primitive, Var, jaxpr_as_fun
     from jax.interpreters import ad, batching, mlir
     from jax.interpreters.ad import instantiate_zeros, is_undefined_primal
-    from jax.interpreters.partial_eval import dce_jaxpr
+    from jax.interpreters.partial_eval import custom_partial_eval_rules, dce_jaxpr
 
     _ = Jaxpr.replace, Jaxpr.eqns, Jaxpr.invars, Jaxpr.constvars, Jaxpr.outvars
     _ = JaxprEqn.replace, JaxprEqn.primitive, JaxprEqn.params, JaxprEqn.invars, JaxprEqn.outvars, JaxprEqn.effects
@@ -45,7 +46,9 @@ except (ImportError, AttributeError) as error:
     MISSING = f"this JAX lacks what that needs ({error})"
     missing: Any = None
     ClosedJaxpr = Jaxpr = Primitive = Var = missing
-    jaxpr_as_fun = dce_jaxpr = instantiate_zeros = is_undefined_primal = ad = batching = mlir = missing
+    custom_partial_eval_rules = jaxpr_as_fun = dce_jaxpr = instantiate_zeros = is_undefined_primal = ad = batching = (
+        mlir
+    ) = missing
 
 
 WRONG_FUSIONS = ((0, 10, 2), (0, 11, 0))
@@ -196,9 +199,10 @@ def new_primitive(
     batch: Callable[..., Any],
     traced: Callable[..., Any],
     lower_on_cpu: Callable[..., Any],
+    parts: Callable[..., Any] | None = None,
 ) -> Any:
     """An operation of JAX with several results and these rules; `traced` is what it stands for, `lower_on_cpu` makes
-    its text for XLA there."""
+    its text for XLA there. `parts`: see `_partially_evaluated`."""
     primitive = Primitive(name)
     primitive.multiple_results = True
     primitive.def_impl(evaluate)
@@ -208,7 +212,18 @@ def new_primitive(
     batching.primitive_batchers[primitive] = batch
     mlir.register_lowering(primitive, mlir.lower_fun(traced, multiple_results=True))
     mlir.register_lowering(primitive, lower_on_cpu, platform="cpu")
+    if parts is not None:
+        custom_partial_eval_rules[primitive] = functools.partial(_partially_evaluated, primitive, parts)
     return primitive
+
+
+def _partially_evaluated(
+    primitive: Any, parts: Callable[..., Any], trace: Any, *inputs: Any, **params: Any
+) -> Sequence[Any]:
+    """Where JAX computes what is known and keeps the rest for later: each of the `parts` of an operation by itself, of
+    which one may be known. Of the parameters, `parts` gives how many of the inputs each has, and its parameters."""
+    each = [trace.default_process_primitive(primitive, inputs[:n], part) for n, part in parts(**params)]
+    return [x for results in each for x in results]
 
 
 def new_variable(like: Any) -> Any:

@@ -10,6 +10,7 @@ reverse derivative 2450 -> 17 us.
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 import warnings
@@ -192,6 +193,12 @@ class ScalarFunction:
                 return self.__wrapped__(*map(tree_of, args))
         return jax.tree.unflatten(program.structure, program(*numbers))
 
+    def in_forward_mode(self, *args: Any) -> Any:
+        """`f(*args)`, which with its derivative in forward mode is one operation. A derivative in reverse mode costs
+        what it does elsewhere."""
+        numbers, program = self.program(*args)
+        return self(*args) if program is None else jax.tree.unflatten(program.structure, program.forward(*numbers))
+
     def program(self, *args: Any) -> tuple[list[Any], Program | None]:
         """The numbers of the arguments, and the program of them; None where it cannot be one operation."""
         if MISSING is not None:
@@ -327,7 +334,8 @@ class Program:
     `loop_invariant`: places of the arguments that stay what they are while the program is called again and again, as
     the parameters of a system. `tangents`: places of those that are tangents; `linear`: of those in which all of it is
     linear; `moves`: which results of the program that it is a derivative of move. `structure`: of the results. `once`:
-    whether it is called once. `is_reduced`: whether `cse` would find nothing in it.
+    whether it is called once. `is_reduced`: whether `cse` would find nothing in it. `values`: of one that gives values
+    and then their tangents, the program of the values, and which of its inputs move.
     """
 
     def __init__(
@@ -341,9 +349,11 @@ class Program:
         moves: tuple[bool, ...] = (),
         once: bool = False,
         is_reduced: bool = False,
+        values: tuple[Program, tuple[bool, ...]] | None = None,
     ):
         self.label, self.loop_invariant, self.structure, self.once = label, loop_invariant, structure, once
         self.tangents, self.linear, self.moves = tangents, linear, moves
+        self.values, self.is_forward = values, values is not None
         self.program = program if is_reduced else cse(program)
         self.evaluate = jaxpr_as_fun(self.program)
         self.in_avals, self.out_avals = self.program.in_avals, self.program.out_avals
@@ -352,26 +362,42 @@ class Program:
         # Caches of each instance, since a cached method would keep the instance itself alive.
         cached = functools.lru_cache(maxsize=256)
         self.tangent, self.transposed = cached(self._tangent), cached(self._transposed)
+        self.with_tangent = cached(self._with_tangent)
         self.batched, self.part, self.jitted = cached(self._batched), cached(self._part), cached(self._jitted)
 
     def __call__(self, *leaves: Any) -> list[Any]:
         return _program_p.bind(*leaves, program=self, sizes=(), where=((),) * len(leaves))
 
+    @functools.cached_property
+    def forward(self) -> Program:
+        """The same, whose derivatives are `with_tangent`."""
+        program = copy.copy(self)
+        program.is_forward = True
+        return program
+
     def _tangent(self, moving: tuple[bool, ...]) -> Program:
         """(primals, tangents of those that move) -> tangents of the outputs that move."""
+        return self._derivative(moving, with_values=False)
+
+    def _with_tangent(self, moving: tuple[bool, ...]) -> Program:
+        """The same, with the outputs before their tangents."""
+        return self._derivative(moving, with_values=True)
+
+    def _derivative(self, moving: tuple[bool, ...], with_values: bool) -> Program:
         places = [i for i, m in enumerate(moving) if m]
         fixed = self.loop_invariant | {len(moving) + j for j, i in enumerate(places) if i in self.loop_invariant}
         linear = frozenset(range(len(moving), len(moving) + len(places)))
-        program, moves = with_room(tangent_program, self.program, places)
+        program, moves = with_room(tangent_program, self.program, places, with_values)
         return Program(
             program,
             self.label,
             fixed,
             tangents=self.tangents | linear,
-            linear=linear,
+            linear=frozenset() if with_values else linear,
             moves=moves,
             once=self.once,
             is_reduced=True,
+            values=(self, moving) if with_values else None,
         )
 
     def _transposed(self, linear: tuple[bool, ...]) -> Program:
@@ -388,10 +414,21 @@ class Program:
             a.update(shape=(*(n for n, h in zip(sizes, has, strict=True) if h), *a.shape))
             for a, has in zip(specs_of(self.in_avals), where, strict=True)
         ]
-        f = lambda *xs: self.evaluate(*xs)  # noqa: E731
+        f, out_where = lambda *xs: self.evaluate(*xs), self.out_where(where)
+        axes = lambda d, where: [0 if has[d] else None for has in where]  # noqa: E731
         for d in reversed(range(len(sizes))):
-            f = jax.vmap(f, in_axes=tuple(0 if has[d] else None for has in where), axis_size=sizes[d])
+            f = jax.vmap(f, tuple(axes(d, where)), axes(d, out_where), axis_size=sizes[d])
         return Program(program_of(f, *avals), self.label, once=self.once)
+
+    def out_where(self, where: Where) -> Where:
+        """Which of the leading axes each output has: all of them, but values beside their tangents those of the inputs
+        that are no such tangents."""
+        everywhere = (True,) * len(where[0]) if where else ()
+        if not self.values:
+            return (everywhere,) * len(self.out_avals)
+        n_in, n_out = len(self.values[0].in_avals), len(self.values[0].out_avals)
+        of_values = tuple(any(w[d] for w in where[:n_in]) for d in range(len(everywhere)))
+        return (of_values,) * n_out + (everywhere,) * (len(self.out_avals) - n_out)
 
     def moved(self, moving: tuple[bool, ...]) -> tuple[bool, ...]:
         """Which outputs follow from any of the inputs that move."""
@@ -445,7 +482,7 @@ class Program:
         """The name of the native kernel for a batch, where there can be one."""
         scalars = self.scalars if native.is_on() and 0 not in sizes else None
         try:
-            return scalars.target(sizes, where, self.groups(where)) if scalars else None
+            return scalars.target(sizes, where, self.groups(where), self.out_where(where)) if scalars else None
         except NotScalarError as error:
             self._tell_not_scalar(error)
         except (RuntimeError, OSError, MemoryError) as error:  # LLVM's own are RuntimeError
@@ -456,7 +493,8 @@ class Program:
         _tell(self.label, f"{error}", "native kernels do not know: XLA does its work, three to ten times slower")
 
 
-# A call stands for a batch over leading axes `sizes`; input i has those of them that `where[i]` says, outputs have all.
+# A call stands for a batch over leading axes `sizes`; input i has those of them that `where[i]` says, the outputs those
+# of `Program.out_where`.
 
 
 def _run(*args, program, sizes, where):
@@ -464,7 +502,23 @@ def _run(*args, program, sizes, where):
 
 
 def _abstract(*_, program, sizes, where):
-    return [a.update(shape=(*sizes, *a.shape)) for a in program.out_avals]
+    each = zip(program.out_avals, program.out_where(where), strict=True)
+    return [a.update(shape=(*_present(sizes, has), *a.shape)) for a, has in each]
+
+
+def _present(sizes, has):
+    return tuple(n for n, is_there in zip(sizes, has, strict=True) if is_there)
+
+
+def _parts(*, program, sizes, where):
+    """For each program that it consists of: how many of the inputs it has, and its parameters."""
+    whole = {"program": program, "sizes": sizes, "where": where}
+    if not program.values:
+        return [(len(where), whole)]
+    values, moving = program.values
+    n, has = len(moving), program.out_where(where)[0]
+    of_values = {"sizes": _present(sizes, has), "where": tuple(_present(w, has) for w in where[:n])}
+    return [(n, {"program": values} | of_values), (len(where), whole | {"program": values.tangent(moving)})]
 
 
 def _jvp(primals, tangents, *, program, sizes, where):
@@ -472,11 +526,15 @@ def _jvp(primals, tangents, *, program, sizes, where):
         reads and is_inexact(x) and not is_no_tangent(dx)
         for reads, x, dx in zip(program.reads, program.in_avals, tangents, strict=True)
     )
-    outputs = _program_p.bind(*primals, program=program, sizes=sizes, where=where)
-    tangent, slopes = program.tangent(moving) if any(moving) else None, iter(())
+    n, tangent, outputs, slopes = len(program.out_avals), None, None, iter(())
+    if any(moving):
+        tangent = (program.with_tangent if program.is_forward else program.tangent)(moving)
     if tangent and any(tangent.moves):
         along, places = zip(*[(dx, w) for dx, m, w in zip(tangents, moving, where, strict=True) if m], strict=True)
-        slopes = iter(_program_p.bind(*primals, *along, program=tangent, sizes=sizes, where=(*where, *places)))
+        results = _program_p.bind(*primals, *along, program=tangent, sizes=sizes, where=(*where, *places))
+        outputs, slopes = (results[:n], iter(results[n:])) if tangent.values else (None, iter(results))
+    if outputs is None:
+        outputs = _program_p.bind(*primals, program=program, sizes=sizes, where=where)
     shapes = _abstract(program=program, sizes=sizes, where=where)
     moved = tangent.moves if tangent else (False,) * len(shapes)
     return outputs, [next(slopes) if m else no_tangent(aval) for m, aval in zip(moved, shapes, strict=True)]
@@ -519,6 +577,10 @@ def _batch(args, axes, *, program, sizes, where):
         ]
         moving = tuple(m or i in program.tangents for i, m in enumerate(moving))
     moves = program.moved(moving)
+    if program.values:  # they remain shared unless any of what they follow from is not
+        where = tuple((m, *w) for m, w in zip(moving, where, strict=True))
+        outputs = _program_p.bind(*args, program=program, sizes=(size, *sizes), where=where)
+        return outputs, [0 if has[0] else None for has in program.out_where(where)]
     if any(moves) and not all(moves) and not all(moving):  # what follows from shared inputs alone remains shared
         results = {}
         for is_moved in (False, True):
@@ -557,15 +619,16 @@ def _in_chunks(args, program, sizes, where):
         start = jnp.minimum(i * size, n - size)
         part = [jax.lax.dynamic_slice_in_dim(x, start, size) if w[0] else x for x, w in zip(args, where, strict=True)]
         put = functools.partial(jax.lax.dynamic_update_slice_in_dim, start_index=start, axis=0)
-        return [put(whole, piece) for whole, piece in zip(outputs, bind(*part), strict=True)]
+        each = zip(outputs, bind(*part), program.out_where(where), strict=True)
+        return [put(whole, piece) if has[0] else piece for whole, piece, has in each]
 
-    empty = [jnp.zeros((*sizes, *a.shape), a.dtype) for a in program.out_avals]
+    empty = [jnp.zeros(a.shape, a.dtype) for a in _abstract(program=program, sizes=sizes, where=where)]
     return jax.lax.fori_loop(0, -(-n // size), chunk, empty)
 
 
 def _by_kernel(*args, program, sizes, where, target):
     groups = [[args[i] for i in group] for group in program.groups(where)]
-    outputs = [jax.ShapeDtypeStruct((*sizes, *a.shape), a.dtype) for a in program.out_avals]
+    outputs = specs_of(_abstract(program=program, sizes=sizes, where=where))
     return jax.ffi.ffi_call(target, outputs)(*(jnp.stack(xs, axis=-1) if len(xs) > 1 else xs[0] for xs in groups))
 
 
@@ -585,4 +648,5 @@ if MISSING is None:
         batch=_batch,
         traced=_inlined,
         lower_on_cpu=_lower_on_cpu,
+        parts=_parts,
     )

@@ -252,8 +252,11 @@ def _cotangents(equation: Any, moves_and_given: tuple[bool, ...], *values: Any) 
     return transposed(equation, xs, moves, [next(values_left) if is_one else None for is_one in given])
 
 
-def tangent_program(program: ClosedJaxpr, moving: Sequence[int]) -> tuple[ClosedJaxpr, tuple[bool, ...]]:
+def tangent_program(
+    program: ClosedJaxpr, moving: Sequence[int], values: bool = False
+) -> tuple[ClosedJaxpr, tuple[bool, ...]]:
     """(inputs, tangents of those at the places `moving`) -> tangents of the outputs that move; and which these are.
+    With `values`, all outputs come before these.
 
     Equation by equation, by JAX's rule of each, traced once for all alike. To trace the whole takes four times as long.
     """
@@ -272,8 +275,8 @@ def tangent_program(program: ClosedJaxpr, moving: Sequence[int]) -> tuple[Closed
 
     inputs = [(v, tangents.get(v)) for v in jaxpr.invars]
     pairs = interpret(program, inputs, rule, lambda v, x: (once.constant(v, x), None))
-    dys = [dy for _, dy in pairs if dy is not None]
-    return once.program(jaxpr, [*jaxpr.invars, *tangents.values()], dys), tuple(dy is not None for _, dy in pairs)
+    results = [*(y for y, _ in pairs if values), *(dy for _, dy in pairs if dy is not None)]
+    return once.program(jaxpr, [*jaxpr.invars, *tangents.values()], results), tuple(dy is not None for _, dy in pairs)
 
 
 def transposed_program(program: ClosedJaxpr, linear: Sequence[int]) -> ClosedJaxpr:

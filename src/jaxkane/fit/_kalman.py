@@ -147,7 +147,7 @@ class _Motion:
 
     def start(self, v: Array) -> Reached:
         y, t = v[: self.n], self.window.t[0]
-        valid = is_valid(self.system, unpacked(self.system, y), t, self.signals(v[self.n :]))
+        valid = is_valid(self.system, y, t, self.signals(v[self.n :]))
         return Reached(t, y, jnp.where(valid, jnp.int32(Status.COMPLETED), jnp.int32(Status.INVALID)))
 
     def predicted(self, v: Array, S: Array, t0: Array, t1: Array, reached: Reached):

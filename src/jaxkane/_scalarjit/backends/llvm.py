@@ -56,17 +56,17 @@ def wrapper_text(
     kernel: str,
     sizes: Sequence[int],
     where: Sequence[Sequence[bool]],
-    n_out: int,
+    n_in: int,
     bytes_of: Sequence[int],
     of_kernel: str = "",
 ) -> str:
     """The function that XLA calls: for every place in the outer dimensions, the kernel on the lanes of the last. The
     kernel has this name, in the program or in the text `of_kernel`, which becomes a part of this one.
 
-    Argument i has those of the dimensions `sizes` that `where[i]` says, results have all; an element of each is so
-    many bytes. Where a structure is not as large as it is taken to be, XLA is handed an error.
+    Of the dimensions `sizes`, the `n_in` arguments and the results behind them have those that `where` says of each; an
+    element of each is so many bytes. Where a structure is not as large as it is taken to be, XLA is handed an error.
     """
-    n_in = len(where)
+    n_out = len(where) - n_in
     lines = [
         f"%in = alloca ptr, i64 {max(n_in, 1)}",
         f"%out = alloca ptr, i64 {max(n_out, 1)}",
@@ -94,7 +94,7 @@ def wrapper_text(
             lines += _load(f"{b}.buffer", "ptr", f"{side}.list", 8 * i)
             lines += _load(f"{b}.data", "ptr", f"{b}.buffer", LAYOUT.buffer_data)
             lines.append(f"%{b}.slot = getelementptr ptr, ptr %{side}, i64 {i}")
-    lines += [*_calls(kernel, sizes, where, n_out, bytes_of), *_refusal()]
+    lines += [*_calls(kernel, sizes, where, n_in, bytes_of), *_refusal()]
     body = "\n".join(["entry:", *lines])
     message = "".join(f"\\{byte:02X}" for byte in _MOVED.encode())
     return (
@@ -159,21 +159,19 @@ def _refusal() -> list[str]:
 
 
 def _calls(
-    kernel: str, sizes: Sequence[int], where: Sequence[Sequence[bool]], n_out: int, bytes_of: Sequence[int]
+    kernel: str, sizes: Sequence[int], where: Sequence[Sequence[bool]], n_in: int, bytes_of: Sequence[int]
 ) -> list[str]:
     """Every place in the outer dimensions, one after the other."""
-    n_in = len(where)
     outer, lanes = sizes[:-1], (sizes[-1] if sizes else 1)
     lines = ["br label %outer", "outer:", "%k = phi i64 [0, %run], [%k.next, %outer]"]
-    all_where = [*where, *([[True] * len(sizes)] * n_out)]
-    for i in range(n_in + n_out):
+    for i in range(len(where)):
         b = f"%in{i}" if i < n_in else f"%out{i - n_in}"
         offset = f"{b}.0"
         lines.append(f"{offset} = add i64 0, 0")
-        stride = bytes_of[i] * (lanes if sizes and all_where[i][-1] else 1)
+        stride = bytes_of[i] * (lanes if sizes and where[i][-1] else 1)
         later = 1
         for d in reversed(range(len(outer))):
-            if all_where[i][d]:
+            if where[i][d]:
                 lines.append(f"{b}.{d}.q = udiv i64 %k, {later}")
                 lines.append(f"{b}.{d}.r = urem i64 {b}.{d}.q, {outer[d]}")
                 lines.append(f"{b}.{d}.s = mul i64 {b}.{d}.r, {stride}")
@@ -209,8 +207,8 @@ _BLOCK = 1500
 class Writer:
     """The text of one function: `void it(ptr in, ptr out, i64 n)`, with pointers to n lanes of every argument.
 
-    An argument that `varies` holds its elements lane after lane; one that does not is read once. The last lanes of the
-    last group repeat lane n - 1, so that what a lane gives never depends on its place.
+    An argument or a result that varies holds its elements lane after lane; one that does not is read or written once.
+    The last lanes of the last group repeat lane n - 1, so that what a lane gives never depends on its place.
 
     `is_derivative`: sums of products along several directions may be added up in any order, which saves an eighth.
     """
@@ -233,13 +231,13 @@ class Writer:
         self.places: dict[int, int] = {}
         self.splats: dict[int, str] = {}
 
-    def text(self, n_in: int, outputs: Sequence[np.ndarray]) -> str:
+    def text(self, n_in: int, outputs: Sequence[np.ndarray], out_varies: Sequence[bool]) -> str:
         nodes = self.graph.nodes
         used = needed(nodes, outputs)
         self.wide = wide = self._wide(used)
         shared = {k for k in used if k not in wide and nodes[k].operation != "constant"}
         read = {i for k in wide if nodes[k].operation != "input" for i in nodes[k].operands}
-        read |= {int(k) for out in outputs for k in out.flat}
+        read |= {int(k) for out, varies in zip(outputs, out_varies, strict=True) if varies for k in out.flat}
         for where, n in (("in", n_in), ("out", len(outputs))):
             for i in range(n):
                 self.lines.append(f"%{where}{i}.at = getelementptr ptr, ptr %{where}, i64 {i}")
@@ -251,6 +249,9 @@ class Writer:
             if k in read:
                 self.places[k] = len(self.places)
                 self.lines.append(f"store {TYPES[nodes[k].dtype]} %v{k}, ptr {self._kept(k, 'kept')}")
+        for j, array in enumerate(outputs):
+            for e, k in enumerate(map(int, array.flat)) if not out_varies[j] else ():
+                self._store_alone(f"out{j}", e, self._alone(k), nodes[k].dtype)
         self.lines += [
             "%last = sub i64 %n, 1",
             "br label %lanes",
@@ -265,7 +266,7 @@ class Writer:
             self._node(k, self.lanes)
         self.lines += ["br label %stored", "stored:"]
         for j, array in enumerate(outputs):
-            for e, k in enumerate(map(int, array.flat)):
+            for e, k in enumerate(map(int, array.flat)) if out_varies[j] else ():
                 self._store(f"out{j}", e, array.size, self._in_lanes(k), nodes[k].dtype)
         self.lines += [f"%next = add i64 %i, {self.lanes}", "%more = icmp ult i64 %next, %n"]
         self.lines += ["br i1 %more, label %lanes, label %done", "done:", "ret void"]
@@ -428,6 +429,14 @@ class Writer:
             name = whole if lane == len(parts) - 1 else f"{tag}.{lane}"
             self.lines.append(f"{name} = insertelement {vector} {so_far}, {kind} {part}, i64 {lane}")
             so_far = name
+
+    def _store_alone(self, pointer: str, element: int, value: str, dtype: str) -> None:
+        tag, kind = f"{pointer}.e{element}", TYPES[dtype]
+        if dtype == "bool":
+            self.lines.append(f"%{tag}.byte = zext {kind} {value} to i8")
+            value, kind = f"%{tag}.byte", "i8"
+        self.lines.append(f"%{tag}.p = getelementptr {kind}, ptr %{pointer}, i64 {element}")
+        self.lines.append(f"store {kind} {value}, ptr %{tag}.p")
 
     def _store(self, pointer: str, element: int, size: int, value: str, dtype: str) -> None:
         lanes, tag, kind = self.lanes, f"{pointer}.e{element}", TYPES[dtype]

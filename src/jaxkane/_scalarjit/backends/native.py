@@ -84,7 +84,7 @@ def _read(path: Path) -> str | None:
 
 
 def _wrapper(kernel: str) -> str:
-    return wrapper_text(kernel, (_LANES,), ((True,), (False,)), 3, [16, 8, 8, 8, 1])
+    return wrapper_text(kernel, (_LANES,), ((True,), (False,), *[(True,)] * 3), 2, [16, 8, 8, 8, 1])
 
 
 def _kernel(compiler: LLVMCompiler) -> str:
@@ -98,7 +98,7 @@ def _kernel(compiler: LLVMCompiler) -> str:
         total, power = double("add", total, power), double("mul", power, a)
     outputs = [total, double("atan2", y, x), graph.apply("lt", (x, y), "bool")]
     writer = Writer(graph, (True, False), compiler.lanes, lambda f, arity: compiler.of_lanes(f, arity, compiler.lanes))
-    return writer.text(2, [np.array([k]) for k in outputs])
+    return writer.text(2, [np.array([k]) for k in outputs], [True] * 3)
 
 
 def _expected() -> list[Any]:
@@ -235,6 +235,7 @@ def _probed() -> str | None:
 
 
 Groups = tuple[tuple[int, ...], ...]
+Where = tuple[tuple[bool, ...], ...]
 FMOD = "fmod"  # in the C library what is `rem` in JAX
 
 
@@ -265,18 +266,21 @@ class Scalars:
         self.kernel = functools.cache(self._kernel)
         self.target = functools.cache(self._target)
 
-    def _kernel(self, groups: Groups, varies: tuple[bool, ...], lanes: int) -> tuple[str, str]:
+    def _kernel(
+        self, groups: Groups, varies: tuple[bool, ...], out_varies: tuple[bool, ...], lanes: int
+    ) -> tuple[str, str]:
         """Its name; and its text, where that is to be part of the one function that calls it."""
         of_lanes = functools.partial(llvm_compiler().of_lanes, lanes=lanes)
         writer = Writer(self.graph.reading_groups(groups), varies, lanes, of_lanes, self.is_derivative)
-        text = writer.text(len(varies), self.outputs)
+        text = writer.text(len(varies), self.outputs, out_varies)
         if not self.once:
             return _compiled(text)[1], ""
         return "kernel", text.replace("define void @it(", "define internal void @kernel(")
 
-    def _target(self, sizes: tuple[int, ...], where: tuple[tuple[bool, ...], ...], groups: Groups) -> str:
+    def _target(self, sizes: tuple[int, ...], where: Where, groups: Groups, out_where: Where) -> str:
         """The name under which XLA calls the program for a batch of `sizes`, of whose dimensions argument i has those
-        in `where[i]`. It is called with `groups` of the arguments: one, or several numbers as one array.
+        in `where[i]`, and result i those in `out_where[i]`. It is called with `groups` of the arguments: one, or
+        several numbers as one array.
 
         **Raises:** `NotScalarError` where this machine lacks a function, `RuntimeError` where LLVM fails.
         """
@@ -284,14 +288,15 @@ class Scalars:
         if missing:
             raise NotScalarError(f"{', '.join(missing)} (not in the mathematical library here)")
         bytes_of = [sum(self.bytes_of[i] for i in group) for group in groups] + self.bytes_of[len(where) :]
-        where = tuple(where[group[0]] for group in groups)
+        where = (*(where[group[0]] for group in groups), *out_where)
         if all(all(w) or not any(w) for w in where):  # one long batch
             sizes, where = (int(np.prod(sizes)),) if sizes else (), tuple((any(w),) if sizes else () for w in where)
+        n, varies = len(groups), tuple(bool(w and w[-1]) for w in where)
         # What is called once is to have a short text.
         lanes = min(llvm_compiler().lanes, 1 << (sizes[-1] - 1).bit_length()) if sizes and not self.once else 1
         with llvm_compiler().lock:
-            kernel, text = self.kernel(groups, tuple(bool(w and w[-1]) for w in where), lanes)
-            wrapper = wrapper_text(kernel, sizes, where, len(self.outputs), bytes_of, text)
+            kernel, text = self.kernel(groups, varies[:n], varies[n:], lanes)
+            wrapper = wrapper_text(kernel, sizes, where, n, bytes_of, text)
             address, name = _compiled(wrapper, level=0)
             _register(address, name)
         return name
