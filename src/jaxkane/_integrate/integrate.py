@@ -85,18 +85,16 @@ def _limited(system: System) -> list[tuple[Array, ParameterInfo]]:
 
 
 class Beginning(NamedTuple):
-    """The `times` of a motion; whether it can begin; its `system` and packed state at the `start`, ones if it cannot.
-
-    `stepped`: the system that the steps read, with ones for parameters that are not finite, or that no description can
-    have: behind a mask these would still spoil the reverse gradient of what is shared. What all members of a batch
-    share remains shared there, of which a kernel computes its part once.
+    """The `times` of a motion; whether it can begin; its packed state at the `start`, ones where it cannot; and its
+    `system`, with ones for parameters that are not finite, or that no description can have: behind a mask these would
+    still spoil the reverse gradient of what is shared. What all members of a batch share remains shared there, of which
+    a kernel computes its part once.
     """
 
     times: Times
     valid: Array
-    system: System
     start: Array
-    stepped: System
+    system: System
 
 
 def beginning(system: System, y: Array, ts: Array, others_are_valid: Array) -> Beginning:
@@ -105,27 +103,28 @@ def beginning(system: System, y: Array, ts: Array, others_are_valid: Array) -> B
     others = _large_are_valid(system, y) & others_are_valid
     small = _beginning(system, y, ts[0], ts[1], ts[-1], others)
     large = _harmless(system, y, small.valid, lambda x: eqx.is_inexact_array(x) and not _is_small(x))
-    rest = eqx.filter((system, y, system), eqx.is_inexact_array, inverse=True)
-    return Beginning(small.times, small.valid, *eqx.combine(small[2:], large, rest))
+    rest = eqx.filter((y, system), eqx.is_inexact_array, inverse=True)
+    return Beginning(small.times, small.valid, *eqx.combine((small.start, small.system), large, rest))
 
 
 @ScalarFunction.once
 def _beginning(system: System, y: Array, first: Array, second: Array, last: Array, others: Array) -> Beginning:
     valid = _small_are_valid.__wrapped__(system, y, first, others)
-    masked, start, stepped = _harmless(system, y, valid, _is_small)
+    start, harmless = _harmless(system, y, valid, _is_small)
     # To JAX the state moves with the parameters, so that the derivative of the first rates is the program of the loop.
-    numbers = [jnp.sum(x) for x in jax.tree.leaves(stepped) if x.dtype == y.dtype]
+    numbers = [jnp.sum(x) for x in jax.tree.leaves(harmless) if x.dtype == y.dtype]
     start = jax.tree.map(lambda x: jnp.where(valid, x, x + 0.0 * sum(numbers)), start)
-    return Beginning(times_of(first, second, last), valid, masked, start, stepped)
+    return Beginning(times_of(first, second, last), valid, start, harmless)
 
 
-def _harmless(system: System, y: Array, valid: Array, is_chosen: Callable[[Any], bool]) -> Any:
-    """The last three of a `Beginning`: those of their arrays that are chosen, None for the others."""
+def _harmless(system: System, y: Array, valid: Array, is_chosen: Callable[[Any], bool]) -> tuple[Any, Any]:
+    """The state and the system of a `Beginning`: those of their arrays that are chosen, None for the others."""
     limits = {id(x): info for x, info in _limited(system)}
-    where = lambda condition, x: jnp.where(condition, x, jnp.ones_like(x))  # noqa: E731
-    masked = lambda x: where(valid, x) if is_chosen(x) else None  # noqa: E731
-    possible = lambda x: where(limits.get(id(x), ANY).allows(x), x) if is_chosen(x) else None  # noqa: E731
-    return *jax.tree.map(masked, (system, y)), jax.tree.map(possible, system)
+
+    def where(condition: Array, x: Array) -> Array | None:
+        return jnp.where(condition, x, jnp.ones_like(x)) if is_chosen(x) else None
+
+    return where(valid, y), jax.tree.map(lambda x: where(limits.get(id(x), ANY).allows(x), x), system)
 
 
 class InitialValueProblem(NamedTuple):
@@ -193,12 +192,11 @@ def solve(
     if settings.check_bodies:
         others_are_valid &= bodies_are_possible(system, ts[0], state.q)
     # What is not finite must not enter the solver, where it would spoil the gradient of what is shared.
-    times, valid, system, start, stepped = beginning(system, packed(state), ts, others_are_valid)
+    times, valid, start, system = beginning(system, packed(state), ts, others_are_valid)
+    # In reverse mode the cotangent of each number would be a sum of its own, in each of the loops. In forward mode they
+    # stay apart, since in a batch some of them may be shared.
     forward = isinstance(settings.adjoint, diffrax.ForwardMode)
-    if not forward:
-        # In reverse mode the cotangent of each number would be a sum of its own, in each of the loops. In forward mode
-        # they stay apart, since in a batch some of them may be shared.
-        stepped = Packed.of(stepped, start.dtype)
+    stepped = system if forward else Packed.of(system, start.dtype)
     signals, state = mask_invalid_inputs(signals, valid), unpacked(system, start)
     constrained = has_configuration_constraints(system, times.start, state.q)
     problem = InitialValueProblem(

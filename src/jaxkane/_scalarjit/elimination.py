@@ -63,7 +63,7 @@ class _Solve(Program):
         self.label, self.loop_invariant, self.program = form.label, form.loop_invariant, form.program
         self.in_avals, self.out_avals = form.in_avals, form.in_avals[-1:]
         self.evaluate, self.is_fusable, self.reads = by_lapack, False, (*form.reads[:-1], True)
-        self.tangents, self.once = frozenset[int](), False
+        self.tangents, self.values, self.axes_of, self.once = frozenset[int](), None, (None,), False
         self.batched, self.jitted = functools.cache(self._batched), functools.cache(self._jitted)
 
     def moved(self, moving: tuple[bool, ...]) -> tuple[bool, ...]:

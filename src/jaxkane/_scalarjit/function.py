@@ -335,7 +335,8 @@ class Program:
     the parameters of a system. `tangents`: places of those that are tangents; `linear`: of those in which all of it is
     linear; `moves`: which results of the program that it is a derivative of move. `structure`: of the results. `once`:
     whether it is called once. `is_reduced`: whether `cse` would find nothing in it. `values`: of one that gives values
-    and then their tangents, the program of the values, and which of its inputs move.
+    and then their tangents, the program of the values, and which of its inputs move. `axes_of`: of each output, the
+    inputs whose leading axes it has in a batch; None for all.
     """
 
     def __init__(
@@ -350,6 +351,7 @@ class Program:
         once: bool = False,
         is_reduced: bool = False,
         values: tuple[Program, tuple[bool, ...]] | None = None,
+        axes_of: tuple[frozenset[int] | None, ...] = (),
     ):
         self.label, self.loop_invariant, self.structure, self.once = label, loop_invariant, structure, once
         self.tangents, self.linear, self.moves = tangents, linear, moves
@@ -357,6 +359,7 @@ class Program:
         self.program = program if is_reduced else cse(program)
         self.evaluate = jaxpr_as_fun(self.program)
         self.in_avals, self.out_avals = self.program.in_avals, self.program.out_avals
+        self.axes_of = axes_of or (None,) * len(self.out_avals)
         self.is_fusable = is_fusable(self.program.jaxpr)
         self.reads = reads_of(self.program.jaxpr)
         # Caches of each instance, since a cached method would keep the instance itself alive.
@@ -384,20 +387,24 @@ class Program:
         return self._derivative(moving, with_values=True)
 
     def _derivative(self, moving: tuple[bool, ...], with_values: bool) -> Program:
-        places = [i for i, m in enumerate(moving) if m]
-        fixed = self.loop_invariant | {len(moving) + j for j, i in enumerate(places) if i in self.loop_invariant}
-        linear = frozenset(range(len(moving), len(moving) + len(places)))
+        n, places = len(moving), [i for i, m in enumerate(moving) if m]
+        along = {i: n + j for j, i in enumerate(places)}
         program, moves = with_room(tangent_program, self.program, places, with_values)
+        axes_of = [x and x | {along[i] for i in x if i in along} for x, m in zip(self.axes_of, moves, strict=True) if m]
+        if with_values:
+            axes_of = [*(frozenset(range(n)) if x is None else x for x in self.axes_of), *axes_of]
+        linear = frozenset(along.values())
         return Program(
             program,
             self.label,
-            fixed,
-            tangents=self.tangents | linear,
+            self.loop_invariant | {along[i] for i in places if i in self.loop_invariant},
+            tangents=linear if with_values else self.tangents | linear,
             linear=frozenset() if with_values else linear,
             moves=moves,
             once=self.once,
             is_reduced=True,
             values=(self, moving) if with_values else None,
+            axes_of=tuple(axes_of),
         )
 
     def _transposed(self, linear: tuple[bool, ...]) -> Program:
@@ -421,14 +428,10 @@ class Program:
         return Program(program_of(f, *avals), self.label, once=self.once)
 
     def out_where(self, where: Where) -> Where:
-        """Which of the leading axes each output has: all of them, but values beside their tangents those of the inputs
-        that are no such tangents."""
+        """Which of the leading axes each output has."""
         everywhere = (True,) * len(where[0]) if where else ()
-        if not self.values:
-            return (everywhere,) * len(self.out_avals)
-        n_in, n_out = len(self.values[0].in_avals), len(self.values[0].out_avals)
-        of_values = tuple(any(w[d] for w in where[:n_in]) for d in range(len(everywhere)))
-        return (of_values,) * n_out + (everywhere,) * (len(self.out_avals) - n_out)
+        of_inputs = lambda places: tuple(any(where[i][d] for i in places) for d in range(len(everywhere)))  # noqa: E731
+        return tuple(everywhere if places is None else of_inputs(places) for places in self.axes_of)
 
     def moved(self, moving: tuple[bool, ...]) -> tuple[bool, ...]:
         """Which outputs follow from any of the inputs that move."""
@@ -516,7 +519,8 @@ def _parts(*, program, sizes, where):
     if not program.values:
         return [(len(where), whole)]
     values, moving = program.values
-    n, has = len(moving), program.out_where(where)[0]
+    n = len(moving)
+    has = tuple(any(w[d] for w in where[:n]) for d in range(len(sizes)))
     of_values = {"sizes": _present(sizes, has), "where": tuple(_present(w, has) for w in where[:n])}
     return [(n, {"program": values} | of_values), (len(where), whole | {"program": values.tangent(moving)})]
 
@@ -545,15 +549,22 @@ def _transpose(cotangents, *args, program, sizes, where):
     if all(i in program.linear for i, is_asked in enumerate(asked) if is_asked):
         # One transpose for whichever of the tangents are constant: a loop asks for some before it asks for all.
         linear = tuple(i in program.linear for i in range(len(args)))
+
+    def at_one_place(ct, has):
+        for d, (n, is_there) in enumerate(zip(sizes, has, strict=True)):
+            if not is_there:  # of what all members share, the cotangent counts once
+                ct = jnp.expand_dims(ct, d)
+                ct = jnp.pad(ct, [(0, n - 1 if axis == d else 0) for axis in range(ct.ndim)])
+        return ct
+
     known = [(x, w) for x, w, is_linear in zip(args, where, linear, strict=True) if not is_linear]
-    everywhere = ((True,) * len(sizes),) * len(cotangents)
     results = iter(
         _program_p.bind(
             *(x for x, _ in known),
-            *map(instantiate_zeros, cotangents),
+            *map(at_one_place, map(instantiate_zeros, cotangents), program.out_where(where)),
             program=program.transposed(linear),
             sizes=sizes,
-            where=(*(w for _, w in known), *everywhere),
+            where=(*(w for _, w in known), *((True,) * len(sizes),) * len(cotangents)),
         )
     )
 
@@ -577,7 +588,7 @@ def _batch(args, axes, *, program, sizes, where):
         ]
         moving = tuple(m or i in program.tangents for i, m in enumerate(moving))
     moves = program.moved(moving)
-    if program.values:  # they remain shared unless any of what they follow from is not
+    if any(program.axes_of):  # values beside tangents remain shared unless any of what they follow from is not
         where = tuple((m, *w) for m, w in zip(moving, where, strict=True))
         outputs = _program_p.bind(*args, program=program, sizes=(size, *sizes), where=where)
         return outputs, [0 if has[0] else None for has in program.out_where(where)]
