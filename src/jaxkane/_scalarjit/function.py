@@ -131,6 +131,7 @@ def _with_exact(equation: Any, xs: Sequence[Any]) -> Any:
     return _OF_TWO[name](*xs) if name in _OF_TWO and is_trivial else None
 
 
+_FEW = 8  # numbers, that take XLA as long by themselves as to make an array of them
 _MOST_LANES = 128  # in XLA's hands: with more, intermediates no longer stay in the cache
 
 Where = tuple[tuple[bool, ...], ...]
@@ -471,7 +472,7 @@ class Program:
             return None
 
     def groups(self, where: Where) -> tuple[tuple[int, ...], ...]:
-        """The arguments as a native kernel takes them: numbers of the same lanes are one array, since each
+        """The arguments as a native kernel takes them: many numbers of the same lanes are one array, since each
         argument takes XLA as long as some forty operations of a kernel; unless a loop had to make the array in each of
         its steps. What is not read is not passed, so that XLA need not compute it either."""
         groups: dict[Any, list[int]] = {}
@@ -479,7 +480,8 @@ class Program:
             if self.reads[i]:
                 together = aval.shape == () and (self.once or i in self.loop_invariant)
                 groups.setdefault((aval.dtype, has) if together else i, []).append(i)
-        return tuple(map(tuple, groups.values()))
+        apart = [[(i,) for i in group] if len(group) <= _FEW else [tuple(group)] for group in groups.values()]
+        return tuple(group for each in apart for group in each)
 
     def target(self, sizes: tuple[int, ...], where: Where) -> str | None:
         """The name of the native kernel for a batch, where there can be one."""

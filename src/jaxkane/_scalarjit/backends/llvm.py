@@ -200,8 +200,9 @@ COMPARISONS = {"eq": "oeq", "ne": "une", "lt": "olt", "le": "ole", "gt": "ogt", 
 INTRINSICS = {"sqrt": "sqrt", "abs": "fabs", "floor": "floor", "max": "maximum", "min": "minimum"}
 
 
-# LLVM's time for a block grows faster than its length: in blocks of so many nodes, a long kernel takes half of it.
-_BLOCK = 1500
+# LLVM's time for a block grows faster than its length: in blocks of some such number of nodes, a long kernel takes two
+# thirds of it.
+_BLOCK = 1000
 
 
 class Writer:
@@ -279,8 +280,9 @@ class Writer:
         """The nodes one after the other, with a branch that is never taken between blocks of them, lest LLVM join them:
         the first block has this label, `self.block` is the last."""
         self.block = label
+        size = -(-len(nodes) // max(1, len(nodes) // _BLOCK))
         for i, k in enumerate(sorted(nodes)):
-            if i and i % _BLOCK == 0:
+            if i and i % size == 0:
                 self.block = f"{label}.{i}"
                 self.lines += [f"br i1 %is.empty, label %done, label %{self.block}", f"{self.block}:"]
             yield k
