@@ -97,7 +97,7 @@ def test_the_steps_are_those_of_diffrax(solver, adjoint, step):
         spread = None if step is None else evenly_spread(times, jnp.array(step))
         control = StepSizeController(ControlSettings(*tolerances, spread, times, order, 4096, ()), None, None)
         method = with_tolerances(solver, tolerance, tolerance)
-        steps = take_steps(rates, method, control, y0, args, ts, kind, diffrax.NoProgressMeter())
+        steps = take_steps(rates, method, control, jnp.array(True), y0, args, ts, kind, diffrax.NoProgressMeter())
         return steps.motion, steps.t_end, steps.progress.steps
 
     def theirs(args):
@@ -252,3 +252,21 @@ def test_a_step_ends_beside_a_kink_or_leaves_half_of_the_way_to_it():
         settings = ControlSettings(jnp.array(1e-6), jnp.array(1e-6), None, times, 5.0, None, ())
         end, _ = StepSizeController(settings, None, kinks).first(jnp.zeros(1), None)
         assert abs(0.5 - end) < 1e-13 or end == min(length, 0.25)
+
+
+@pytest.mark.parametrize("adjoint", ["forward", "reverse"])
+def test_a_motion_that_cannot_begin_takes_no_steps(adjoint):
+    """Beside one that can: a body with a negative mass, and a parameter that is no number."""
+
+    def ride(mass, stiffness):
+        return jk.simulate(Oscillator(mass=mass, stiffness=stiffness), AT_REST, [0.0, 0.5, 1.0], adjoint=adjoint)
+
+    jacobian = jax.jacfwd if adjoint == "forward" else jax.jacrev
+    batch = jnp.array([1.0, -1.0, 1.0]), jnp.array([4.0, 4.0, jnp.nan])
+    found = jax.jit(jax.vmap(ride))(*batch)
+    np.testing.assert_array_equal(found.status, [jk.Status.COMPLETED, jk.Status.INVALID, jk.Status.INVALID])
+    assert found.stats["steps"][0] > 2
+    np.testing.assert_array_equal(found.stats["steps"][1:], 0)
+    np.testing.assert_array_equal(found.t_end, [1.0, 0.0, 0.0])
+    slopes = jax.jit(jax.vmap(jacobian(lambda m, k: ride(m, k)["x"][-1], argnums=1)))(*batch)
+    np.testing.assert_allclose(slopes, [-np.sin(2.0) / 4, np.nan, np.nan], atol=1e-7)

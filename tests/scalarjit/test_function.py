@@ -391,3 +391,50 @@ def test_where_devices_share_the_work_it_is_one_operation_too():
         warnings.simplefilter("error")
         found = jax.jit(over(jax.vmap(nearest), in_specs=(spec,), out_specs=spec))(jnp.array([-1.0, 2.0]))
     np.testing.assert_array_equal(found, [jnp.inf, 2.0])
+
+
+@ScalarFunction
+def _pair(p, y):
+    return jnp.stack([jnp.sin(p * y[0]) + y[1], y[1] * p**2])
+
+
+def once(f):
+    return lambda v: f(2.0 * v[0], jnp.stack([v[1], v[0] * v[1]]))
+
+
+def in_a_loop(f):
+    return lambda v: jax.lax.fori_loop(0, 3, lambda _, y: f(v[0], y), v)
+
+
+FWD, REV = jax.jacfwd, jax.jacrev
+NESTED = [(FWD,), (REV,), (FWD, FWD), (FWD, REV), (REV, FWD), (FWD, FWD, FWD)]
+
+
+@pytest.mark.parametrize("modes", NESTED, ids=lambda modes: "-".join(mode.__name__ for mode in modes))
+@pytest.mark.parametrize("shape", [once, in_a_loop])
+def test_value_and_derivative_as_one_operation(shape, modes, native):
+    ours, plain = shape(_pair.in_forward_mode), shape(_pair.__wrapped__)
+    for mode in reversed(modes):
+        ours, plain = mode(ours), mode(plain)
+    v = jnp.array([0.3, 0.7])
+    np.testing.assert_allclose(jax.jit(ours)(v), plain(v), rtol=1e-13, atol=1e-14)
+    vs = jnp.stack([v, 2.0 * v, -v])
+    np.testing.assert_allclose(jax.jit(jax.vmap(ours))(vs), jax.vmap(plain)(vs), rtol=1e-13, atol=1e-14)
+
+
+@pytest.mark.parametrize("shape", [once, in_a_loop])
+def test_value_and_derivative_as_one_operation_by_linearize_and_in_batches(shape, kernels):
+    ours, plain = shape(_pair.in_forward_mode), shape(_pair.__wrapped__)
+    v, dv = jnp.array([0.3, 0.7]), jnp.array([1.0, -2.0])
+    for f in (ours, plain):
+        value, slope = jax.linearize(f, v)
+        np.testing.assert_allclose(value, plain(v), rtol=1e-14)
+        np.testing.assert_allclose(slope(dv), jax.jvp(plain, (v,), (dv,))[1], rtol=1e-14)
+    vs = jnp.stack([(1.0 + 0.01 * i) * v for i in range(150)])  # more than XLA takes at once
+    for derivative in (lambda f: jax.vmap(FWD(f)), lambda f: lambda vs: jnp.sum(FWD(jax.vmap(f))(vs), axis=2)):
+        np.testing.assert_allclose(jax.jit(derivative(ours))(vs), derivative(plain)(vs), rtol=1e-12, atol=1e-13)
+
+
+def test_value_and_derivative_are_one_kernel(native):
+    program = jax.jit(FWD(once(_pair.in_forward_mode))).lower(jnp.array([0.3, 0.7])).as_text()
+    assert program.count("stablehlo.custom_call @jaxkane") == 1

@@ -114,8 +114,9 @@ def spring(parameters, x):
     return -k / m * (x - rest) * signs
 
 
-def test_numbers_that_stay_are_one_argument_of_a_kernel():
+def test_numbers_that_stay_are_one_argument_of_a_kernel(monkeypatch):
     """m, k and rest are one array, where all lanes share them; values and derivatives are those of plain JAX."""
+    monkeypatch.setattr(function, "_FEW", 1)
     parameters, x = (2.0, 5.0, 0.1, jnp.array([1.0, -1.0])), jnp.array([0.3, -0.2])
     plain = spring.__wrapped__
     shared = lambda f: jax.vmap(f, in_axes=(None, 0))  # noqa: E731

@@ -209,7 +209,7 @@ def solve(
             system, signals, _reads_samples(system), times.start, state, settings.step is not None, settings.rtol
         ),
         valid=valid,
-        rates=_rates(valid, settings.stabilize if constrained else 0.0, forward),
+        rates=_rates(settings.stabilize if constrained else 0.0, forward),
         are_native=rates_are_native(stepped, times.start, start, inputs_at(system, signals, times.start, state)),
         args=(stepped, signals, disturbance),
         events=events_of(system, times.start, state),
@@ -228,7 +228,7 @@ def one_step(
     and outputs. NaN where an implicit solver finds no solution. `signals` for steps of one length."""
     args = (system, signals, disturbance)
     constrained = has_configuration_constraints(system, t0, unpacked(system, y).q)
-    rates = _rates(jnp.array(True), settings.stabilize if constrained else 0.0)
+    rates = _rates(settings.stabilize if constrained else 0.0)
     inputs = inputs_at(system, signals, t0, unpacked(system, y))
     solver = with_scan_kind(_solver_for(settings, rates_are_native(system, t0, y, inputs)), "lax")
     term = diffrax.ODETerm(rates)
@@ -283,9 +283,8 @@ def refuse_captured(system: System) -> None:
         )
 
 
-def _rates(valid: Array, stabilize: float, forward: bool = False) -> Callable[..., Any]:
-    """(t, y, args) -> y_dot, zero where no motion can begin. `stabilize` [1/s]: how fast constraints are led back;
-    `forward`: see `vector_field`."""
+def _rates(stabilize: float, forward: bool = False) -> Callable[..., Any]:
+    """(t, y, args) -> y_dot. `stabilize` [1/s]: how fast constraints are led back; `forward`: see `vector_field`."""
 
     def rates(t: Array, y: Array, args: Any) -> Array:
         packed_system, signals, disturbance = args
@@ -300,7 +299,7 @@ def _rates(valid: Array, stabilize: float, forward: bool = False) -> Callable[..
         if stabilize:
             back = stabilize * correction(system, t, state.q)
             y_dot += jnp.concatenate([back, jnp.zeros_like(y_dot[back.size :])])
-        return jnp.where(valid, y_dot, jnp.zeros_like(y_dot))
+        return y_dot
 
     return rates
 
@@ -317,6 +316,7 @@ def _integrated(problem: InitialValueProblem) -> Solution:
         problem.rates if isinstance(settings.adjoint, diffrax.ForwardMode) else trial_rates,
         _solver_for(settings, problem.are_native),
         _controller_of(problem),
+        problem.valid,
         problem.start,
         problem.args,
         problem.ts,

@@ -63,6 +63,7 @@ def take_steps(
     rates: Callable[..., Array],
     solver: Any,
     control: StepSizeController,
+    can_begin: Array,
     y0: Array,
     args: Any,
     ts: Array,
@@ -74,7 +75,7 @@ def take_steps(
     It takes the steps of `diffrax.diffeqsolve`, and compiles twice as fast: the control makes all decisions of a step
     in one program, and nothing is there for what no motion needs.
 
-    **Arguments:** `rates`: (t, y, args) -> y_dot.
+    **Arguments:** `rates`: (t, y, args) -> y_dot. There are no steps unless the motion `can_begin`.
     """
     kind = _KINDS[type(adjoint)]
     if control.settings.max_steps is None and getattr(adjoint, "checkpoints", None) is None:
@@ -91,7 +92,7 @@ def take_steps(
         solver_state=solver.init(term, start, end, y0, args),
         jumped=jnp.array(False) if jumps else None,
         progress=progress,
-        is_running=jnp.array(True),
+        is_running=can_begin,
         samples=_Samples(jnp.zeros((len(ts), *y0.shape), y0.dtype), zero),
         meter=meter.init(),
     )
