@@ -144,6 +144,22 @@ def test_a_batch_in_a_loop_of_values_that_all_members_share(mask, batched):
     np.testing.assert_array_equal(np.isnan(slopes), [[batched == "origin", True]])
 
 
+@pytest.mark.parametrize("mask", [nan_where, nan_derivative_where])
+def test_a_batch_in_a_loop_of_one_part_of_the_origin(mask):
+    """To the second derivative, along the part that all members share, and along each member's own."""
+
+    def one(shared, x):
+        return jnp.sum(mask(jnp.array(True), jnp.ones((2, 3)), (shared, jnp.stack([x, x]))))
+
+    f = jax.jit(lambda shared, x: jax.lax.map(lambda x: jax.vmap(one, (None, 0))(shared, x), x) * shared)
+    x, shared = jnp.array([[1.0, 2.0]]), jnp.array(2.0)
+    for argument in (0, 1):
+        first = jax.jacfwd(f, argnums=argument)
+        assert np.isnan(first(shared, x)).any(axis=tuple(range(2, 2 + 2 * argument))).all()
+        for other in (0, 1):
+            assert np.isnan(jax.jacfwd(first, argnums=other)(shared, x)).any()
+
+
 def test_values_without_entries_in_a_batch_in_a_loop():
     f = jax.jit(lambda x: jax.lax.map(jax.vmap(lambda x: nan_where(x > jnp.ones(4), jnp.zeros((4, 0)), x)), x))
     x = jnp.array([[1.0, 2.0]])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from mechanisms import Bead
+from mechanisms import Bead, Slider
 
 import jaxkane as jk
 from jaxkane.catalog import DoublePendulum
@@ -39,6 +39,13 @@ def test_members_move_as_if_alone(rides):
         for end in (rides.trajectory.end, rides.member(i).end):
             q = end.q if end.q.ndim == 1 else end.q[i]
             np.testing.assert_allclose(q, alone.end.q, atol=1e-12)
+
+
+def test_a_member_with_a_body_that_cannot_be_is_invalid():
+    swept = jk.sweep.sweep(Slider(inertia=np.array([0.1, -0.1])), jk.State(np.array([0.0, 0.3]), np.ones(2)), TS)
+    np.testing.assert_array_equal(swept.status, [jk.Status.COMPLETED, jk.Status.INVALID])
+    assert np.isfinite(swept.q[0]).all()
+    assert np.isnan(swept.q[1]).all()
 
 
 @pytest.mark.slow
