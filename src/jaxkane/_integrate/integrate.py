@@ -195,8 +195,7 @@ def solve(
     times, valid, start, system = beginning(system, packed(state), ts, others_are_valid)
     # In reverse mode the cotangent of each number would be a sum of its own, in each of the loops. In forward mode they
     # stay apart, since in a batch some of them may be shared.
-    forward = isinstance(settings.adjoint, diffrax.ForwardMode)
-    stepped = system if forward else Packed.of(system, start.dtype)
+    stepped = system if settings.is_forward else Packed.of(system, start.dtype)
     signals, state = mask_invalid_inputs(signals, valid), unpacked(system, start)
     constrained = has_configuration_constraints(system, times.start, state.q)
     problem = InitialValueProblem(
@@ -209,7 +208,7 @@ def solve(
             system, signals, _reads_samples(system), times.start, state, settings.step is not None, settings.rtol
         ),
         valid=valid,
-        rates=_rates(settings.stabilize if constrained else 0.0, forward),
+        rates=_rates(settings.stabilize if constrained else 0.0, settings.is_forward),
         are_native=rates_are_native(stepped, times.start, start, inputs_at(system, signals, times.start, state)),
         args=(stepped, signals, disturbance),
         events=events_of(system, times.start, state),
@@ -313,7 +312,7 @@ def _integrated(problem: InitialValueProblem) -> Solution:
         return derivative_free_where_not_finite(problem.rates, t, y, args)
 
     steps = take_steps(
-        problem.rates if isinstance(settings.adjoint, diffrax.ForwardMode) else trial_rates,
+        problem.rates if settings.is_forward else trial_rates,
         _solver_for(settings, problem.are_native),
         _controller_of(problem),
         problem.valid,
@@ -401,8 +400,8 @@ def _located(problem: InitialValueProblem, ending: Ending) -> EventPoint:
     near = stepped(EventPoint(t, y, jnp.zeros_like(t), jnp.array(True)))
     if problem.are_native:
         return stepped(near._replace(y=near.y + bend(near.step, y, problem.args)))
-    reverse = not isinstance(problem.settings.adjoint, diffrax.ForwardMode)
-    return stepped(near._replace(y=near.y + negligible(bend, near.step, y, problem.args, transposes=reverse)))
+    bent = negligible(bend, near.step, y, problem.args, transposes=not problem.settings.is_forward)
+    return stepped(near._replace(y=near.y + bent))
 
 
 def _to_event(problem: InitialValueProblem, solution: Solution) -> Solution:

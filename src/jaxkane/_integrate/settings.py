@@ -55,6 +55,11 @@ class Settings(eqx.Module):
     rising: bool = eqx.field(static=True, default=False)  # the times are known to rise
     check_bodies: bool = eqx.field(static=True, default=False)  # a motion of bodies that cannot be is invalid
 
+    @property
+    def is_forward(self) -> bool:
+        """Whether derivatives are those in forward mode alone."""
+        return isinstance(self.adjoint, ADJOINTS["forward"])
+
 
 def settings_for(
     ts: Array,

@@ -46,9 +46,8 @@ except (ImportError, AttributeError) as error:
     MISSING = f"this JAX lacks what that needs ({error})"
     missing: Any = None
     ClosedJaxpr = Jaxpr = Primitive = Var = missing
-    custom_partial_eval_rules = jaxpr_as_fun = dce_jaxpr = instantiate_zeros = is_undefined_primal = ad = batching = (
-        mlir
-    ) = missing
+    custom_partial_eval_rules = jaxpr_as_fun = dce_jaxpr = missing
+    instantiate_zeros = is_undefined_primal = ad = batching = mlir = missing
 
 
 WRONG_FUSIONS = ((0, 10, 2), (0, 11, 0))

@@ -23,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .backends import native
-from .backends.native import Scalars
+from .backends.native import Scalars, Where
 from .backends.numpy import NumPyProgram
 from .backends.xla import as_one_function
 from .cache_key import Cache, CacheKey, explain_leaked_tracer, key_of, trace_with_snapshot, with_room
@@ -134,8 +134,6 @@ def _with_exact(equation: Any, xs: Sequence[Any]) -> Any:
 _FEW = 8  # numbers, that take XLA as long by themselves as to make an array of them
 _MOST_LANES = 128  # in XLA's hands: with more, intermediates no longer stay in the cache
 
-Where = tuple[tuple[bool, ...], ...]
-
 
 class Packed(eqx.Module):
     """A tree whose single numbers are one array, which a loop carries, and whose cotangents it adds up, at once.
@@ -167,6 +165,7 @@ class ScalarFunction:
     """A pure function at module level, as a decorator. It is traced once for each `CacheKey`, and evaluated by
 
     - `f(*args)`: LLVM or XLA, as one operation of JAX, also under `jax.jit`, `jax.grad` and `jax.vmap`;
+    - `f.in_forward_mode(*args)`: the same, which with its derivative by `jax.jvp` or `jax.jacfwd` is one operation;
     - `f.numpy(*args)` and `f.numpy_jvp(args, directions)`: NumPy, with numbers, and without compiling;
     - `f.replay(part, arrays, components, memory)`: the trace that is under way, equation by equation.
 
@@ -195,8 +194,7 @@ class ScalarFunction:
         return jax.tree.unflatten(program.structure, program(*numbers))
 
     def in_forward_mode(self, *args: Any) -> Any:
-        """`f(*args)`, which with its derivative in forward mode is one operation. A derivative in reverse mode costs
-        what it does elsewhere."""
+        """`f(*args)`, which with its derivative in forward mode is one operation."""
         numbers, program = self.program(*args)
         return self(*args) if program is None else jax.tree.unflatten(program.structure, program.forward(*numbers))
 
@@ -532,18 +530,18 @@ def _jvp(primals, tangents, *, program, sizes, where):
         reads and is_inexact(x) and not is_no_tangent(dx)
         for reads, x, dx in zip(program.reads, program.in_avals, tangents, strict=True)
     )
-    n, tangent, outputs, slopes = len(program.out_avals), None, None, iter(())
+    shapes = _abstract(program=program, sizes=sizes, where=where)
+    n, moved, outputs, slopes = len(shapes), (False,) * len(shapes), [], []
     if any(moving):
         tangent = (program.with_tangent if program.is_forward else program.tangent)(moving)
-    if tangent and any(tangent.moves):
-        along, places = zip(*[(dx, w) for dx, m, w in zip(tangents, moving, where, strict=True) if m], strict=True)
-        results = _program_p.bind(*primals, *along, program=tangent, sizes=sizes, where=(*where, *places))
-        outputs, slopes = (results[:n], iter(results[n:])) if tangent.values else (None, iter(results))
-    if outputs is None:
-        outputs = _program_p.bind(*primals, program=program, sizes=sizes, where=where)
-    shapes = _abstract(program=program, sizes=sizes, where=where)
-    moved = tangent.moves if tangent else (False,) * len(shapes)
-    return outputs, [next(slopes) if m else no_tangent(aval) for m, aval in zip(moved, shapes, strict=True)]
+        moved = tangent.moves
+        if any(moved):
+            along, places = zip(*[(dx, w) for dx, m, w in zip(tangents, moving, where, strict=True) if m], strict=True)
+            slopes = _program_p.bind(*primals, *along, program=tangent, sizes=sizes, where=(*where, *places))
+            outputs, slopes = (slopes[:n], slopes[n:]) if tangent.values else ([], slopes)
+    outputs = outputs or _program_p.bind(*primals, program=program, sizes=sizes, where=where)
+    each = iter(slopes)
+    return outputs, [next(each) if m else no_tangent(aval) for m, aval in zip(moved, shapes, strict=True)]
 
 
 def _transpose(cotangents, *args, program, sizes, where):

@@ -208,8 +208,9 @@ _BLOCK = 1000
 class Writer:
     """The text of one function: `void it(ptr in, ptr out, i64 n)`, with pointers to n lanes of every argument.
 
-    An argument or a result that varies holds its elements lane after lane; one that does not is read or written once.
-    The last lanes of the last group repeat lane n - 1, so that what a lane gives never depends on its place.
+    An argument that `varies` and a result that `out_varies` hold their elements lane after lane; others are read or
+    written once. The last lanes of the last group repeat lane n - 1, so that what a lane gives never depends on its
+    place.
 
     `is_derivative`: sums of products along several directions may be added up in any order, which saves an eighth.
     """
@@ -218,11 +219,13 @@ class Writer:
         self,
         graph: Graph,
         varies: Sequence[bool],
+        out_varies: Sequence[bool],
         lanes: int,
         of_lanes: Callable[[str, int], str | None],
         is_derivative: bool = False,
     ):
-        self.graph, self.varies, self.lanes, self.of_lanes = graph, varies, lanes, of_lanes
+        self.graph, self.lanes, self.of_lanes = graph, lanes, of_lanes
+        self.varies, self.out_varies = varies, out_varies
         self.any_order = "reassoc contract" if is_derivative and lanes > 1 else "contract"
         self.lines: list[str] = []
         self.declared: set[str] = set()
@@ -232,14 +235,14 @@ class Writer:
         self.places: dict[int, int] = {}
         self.splats: dict[int, str] = {}
 
-    def text(self, n_in: int, outputs: Sequence[np.ndarray], out_varies: Sequence[bool]) -> str:
+    def text(self, outputs: Sequence[np.ndarray]) -> str:
         nodes = self.graph.nodes
         used = needed(nodes, outputs)
         self.wide = wide = self._wide(used)
         shared = {k for k in used if k not in wide and nodes[k].operation != "constant"}
         read = {i for k in wide if nodes[k].operation != "input" for i in nodes[k].operands}
-        read |= {int(k) for out, varies in zip(outputs, out_varies, strict=True) if varies for k in out.flat}
-        for where, n in (("in", n_in), ("out", len(outputs))):
+        read |= {int(k) for out, varies in zip(outputs, self.out_varies, strict=True) if varies for k in out.flat}
+        for where, n in (("in", len(self.varies)), ("out", len(outputs))):
             for i in range(n):
                 self.lines.append(f"%{where}{i}.at = getelementptr ptr, ptr %{where}, i64 {i}")
                 self.lines.append(f"%{where}{i} = load ptr, ptr %{where}{i}.at")
@@ -250,9 +253,7 @@ class Writer:
             if k in read:
                 self.places[k] = len(self.places)
                 self.lines.append(f"store {TYPES[nodes[k].dtype]} %v{k}, ptr {self._kept(k, 'kept')}")
-        for j, array in enumerate(outputs):
-            for e, k in enumerate(map(int, array.flat)) if not out_varies[j] else ():
-                self._store_alone(f"out{j}", e, self._alone(k), nodes[k].dtype)
+        self._store_outputs(outputs, varying=False)
         self.lines += [
             "%last = sub i64 %n, 1",
             "br label %lanes",
@@ -266,9 +267,7 @@ class Writer:
         for k in self._in_blocks("lanes", wide):
             self._node(k, self.lanes)
         self.lines += ["br label %stored", "stored:"]
-        for j, array in enumerate(outputs):
-            for e, k in enumerate(map(int, array.flat)) if out_varies[j] else ():
-                self._store(f"out{j}", e, array.size, self._in_lanes(k), nodes[k].dtype)
+        self._store_outputs(outputs, varying=True)
         self.lines += [f"%next = add i64 %i, {self.lanes}", "%more = icmp ult i64 %next, %n"]
         self.lines += ["br i1 %more, label %lanes, label %done", "done:", "ret void"]
         body = "\n".join(self.lines)
@@ -395,10 +394,10 @@ class Writer:
         self._gathered(results, scalar, f"%c{k}.g", f"%c{k}.all")
         return f"freeze {kind} %c{k}.all"
 
-    def _at(self, pointer: str, element: int, size: int, lane: int, kind: str, tag: str) -> str:
-        """The address of an element of an argument in a lane."""
-        base = f"%{pointer}.{lane}"
-        if base not in self.bases:
+    def _at(self, pointer: str, element: int, size: int, lane: int | None, kind: str, tag: str) -> str:
+        """The address of an element of an argument or a result in a lane; None where it does not vary."""
+        base = f"%{pointer}" if lane is None else f"%{pointer}.{lane}"
+        if lane is not None and base not in self.bases:
             self.bases.add(base)
             self.lines.append(f"{base}.o = mul i64 %i{lane}, {size}")
             self.lines.append(f"{base} = getelementptr {kind}, ptr %{pointer}, i64 {base}.o")
@@ -412,8 +411,8 @@ class Writer:
         whole = f"%v{k}" if dtype != "bool" else f"%v{k}.byte"
         vector = f"<{lanes} x {kind}>" if varies and lanes > 1 else kind
         if not varies:
-            self.lines.append(f"%a{k} = getelementptr {kind}, ptr %in{argument}, i64 {element}")
-            self.lines.append(f"{whole} = load {kind}, ptr %a{k}")
+            at = self._at(f"in{argument}", element, size, None, kind, f"a{k}")
+            self.lines.append(f"{whole} = load {kind}, ptr {at}")
         else:
             parts = []
             for lane in range(lanes):
@@ -432,22 +431,22 @@ class Writer:
             self.lines.append(f"{name} = insertelement {vector} {so_far}, {kind} {part}, i64 {lane}")
             so_far = name
 
-    def _store_alone(self, pointer: str, element: int, value: str, dtype: str) -> None:
-        tag, kind = f"{pointer}.e{element}", TYPES[dtype]
-        if dtype == "bool":
-            self.lines.append(f"%{tag}.byte = zext {kind} {value} to i8")
-            value, kind = f"%{tag}.byte", "i8"
-        self.lines.append(f"%{tag}.p = getelementptr {kind}, ptr %{pointer}, i64 {element}")
-        self.lines.append(f"store {kind} {value}, ptr %{tag}.p")
+    def _store_outputs(self, outputs: Sequence[np.ndarray], varying: bool) -> None:
+        for j, array in enumerate(outputs):
+            if self.out_varies[j] == varying:
+                for element, k in enumerate(map(int, array.flat)):
+                    self._store(f"out{j}", element, array.size, k, varying)
 
-    def _store(self, pointer: str, element: int, size: int, value: str, dtype: str) -> None:
-        lanes, tag, kind = self.lanes, f"{pointer}.e{element}", TYPES[dtype]
+    def _store(self, pointer: str, element: int, size: int, k: int, varies: bool) -> None:
+        """Node k, in each lane or, where the result does not vary, once."""
+        dtype, lanes = self.graph.nodes[k].dtype, self.lanes if varies else 1
+        tag, kind, value = f"{pointer}.e{element}", TYPES[dtype], self._in_lanes(k) if varies else self._alone(k)
         if dtype == "bool":
             byte = "i8" if lanes == 1 else f"<{lanes} x i8>"
             self.lines.append(f"%{tag}.byte = zext {self._type(dtype, lanes)} {value} to {byte}")
             value, kind = f"%{tag}.byte", "i8"
         for lane in range(lanes):
-            at = self._at(pointer, element, size, lane, kind, f"{tag}.{lane}.p")
+            at = self._at(pointer, element, size, lane if varies else None, kind, f"{tag}.{lane}.p")
             one = value
             if lanes > 1:
                 one = f"%{tag}.{lane}.v"

@@ -97,8 +97,8 @@ def _kernel(compiler: LLVMCompiler) -> str:
     for _ in range(_SHARED):
         total, power = double("add", total, power), double("mul", power, a)
     outputs = [total, double("atan2", y, x), graph.apply("lt", (x, y), "bool")]
-    writer = Writer(graph, (True, False), compiler.lanes, lambda f, arity: compiler.of_lanes(f, arity, compiler.lanes))
-    return writer.text(2, [np.array([k]) for k in outputs], [True] * 3)
+    of_lanes = functools.partial(compiler.of_lanes, lanes=compiler.lanes)
+    return Writer(graph, (True, False), (True,) * 3, compiler.lanes, of_lanes).text([np.array([k]) for k in outputs])
 
 
 def _expected() -> list[Any]:
@@ -271,8 +271,8 @@ class Scalars:
     ) -> tuple[str, str]:
         """Its name; and its text, where that is to be part of the one function that calls it."""
         of_lanes = functools.partial(llvm_compiler().of_lanes, lanes=lanes)
-        writer = Writer(self.graph.reading_groups(groups), varies, lanes, of_lanes, self.is_derivative)
-        text = writer.text(len(varies), self.outputs, out_varies)
+        graph = self.graph.reading_groups(groups)
+        text = Writer(graph, varies, out_varies, lanes, of_lanes, self.is_derivative).text(self.outputs)
         if not self.once:
             return _compiled(text)[1], ""
         return "kernel", text.replace("define void @it(", "define internal void @kernel(")
