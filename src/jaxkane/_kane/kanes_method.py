@@ -53,7 +53,7 @@ from .._scalarjit.components import (
     total,
 )
 from .._scalarjit.elimination import ScalarSolve
-from .._scalarjit.function import ScalarFunction
+from .._scalarjit.function import LinearSolution, ScalarFunction
 from .._system.kinematics import Frame
 from .._system.motion import Body, Load, Motion, flatten_loads, flatten_residuals
 from .._system.parameters import in_batches
@@ -363,9 +363,10 @@ class KaneEquations(DescriptionEvaluator):
         along = self.along_speeds(self.momenta, self.with_dependent(direction))
         return self.onto_speeds(lambda u: self.velocities(u)[0], along)
 
-    def forcing(self) -> Row:
-        """f of M u_dot = f, without partial velocities: all vectors onto all speeds at once."""
-        inertia = [tuple(scale3(-1.0, rate) for rate in rates) for rates in self.momentum_rates()]
+    def forcing(self, u_dot: Row | None = None) -> Row:
+        """f of M u_dot = f, or f - M u_dot, without partial velocities: all vectors onto all speeds at once."""
+        u_dot_all = None if u_dot is None else (*u_dot, *self.dependent_accelerations(u_dot))
+        inertia = [tuple(scale3(-1.0, rate) for rate in rates) for rates in self.momentum_rates(u_dot_all)]
         return self.onto_speeds(self.velocities, (inertia, self.force_components()))
 
     def bias(self) -> Row:
@@ -498,7 +499,14 @@ def accelerations_and_mass_matrix(
     return motion_rates(system, t, q, u, inputs)[1], _columns(system, t, q, u, inputs)
 
 
-@ScalarFunction
+def _equations_at(system, t, q, u, inputs, u_dot, r):
+    kane = KaneEquations(system, t, q, u, inputs)
+    u_dot, r = (as_row(x, system.speeds, "u_dot") for x in (u_dot, r))
+    solution = solve_positive(kane.mass_matrix(kane.partials()), r)
+    return as_vector(kane.q_dot, q), as_vector(kane.forcing(u_dot), q), as_vector(solution, q)
+
+
+@functools.partial(LinearSolution, equations=_equations_at)
 def _motion_rates(system, t, q, u, inputs):
     kane = KaneEquations(system, t, q, u, inputs)
     return as_vector(kane.q_dot, q), as_vector(kane.accelerations(), q)

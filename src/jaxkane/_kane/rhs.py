@@ -243,10 +243,13 @@ def values_of(system: System, x: Array | None, inputs: Mapping[str, Any]) -> dic
 @ScalarFunction
 def _vector_field(system, t, y, inputs):
     state = unpacked(system, y)
-    kane = KaneEquations(system, t, state.q, state.u, values_of(system, state.x, inputs))
-    u_dot = kane.accelerations()
-    x_dot = evaluate_with_accelerations(kane, u_dot, _state_rates) if system.states else ()
-    return as_vector((*kane.q_dot, *u_dot, *x_dot), y)
+    values = values_of(system, state.x, inputs)
+    q_dot, u_dot = motion_rates(system, t, state.q, state.u, values)
+    x_dot = None
+    if system.states:
+        kane = KaneEquations(system, t, state.q, state.u, values)
+        x_dot = as_vector(evaluate_with_accelerations(kane, as_row(u_dot, system.speeds, "u_dot"), _state_rates), y)
+    return packed(State(q_dot, u_dot, x_dot))
 
 
 @ScalarFunction

@@ -64,6 +64,7 @@ class _Solve(Program):
         self.in_avals, self.out_avals = form.in_avals, form.in_avals[-1:]
         self.evaluate, self.is_fusable, self.reads = by_lapack, False, (*form.reads[:-1], True)
         self.tangents, self.values, self.axes_of, self.once = frozenset[int](), None, (None,), False
+        self.is_solution = False
         self.batched, self.jitted = functools.cache(self._batched), functools.cache(self._jitted)
 
     def moved(self, moving: tuple[bool, ...]) -> tuple[bool, ...]:

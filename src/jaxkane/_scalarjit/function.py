@@ -26,7 +26,7 @@ from .backends import native
 from .backends.native import Scalars, Where
 from .backends.numpy import NumPyProgram
 from .backends.xla import as_one_function
-from .cache_key import Cache, CacheKey, explain_leaked_tracer, key_of, trace_with_snapshot, with_room
+from .cache_key import Cache, CacheKey, explain_leaked_tracer, key_of, trace_with_snapshot, version_of, with_room
 from .compat import (
     MISSING,
     ClosedJaxpr,
@@ -41,14 +41,17 @@ from .compat import (
     jaxpr_as_fun,
     new_primitive,
     no_tangent,
+    settings,
 )
 from .components import add, is_exact, mul, sub
 from .graph import OPERATORS, NotScalarError
 from .jaxpr import (
     PROGRAM,
+    Solved,
     cse,
     is_fusable,
     is_inexact,
+    is_solution,
     program_of,
     reads_of,
     replaced,
@@ -223,7 +226,9 @@ class ScalarFunction:
                 "jnp.where and entries at places known beforehand can be part of it",
             )
         fixed = frozenset(range(key.structure.children()[0].num_leaves))
-        return None if inside else Program(program, label, fixed, jax.tree.structure(out), once=self._once)
+        solved = functools.partial(self._solved, key) if isinstance(self, LinearSolution) else None
+        structure = jax.tree.structure(out)
+        return None if inside else Program(program, label, fixed, structure, once=self._once, solved=solved)
 
     def is_native(self, *args: Any) -> bool:
         """Whether LLVM makes a kernel of it for these, a call of which costs nothing to compile."""
@@ -300,6 +305,27 @@ class ScalarFunction:
         return Replay(cse(program) if is_fusable(program.jaxpr) else program, structures, kept)
 
 
+class LinearSolution(ScalarFunction):
+    """A pure function at module level whose last result x solves equations that are linear in it, M x = b.
+
+    `equations(*args, x, r)` gives the other results, b - M x and the y of M y = r, at any x and r. These are
+    differentiated, never the solution of the solve, which takes twice as many operations.
+    """
+
+    def __init__(self, f: Callable[..., Any], equations: Callable[..., Any]):
+        super().__init__(f)
+        self.equations = equations
+
+    def _solved(self, key: CacheKey, x: Any) -> Solved | None:
+        args = jax.tree.unflatten(key.structure, specs_of(key.types))
+        if (version_of(*args), settings()) != (key.version, key.settings):
+            return None  # other equations than those that were solved
+        f, unflatten = trace_with_snapshot(self.equations), functools.partial(jax.tree.unflatten, key.structure)
+        at = lambda *leaves: f(*map(tree_of, unflatten(leaves[:-2])), *leaves[-2:])  # noqa: E731
+        program, _ = _jaxpr_of(at, [*specs_of(key.types), *specs_of([x, x])])
+        return Solved.of(cse(program)) if is_fusable(program.jaxpr) else None
+
+
 class _CapturedTracerError(Exception):
     """The function reads a value of the trace that is under way, so that its program must not outlive that."""
 
@@ -335,7 +361,10 @@ class Program:
     linear; `moves`: which results of the program that it is a derivative of move. `structure`: of the results. `once`:
     whether it is called once. `is_reduced`: whether `cse` would find nothing in it. `values`: of one that gives values
     and then their tangents, the program of the values, and which of its inputs move. `axes_of`: of each output, the
-    inputs whose leading axes it has in a batch; None for all.
+    inputs whose leading axes it has in a batch; None for all. `solved(x)`: of one whose last result x, of this type,
+    solves equations, what these are; None where they are not known any more.
+
+    `source` is the program that is differentiated: in it what solves equations is still one equation.
     """
 
     def __init__(
@@ -351,13 +380,16 @@ class Program:
         is_reduced: bool = False,
         values: tuple[Program, tuple[bool, ...]] | None = None,
         axes_of: tuple[frozenset[int] | None, ...] = (),
+        solved: Callable[[Any], Solved | None] | None = None,
     ):
         self.label, self.loop_invariant, self.structure, self.once = label, loop_invariant, structure, once
         self.tangents, self.linear, self.moves = tangents, linear, moves
         self.values, self.is_forward = values, values is not None
-        self.program = program if is_reduced else cse(program)
+        self.source = program if is_reduced else cse(program, keeps_solutions=True)
+        self.program = cse(self.source) if any(map(is_solution, self.source.jaxpr.eqns)) else self.source
         self.evaluate = jaxpr_as_fun(self.program)
         self.in_avals, self.out_avals = self.program.in_avals, self.program.out_avals
+        self.is_solution, self._solved = solved is not None, solved
         self.axes_of = axes_of or (None,) * len(self.out_avals)
         self.is_fusable = is_fusable(self.program.jaxpr)
         self.reads = reads_of(self.program.jaxpr)
@@ -366,6 +398,12 @@ class Program:
         self.tangent, self.transposed = cached(self._tangent), cached(self._transposed)
         self.with_tangent = cached(self._with_tangent)
         self.batched, self.part, self.jitted = cached(self._batched), cached(self._part), cached(self._jitted)
+        if self.is_solution:
+            self.source = program_of(self, *specs_of(self.in_avals))
+
+    @functools.cached_property
+    def solved(self) -> Solved | None:
+        return self._solved and self._solved(self.out_avals[-1])
 
     def __call__(self, *leaves: Any) -> list[Any]:
         return _program_p.bind(*leaves, program=self, sizes=(), where=((),) * len(leaves))
@@ -388,7 +426,7 @@ class Program:
     def _derivative(self, moving: tuple[bool, ...], with_values: bool) -> Program:
         n, places = len(moving), [i for i, m in enumerate(moving) if m]
         along = {i: n + j for j, i in enumerate(places)}
-        program, moves = with_room(tangent_program, self.program, places, with_values)
+        program, moves = with_room(tangent_program, self.source, places, with_values)
         axes_of = [x and x | {along[i] for i in x if i in along} for x, m in zip(self.axes_of, moves, strict=True) if m]
         if with_values:
             axes_of = [*(frozenset(range(n)) if x is None else x for x in self.axes_of), *axes_of]

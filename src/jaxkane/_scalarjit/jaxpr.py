@@ -70,14 +70,15 @@ BY_LAPACK = "by_lapack"
 PROGRAM = "scalar_program"
 
 
-def cse(program: ClosedJaxpr) -> ClosedJaxpr:
+def cse(program: ClosedJaxpr, keeps_solutions: bool = False) -> ClosedJaxpr:
     """The same program with every common subexpression once, and without what no output needs; products of small
     matrices, which XLA would hand to a library, are sums of products.
 
     A description is read once for every speed, and much of it comes out the same. XLA would find that too, but only
-    after JAX has differentiated every copy.
+    after JAX has differentiated every copy. `keeps_solutions`: a program within it that solves equations remains one
+    equation, so that these are differentiated.
     """
-    once = _Once()
+    once = _Once(keeps_solutions)
     return once.program(program.jaxpr, program.jaxpr.invars, once.walk(program, program.jaxpr.invars))
 
 
@@ -85,7 +86,8 @@ class _Once:
     """Equations of programs in one list, each once. They are put down as they stand and not traced anew, which would
     take as long as all else that is done to a program."""
 
-    def __init__(self) -> None:
+    def __init__(self, keeps_solutions: bool = False) -> None:
+        self.keeps_solutions = keeps_solutions
         self.equations: list[Any] = []
         self.consts: dict[Any, Any] = {}  # by their variables
         self._known: dict[Any, Sequence[Any]] = {}  # the outputs of an equation, by its name
@@ -101,7 +103,7 @@ class _Once:
         return interpret(program, inputs, self.results, self.constant)
 
     def results(self, equation: Any, xs: list[Any]) -> Sequence[Any]:
-        inner = opened(equation)
+        inner = None if self.keeps_solutions and is_solution(equation) else opened(equation)
         if inner is not None:
             return self.walk(inner, xs)
         # Numbers by their bits, all else by identity.
@@ -149,6 +151,11 @@ def opened(equation: Any) -> ClosedJaxpr | None:
         program, sizes, where = (equation.params[k] for k in ("program", "sizes", "where"))
         return (program.batched(sizes, where) if sizes else program).program
     return equation.params["jaxpr"] if equation.primitive.name in CALLS else None
+
+
+def is_solution(equation: Any) -> bool:
+    """Whether an equation stands for a program whose last result solves linear equations."""
+    return equation.primitive.name == PROGRAM and not equation.params["sizes"] and equation.params["program"].is_solution
 
 
 def reads_of(program: Jaxpr) -> tuple[bool, ...]:
@@ -201,6 +208,28 @@ def program_of(f: Callable[..., Any], *specs: Any, return_shape: bool = False) -
     which is no operation of scalars."""
     with jax.sharding.use_abstract_mesh(jax.sharding.AbstractMesh((), ())):
         return jax.make_jaxpr(f, return_shape=return_shape)(*specs)
+
+
+class Solved(NamedTuple):
+    """What the last result x of a program solves, M x = b.
+
+    `equations`: (inputs, x) -> the other results and b - M x. `solve`: (inputs, r) -> the y of M y = r.
+    """
+
+    equations: ClosedJaxpr
+    solve: ClosedJaxpr
+
+    @classmethod
+    def of(cls, both: ClosedJaxpr) -> Solved:
+        """Of a program (inputs, x, r) -> the other results, b - M x and y."""
+        jaxpr, n = both.jaxpr, len(both.out_avals)
+        *inputs, x, r = jaxpr.invars
+
+        def part(outputs: Sequence[int], invars: Sequence[Any]) -> ClosedJaxpr:
+            kept, _ = dce_jaxpr(jaxpr, [i in outputs for i in range(n)], instantiate=True)
+            return ClosedJaxpr(kept.replace(invars=[*invars]), both.consts)
+
+        return cls(part(range(n - 1), [*inputs, x]), part([n - 1], [*inputs, r]))
 
 
 class _Rule(NamedTuple):
@@ -259,22 +288,36 @@ def tangent_program(
     With `values`, all outputs come before these.
 
     Equation by equation, by JAX's rule of each, traced once for all alike. To trace the whole takes four times as long.
+    Where a program solves M x = b, these equations are differentiated at x, and never the solution of the solve:
+
+        M dx = d(b - M x) at fixed x
     """
     jaxpr: Any = program.jaxpr
     once, tangents = _Once(), {jaxpr.invars[i]: new_variable(jaxpr.invars[i]) for i in moving}
+
+    constant = lambda v, x: (once.constant(v, x), None)  # noqa: E731
 
     def rule(equation: Any, pairs: list[Any]) -> Sequence[Any]:
         xs, dxs = [x for x, _ in pairs], [dx for _, dx in pairs if dx is not None]
         ys = once.results(equation, xs)
         if not dxs:
             return [(y, None) for y in ys]
+        solved = equation.params["program"].solved if is_solution(equation) else None
+        if solved is not None:
+            slopes = [dy for _, dy in interpret(solved.equations, [*pairs, (ys[-1], None)], rule, constant)]
+            if slopes[-1] is not None:
+                slopes[-1] = once.walk(solved.solve, [*xs, slopes[-1]])[0]
+            return [*zip(ys, slopes, strict=True)]
+        inner = opened(equation)
+        if inner is not None:
+            return interpret(inner, pairs, rule, constant)
         moves = tuple(dx is not None for _, dx in pairs)
         moved = [v for v, m in zip(equation.invars, moves, strict=True) if m]
         dys = _rule(_tangents, equation, moves, *equation.invars, *moved).written(once, [*xs, *dxs])
         return [*zip(ys, dys, strict=True)]
 
     inputs = [(v, tangents.get(v)) for v in jaxpr.invars]
-    pairs = interpret(program, inputs, rule, lambda v, x: (once.constant(v, x), None))
+    pairs = interpret(program, inputs, rule, constant)
     results = [*(y for y, _ in pairs if values), *(dy for _, dy in pairs if dy is not None)]
     return once.program(jaxpr, [*jaxpr.invars, *tangents.values()], results), tuple(dy is not None for _, dy in pairs)
 
