@@ -172,15 +172,16 @@ class Formulas:
             self.functions[function].evaluate(jax.tree.unflatten(self.structure, leaves), t, q, u, inputs, u_dep)
         )
 
-    def _program(self, function: str) -> ClosedJaxpr:
-        """A function as a program of JAX, in which no other is called."""
+    def _program(self, function: str, keeps_solutions: bool = False) -> ClosedJaxpr:
+        """A function as a program of JAX, in which no other is called; or only what solves equations, so that these are
+        differentiated."""
         if self.functions[function].needs_constraints and not self.system.dependent_speeds:
             raise ValueError(f"{self.name} has no dependent speeds, so that there is no {function!r}. Leave it out.")
         if self.functions[function].needs_states and not self.system.states:
             raise ValueError(f"{self.name} has no states of the first order, so that there is no {function!r}.")
         specs = [jax.ShapeDtypeStruct(a.shape, self.dtype) for a in self.arguments]
         with jax.enable_x64(self.dtype == "float64"):
-            return cse(jax.make_jaxpr(functools.partial(self.evaluate, function))(*specs))
+            return cse(jax.make_jaxpr(functools.partial(self.evaluate, function))(*specs), keeps_solutions)
 
     def _nodes(self, function: str) -> dict[str, np.ndarray]:
         """The outputs of a function by name, as nodes."""
@@ -202,7 +203,7 @@ class Formulas:
         """The derivatives (..., d) of a function's outputs by d numbers, as nodes."""
         try:
             with jax.enable_x64(self.dtype == "float64"):
-                outputs = jacobian(self.program(function), self.inputs, directions, self.graph)
+                outputs = jacobian(self.program(function, True), self.inputs, directions, self.graph)
         except NotScalarError as error:
             raise ValueError(self._refusal(function, error)) from None
         return dict(zip(self.functions[function].outputs, outputs, strict=True))

@@ -52,8 +52,8 @@ from .._scalarjit.components import (
     stack,
     total,
 )
-from .._scalarjit.elimination import ScalarSolve
-from .._scalarjit.function import LinearSolution, ScalarFunction
+from .._scalarjit.elimination import LinearSolution, ScalarSolve
+from .._scalarjit.function import ScalarFunction
 from .._system.kinematics import Frame
 from .._system.motion import Body, Load, Motion, flatten_loads, flatten_residuals
 from .._system.parameters import in_batches

@@ -26,7 +26,7 @@ from .backends import native
 from .backends.native import Scalars, Where
 from .backends.numpy import NumPyProgram
 from .backends.xla import as_one_function
-from .cache_key import Cache, CacheKey, explain_leaked_tracer, key_of, trace_with_snapshot, version_of, with_room
+from .cache_key import Cache, CacheKey, explain_leaked_tracer, key_of, trace_with_snapshot, with_room
 from .compat import (
     MISSING,
     ClosedJaxpr,
@@ -41,7 +41,6 @@ from .compat import (
     jaxpr_as_fun,
     new_primitive,
     no_tangent,
-    settings,
 )
 from .components import add, is_exact, mul, sub
 from .graph import OPERATORS, NotScalarError
@@ -176,6 +175,8 @@ class ScalarFunction:
     warning names the call and the type of the first argument.
     """
 
+    _solved: Callable[[CacheKey, Any], Solved | None] | None = None  # what the last result x solves, if anything
+
     def __init__(self, f: Callable[..., Any]):
         functools.update_wrapper(self, f)
         self.__wrapped__ = f
@@ -214,7 +215,7 @@ class ScalarFunction:
 
     def _traced(self, key: CacheKey, label: str) -> Program | None:
         f, unflatten = trace_with_snapshot(self.__wrapped__), functools.partial(jax.tree.unflatten, key.structure)
-        program, out = _jaxpr_of(lambda *leaves: f(*map(tree_of, unflatten(leaves))), specs_of(key.types))
+        program, out = jaxpr_of(lambda *leaves: f(*map(tree_of, unflatten(leaves))), specs_of(key.types))
         inside = list(unsupported_primitives(program.jaxpr))
         if any(where for _, where in inside):
             names = dict.fromkeys(name for name, where in inside if where)
@@ -226,7 +227,7 @@ class ScalarFunction:
                 "jnp.where and entries at places known beforehand can be part of it",
             )
         fixed = frozenset(range(key.structure.children()[0].num_leaves))
-        solved = functools.partial(self._solved, key) if isinstance(self, LinearSolution) else None
+        solved = self._solved and functools.partial(self._solved, key)
         structure = jax.tree.structure(out)
         return None if inside else Program(program, label, fixed, structure, once=self._once, solved=solved)
 
@@ -299,38 +300,17 @@ class ScalarFunction:
             leaves[:] = jax.tree.leaves([*parts.values()])
             return [x for x in leaves if not is_exact(x)]
 
-        program, _ = _jaxpr_of(results, [*specs_of(types), *[jax.ShapeDtypeStruct((), dtype)] * n])
+        program, _ = jaxpr_of(results, [*specs_of(types), *[jax.ShapeDtypeStruct((), dtype)] * n])
         structures = {part: jax.tree.structure(value) for part, value in parts.items()}
         kept = [x if is_exact(x) else None for x in leaves]  # no tracer
         return Replay(cse(program) if is_fusable(program.jaxpr) else program, structures, kept)
-
-
-class LinearSolution(ScalarFunction):
-    """A pure function at module level whose last result x solves equations that are linear in it, M x = b.
-
-    `equations(*args, x, r)` gives the other results, b - M x and the y of M y = r, at any x and r. These are
-    differentiated, never the solution of the solve, which takes twice as many operations.
-    """
-
-    def __init__(self, f: Callable[..., Any], equations: Callable[..., Any]):
-        super().__init__(f)
-        self.equations = equations
-
-    def _solved(self, key: CacheKey, x: Any) -> Solved | None:
-        args = jax.tree.unflatten(key.structure, specs_of(key.types))
-        if (version_of(*args), settings()) != (key.version, key.settings):
-            return None  # other equations than those that were solved
-        f, unflatten = trace_with_snapshot(self.equations), functools.partial(jax.tree.unflatten, key.structure)
-        at = lambda *leaves: f(*map(tree_of, unflatten(leaves[:-2])), *leaves[-2:])  # noqa: E731
-        program, _ = _jaxpr_of(at, [*specs_of(key.types), *specs_of([x, x])])
-        return Solved.of(cse(program)) if is_fusable(program.jaxpr) else None
 
 
 class _CapturedTracerError(Exception):
     """The function reads a value of the trace that is under way, so that its program must not outlive that."""
 
 
-def _jaxpr_of(f: Callable[..., Any], specs: Sequence[Any]) -> tuple[ClosedJaxpr, Any]:
+def jaxpr_of(f: Callable[..., Any], specs: Sequence[Any]) -> tuple[ClosedJaxpr, Any]:
     program, out = program_of(f, *specs, return_shape=True)
     if any(isinstance(c, Tracer) for c in program.consts):
         raise _CapturedTracerError

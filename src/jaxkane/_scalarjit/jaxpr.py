@@ -155,7 +155,9 @@ def opened(equation: Any) -> ClosedJaxpr | None:
 
 def is_solution(equation: Any) -> bool:
     """Whether an equation stands for a program whose last result solves linear equations."""
-    return equation.primitive.name == PROGRAM and not equation.params["sizes"] and equation.params["program"].is_solution
+    return (
+        equation.primitive.name == PROGRAM and not equation.params["sizes"] and equation.params["program"].is_solution
+    )
 
 
 def reads_of(program: Jaxpr) -> tuple[bool, ...]:
