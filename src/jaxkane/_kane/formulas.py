@@ -173,8 +173,7 @@ class Formulas:
         )
 
     def _program(self, function: str, keeps_solutions: bool = False) -> ClosedJaxpr:
-        """A function as a program of JAX, in which no other is called; or only what solves equations, so that these are
-        differentiated."""
+        """A function as a program of JAX, in which no other is called. `keeps_solutions`: see `cse`."""
         if self.functions[function].needs_constraints and not self.system.dependent_speeds:
             raise ValueError(f"{self.name} has no dependent speeds, so that there is no {function!r}. Leave it out.")
         if self.functions[function].needs_states and not self.system.states:
@@ -203,7 +202,7 @@ class Formulas:
         """The derivatives (..., d) of a function's outputs by d numbers, as nodes."""
         try:
             with jax.enable_x64(self.dtype == "float64"):
-                outputs = jacobian(self.program(function, True), self.inputs, directions, self.graph)
+                outputs = jacobian(self.program(function, keeps_solutions=True), self.inputs, directions, self.graph)
         except NotScalarError as error:
             raise ValueError(self._refusal(function, error)) from None
         return dict(zip(self.functions[function].outputs, outputs, strict=True))

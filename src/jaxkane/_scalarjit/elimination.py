@@ -21,10 +21,10 @@ import jax
 import numpy as np
 
 from .backends.native import Scalars
-from .cache_key import CacheKey, trace_with_snapshot, version_of
+from .cache_key import CacheKey, version_of
 from .compat import ClosedJaxpr, settings, types_of
 from .components import rounding_of_pivots
-from .function import Program, ScalarFunction, jaxpr_of, tree_of
+from .function import Program, ScalarFunction, jaxpr_at
 from .graph import Graph, NotScalarError, graph_of
 from .jaxpr import Solved, cse, is_fusable, specs_of
 
@@ -47,12 +47,10 @@ class LinearSolution(ScalarFunction):
         self.equations = equations
 
     def _solved(self, key: CacheKey, x: Any) -> Solved | None:
-        unflatten = functools.partial(jax.tree.unflatten, key.structure)
-        if (version_of(*unflatten(specs_of(key.types))), settings()) != (key.version, key.settings):
-            return None  # other equations than those that were solved
-        f = trace_with_snapshot(self.equations)
-        at = lambda *leaves: f(*map(tree_of, unflatten(leaves[:-2])), *leaves[-2:])  # noqa: E731
-        program, _ = jaxpr_of(at, specs_of([*key.types, x, x]))
+        args = jax.tree.unflatten(key.structure, specs_of(key.types))
+        if (version_of(*args), settings()) != (key.version, key.settings):
+            return None  # what the code reads has changed: these are not the equations that were solved
+        program, _ = jaxpr_at(key, self.equations, x, x)
         return Solved.of(cse(program)) if is_fusable(program.jaxpr) else None
 
 
@@ -89,7 +87,6 @@ class _Solve(Program):
         self.in_avals, self.out_avals = form.in_avals, form.in_avals[-1:]
         self.evaluate, self.is_fusable, self.reads = by_lapack, False, (*form.reads[:-1], True)
         self.tangents, self.values, self.axes_of, self.once = frozenset[int](), None, (None,), False
-        self.is_solution = False
         self.batched, self.jitted = functools.cache(self._batched), functools.cache(self._jitted)
 
     def moved(self, moving: tuple[bool, ...]) -> tuple[bool, ...]:

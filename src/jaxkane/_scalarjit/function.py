@@ -214,8 +214,7 @@ class ScalarFunction:
             return numbers, None
 
     def _traced(self, key: CacheKey, label: str) -> Program | None:
-        f, unflatten = trace_with_snapshot(self.__wrapped__), functools.partial(jax.tree.unflatten, key.structure)
-        program, out = jaxpr_of(lambda *leaves: f(*map(tree_of, unflatten(leaves))), specs_of(key.types))
+        program, out = jaxpr_at(key, self.__wrapped__)
         inside = list(unsupported_primitives(program.jaxpr))
         if any(where for _, where in inside):
             names = dict.fromkeys(name for name, where in inside if where)
@@ -300,7 +299,7 @@ class ScalarFunction:
             leaves[:] = jax.tree.leaves([*parts.values()])
             return [x for x in leaves if not is_exact(x)]
 
-        program, _ = jaxpr_of(results, [*specs_of(types), *[jax.ShapeDtypeStruct((), dtype)] * n])
+        program, _ = _jaxpr_of(results, [*specs_of(types), *[jax.ShapeDtypeStruct((), dtype)] * n])
         structures = {part: jax.tree.structure(value) for part, value in parts.items()}
         kept = [x if is_exact(x) else None for x in leaves]  # no tracer
         return Replay(cse(program) if is_fusable(program.jaxpr) else program, structures, kept)
@@ -310,7 +309,14 @@ class _CapturedTracerError(Exception):
     """The function reads a value of the trace that is under way, so that its program must not outlive that."""
 
 
-def jaxpr_of(f: Callable[..., Any], specs: Sequence[Any]) -> tuple[ClosedJaxpr, Any]:
+def jaxpr_at(key: CacheKey, f: Callable[..., Any], *more: Any) -> tuple[ClosedJaxpr, Any]:
+    """`f` of the arguments that a key is of, and of arrays of the types `more`, as a program and what it returns."""
+    f, n = trace_with_snapshot(f), len(key.types)
+    at = lambda *xs: f(*map(tree_of, jax.tree.unflatten(key.structure, xs[:n])), *xs[n:])  # noqa: E731
+    return _jaxpr_of(at, specs_of([*key.types, *more]))
+
+
+def _jaxpr_of(f: Callable[..., Any], specs: Sequence[Any]) -> tuple[ClosedJaxpr, Any]:
     program, out = program_of(f, *specs, return_shape=True)
     if any(isinstance(c, Tracer) for c in program.consts):
         raise _CapturedTracerError
@@ -347,6 +353,8 @@ class Program:
     `source` is the program that is differentiated: in it what solves equations is still one equation.
     """
 
+    _solved: Callable[[Any], Solved | None] | None = None
+
     def __init__(
         self,
         program: ClosedJaxpr,
@@ -365,11 +373,12 @@ class Program:
         self.label, self.loop_invariant, self.structure, self.once = label, loop_invariant, structure, once
         self.tangents, self.linear, self.moves = tangents, linear, moves
         self.values, self.is_forward = values, values is not None
-        self.source = program if is_reduced else cse(program, keeps_solutions=True)
-        self.program = cse(self.source) if any(map(is_solution, self.source.jaxpr.eqns)) else self.source
+        self.source = self.program = program if is_reduced else cse(program, keeps_solutions=True)
+        if any(map(is_solution, self.source.jaxpr.eqns)):
+            self.program = cse(self.source)
         self.evaluate = jaxpr_as_fun(self.program)
         self.in_avals, self.out_avals = self.program.in_avals, self.program.out_avals
-        self.is_solution, self._solved = solved is not None, solved
+        self._solved = solved
         self.axes_of = axes_of or (None,) * len(self.out_avals)
         self.is_fusable = is_fusable(self.program.jaxpr)
         self.reads = reads_of(self.program.jaxpr)
@@ -380,6 +389,10 @@ class Program:
         self.batched, self.part, self.jitted = cached(self._batched), cached(self._part), cached(self._jitted)
         if self.is_solution:
             self.source = program_of(self, *specs_of(self.in_avals))
+
+    @property
+    def is_solution(self) -> bool:
+        return self._solved is not None
 
     @functools.cached_property
     def solved(self) -> Solved | None:
