@@ -47,6 +47,17 @@ def around_solution(a, z):
     return jnp.stack([others[0] * x[1], x[0] ** 2 + a])
 
 
+def around_batch_of(f):
+    def around(a, z):
+        _, x = jax.vmap(f, (0, None))(jnp.stack([a, 2.0 * a]), z)
+        return jnp.stack([x[0, 0] * x[1, 1], x[1, 0]])
+
+    return around
+
+
+around_batch = ScalarFunction(around_batch_of(solution))
+
+
 @ScalarFunction
 def around_doubled(a, z):
     return doubled(a, z)[1] * 3.0
@@ -80,7 +91,11 @@ TRANSFORMATIONS = {
 
 
 @pytest.mark.parametrize("name", TRANSFORMATIONS)
-@pytest.mark.parametrize(("f", "g"), [(solution, plain), (around_solution, around_plain)], ids=["alone", "in another"])
+@pytest.mark.parametrize(
+    ("f", "g"),
+    [(solution, plain), (around_solution, around_plain), (around_batch, around_batch_of(plain))],
+    ids=["alone", "in another", "a batch in another"],
+)
 def test_the_same_as_plain_jax(name, f, g, kernels):
     expected = TRANSFORMATIONS[name](g)(*ARGUMENTS)
     for found in (TRANSFORMATIONS[name](f)(*ARGUMENTS), jax.jit(TRANSFORMATIONS[name](f))(*ARGUMENTS)):

@@ -155,9 +155,8 @@ def opened(equation: Any) -> ClosedJaxpr | None:
 
 def is_solution(equation: Any) -> bool:
     """Whether an equation stands for a program whose last result solves linear equations."""
-    return (
-        equation.primitive.name == PROGRAM and not equation.params["sizes"] and equation.params["program"].is_solution
-    )
+    name, parameters = equation.primitive.name, equation.params
+    return name == PROGRAM and parameters["program"].is_solution and not parameters["sizes"]
 
 
 def reads_of(program: Jaxpr) -> tuple[bool, ...]:
