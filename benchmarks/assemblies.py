@@ -61,11 +61,10 @@ def states(bicycle: jk.System, n: int) -> jnp.ndarray:
 
 
 def operations(bicycle: jk.System, y: jnp.ndarray) -> int:
-    """Scalar operations of the right-hand side, as they are traced."""
-    inputs = dict.fromkeys(bicycle.inputs, jnp.zeros(()))
-    leaves, structure = jax.tree.flatten((bicycle, jnp.zeros(()), y, inputs))
-    plain = _vector_field.__wrapped__
-    return len(jax.make_jaxpr(lambda *x: plain(*jax.tree.unflatten(structure, x)))(*leaves).jaxpr.eqns)
+    """Scalar operations of the right-hand side, with every common subexpression once."""
+    _, program = _vector_field.program(bicycle, jnp.zeros(()), y, dict.fromkeys(bicycle.inputs, jnp.zeros(())))
+    assert program is not None
+    return len(program.program.jaxpr.eqns)
 
 
 def in_c(setting: Setting, bicycle: jk.System, y: jnp.ndarray) -> tuple[Callable[[], Any], int] | None:

@@ -10,7 +10,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from benchmarks import _peers, chain, first_calls
+from benchmarks import _peers, assemblies, chain, first_calls
 from benchmarks._figures import Figure, digits, line
 from benchmarks._picture import draw, times_faster
 from benchmarks._process import child
@@ -66,6 +66,13 @@ def test_engines_accelerate_the_chain_alike(peer):
     q, u = chain.states(CHAIN.n, 3)
     ours, theirs = (getattr(chain, f"accelerations_by_{who}")(CHAIN, q, u) for who in ("jaxkane", peer))
     np.testing.assert_allclose(ours, theirs, rtol=0.0, atol=rtol * np.abs(ours).max())
+
+
+def test_operations_of_a_bicycle_are_counted_where_one_program_calls_another():
+    every = assemblies.assemblies()
+    count = lambda name: assemblies.operations(every[name], assemblies.states(every[name], 1)[0])  # noqa: E731
+    whipple, full = count(assemblies.WHIPPLE), count(assemblies.FULL)
+    assert 1000 < whipple < full < 3 * whipple
 
 
 def test_files_for_engines_hold_the_same_chain():

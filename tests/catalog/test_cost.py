@@ -23,9 +23,7 @@ def test_the_programs_do_not_grow(name):
         jnp.array(entry.u),
         dict.fromkeys(system.inputs, jnp.array(0.0)),
     )
-    leaves, treedef = jax.tree.flatten(args)
-    plain = _motion_rates.__wrapped__
-    program = Program(jax.make_jaxpr(lambda *x: plain(*jax.tree.unflatten(treedef, x)))(*leaves))
+    leaves, program = _motion_rates.program(*args)
     size = lambda program: len(program.program.jaxpr.eqns)  # noqa: E731
     tangent = program.tangent((True,) * len(leaves))
     assert size(program) <= entry.operations
