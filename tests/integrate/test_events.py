@@ -1,6 +1,7 @@
 """The instant at which a motion ends: exact times, directions, derivatives, batches, and what does not end it."""
 
 import itertools
+import re
 
 import diffrax
 import equinox as eqx
@@ -304,6 +305,47 @@ def test_the_end_by_an_implicit_solver():
     ride = jk.simulate(Bead(), jk.State(TOP, jnp.ones(1)), TS, solver=diffrax.Kvaerno5())
     assert ride.reason == "low"
     np.testing.assert_allclose(ride.t_end, np.arccos(0.3), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"step": 0.13},
+        pytest.param({"solver": diffrax.Heun()}, marks=pytest.mark.slow),
+        pytest.param({"solver": diffrax.HalfSolver(diffrax.Bosh3())}, marks=pytest.mark.slow),
+        pytest.param({"solver": diffrax.Kvaerno5()}, marks=pytest.mark.slow),
+    ],
+    ids=["Tsit5", "fixed", "Heun", "HalfSolver", "Kvaerno5"],
+)
+def test_derivatives_of_the_end_by_every_solver(kernels, options):
+    """After some steps, and before any step: the rates there are those that the steps leave, or evaluated once more."""
+
+    def end(x):
+        ride = dropped(x[0], x[1], Particle(gravity=x[2]), adjoint="forward", **options)
+        return jnp.stack([ride.t_end, ride.end.q[0], ride.end.u[0]])
+
+    slope = jax.jit(jax.jacfwd(end))
+    for x in ([1.0, 0.3, 9.81], [0.0, -1.0, 9.81]):
+        np.testing.assert_allclose(end(jnp.array(x)), exact(*x), atol=1e-6)
+        expected = jax.jacfwd(lambda x: exact(*x))(jnp.array(x))
+        np.testing.assert_allclose(slope(jnp.array(x)), expected, atol=2e-5)
+
+
+class Stretched(Particle):
+    """On a spring, whose force is the only hyperbolic tangent of all programs."""
+
+    def loads(self, t, q, u, motion, inputs):
+        return [jk.Force(-jnp.tanh(q["h"]) * motion.N.y, motion.bodies[0].center)]
+
+
+def test_xla_compiles_the_accelerations_once(by_xla):
+    """The longest program of all; an event needs them at the end, where the last step leaves them."""
+    text = jax.jit(lambda h: dropped(h, 0.0, Stretched()).t_end).lower(1.0).as_text()
+    functions = re.split(r"\n  func\.func ", text)
+    names = [re.search(r"@([\w.]+)", f).group(1) for f in functions if "stablehlo.tanh" in f]
+    assert len(names) == 1
+    assert len(re.findall(rf"call @{names[0]}\(", text)) == 1
 
 
 @pytest.mark.slow

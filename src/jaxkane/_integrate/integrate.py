@@ -147,14 +147,15 @@ class InitialValueProblem(NamedTuple):
 
 class Ending(NamedTuple):
     """The `status`, as a float; the last time and packed state; whether these move `smooth`ly with what they come from;
-    whether the motion ended `by_event`, which is `near` the last time and state, or else the first."""
+    whether the motion ended `by_event`; and its last time, state and rates, `near` which the event is: those of the
+    start, with rates of zero, where there was none; no rates (None) where the steps leave none."""
 
     status: Array
     t_end: Array
     end: Array
     smooth: Array
     by_event: Array
-    near: tuple[Array, Array]
+    near: tuple[Array, Array, Array | None]
 
 
 class Solution(NamedTuple):
@@ -327,7 +328,9 @@ def _integrated(problem: InitialValueProblem) -> Solution:
     return Solution(
         motion=steps.motion,
         reached=(jnp.arange(len(problem.ts)) < steps.count) & problem.valid,
-        ending=_ending(times, progress.status, problem.valid, steps.t_end, steps.end, problem.start),
+        ending=_ending(
+            times, progress.status, problem.valid, steps.t_end, steps.end, constant(steps.rates), problem.start
+        ),
         stats={name: x.astype(int) for name, x in zip(("steps", "accepted", "rejected"), numbers, strict=True)},
     )
 
@@ -360,11 +363,14 @@ def _controller_of(problem: InitialValueProblem) -> StepSizeController:
 
 
 @ScalarFunction.once
-def _ending(times: Times, status: Array, valid: Array, t_last: Array, last: Array, start: Array) -> Ending:
+def _ending(
+    times: Times, status: Array, valid: Array, t_last: Array, last: Array, rates: Array | None, start: Array
+) -> Ending:
     status = jnp.where(valid, status, float(Status.INVALID))
     completed, by_event = status == Status.COMPLETED, status >= Status.EVENT
     t_end, end = jnp.where(completed, times.end, jnp.where(valid, t_last, times.start)), jnp.where(valid, last, start)
-    near = jnp.where(by_event, t_end, times.start), jnp.where(by_event, end, start)
+    rates = None if rates is None else jnp.where(by_event, rates, jnp.zeros_like(rates))
+    near = jnp.where(by_event, t_end, times.start), jnp.where(by_event, end, start), rates
     return Ending(status, t_end, end, completed, by_event, near)
 
 
@@ -383,10 +389,9 @@ def _located(problem: InitialValueProblem, ending: Ending) -> EventPoint:
     and leaves it out.
     """
     system, events = problem.args[0], problem.events
-    t, y = jax.lax.stop_gradient(ending.near[0]), ending.near[1]
-    if problem.are_native:
-        y_dot = constant(problem.rates(t, y, problem.args))  # by the program of the steps, also in forward mode
-    else:
+    t, y, y_dot = ending.near
+    t = constant(t)
+    if y_dot is None:
         y_dot = problem.rates(*constant((t, y, problem.args)))
 
     def stepped(point: EventPoint) -> EventPoint:

@@ -14,18 +14,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from .._scalarjit.nan import constant
 from .settings import with_scan_kind
 from .step_control import Progress, StepSizeController
 
 
 class Steps(NamedTuple):
     """The `motion` at the sample times (n_t, n), of which the first `count` were reached; the last time and packed
-    state; and the `progress` of the steps."""
+    state, and its rates, None where the solver leaves none; and the `progress` of the steps."""
 
     motion: Array
     count: Array
     t_end: Array
     end: Array
+    rates: Array | None
     progress: Progress
 
 
@@ -37,12 +39,14 @@ class _Samples(NamedTuple):
 
 
 class _Carry(NamedTuple):
-    """What the loop carries: the two ends of the next step, and the state at its start; whether it begins behind a
-    jump, None where there are no jumps; the `progress`, packed; and whether the motion goes on."""
+    """What the loop carries: the two ends of the next step, and the state at its start; the rates there, None where the
+    solver's stages do not tell them; whether the step begins behind a jump, None where there are no jumps; the
+    `progress`, packed; and whether the motion goes on."""
 
     t0: Array
     t1: Array
     y: Array
+    rates: Array | None
     solver_state: Any
     jumped: Array | None
     progress: Array
@@ -89,6 +93,7 @@ def take_steps(
         t0=start,
         t1=end,
         y=y0,
+        rates=jnp.zeros_like(y0) if _has_rates_at_ends(solver) else None,
         solver_state=solver.init(term, start, end, y0, args),
         jumped=jnp.array(False) if jumps else None,
         progress=progress,
@@ -105,6 +110,7 @@ def take_steps(
         failed = None if isinstance(solver, UnrolledERK) else result != diffrax.RESULTS.successful
         decision = control.following(carry.progress, carry.t0, carry.t1, carry.y, y, error, failed, args)
         chosen = lambda new, old: jax.tree.map(functools.partial(jnp.where, decision.keep), new, old)  # noqa: E731
+        k: Any = None if carry.rates is None else constant(dense["k"])
         interpolation = solver.interpolation_cls(t0=carry.t0, t1=carry.t1, **dense)
 
         def is_due(samples: _Samples) -> Array:
@@ -119,6 +125,7 @@ def take_steps(
             t0=decision.t0,
             t1=decision.t1,
             y=chosen(y, carry.y),
+            rates=None if carry.rates is None else chosen(k[-1], k[0]) / (carry.t1 - carry.t0),
             solver_state=chosen(solver_state, carry.solver_state),
             jumped=None if carry.jumped is None else chosen(decision.jumped, carry.jumped),
             progress=decision.progress,
@@ -137,7 +144,7 @@ def take_steps(
     )
     meter.close(last.meter)
     motion, count = last.samples
-    return Steps(motion, count, last.t0, last.y, Progress.unpacked(last.progress))
+    return Steps(motion, count, last.t0, last.y, last.rates, Progress.unpacked(last.progress))
 
 
 def _loop(
@@ -147,6 +154,15 @@ def _loop(
     more: dict[str, Any] = {} if kind == "lax" else {"max_steps": max_steps}
     more |= {"checkpoints": checkpoints} if kind == "checkpointed" else {}
     return eqxi.while_loop(condition, body, carry, buffers=buffers, kind=kind, **more)
+
+
+def _has_rates_at_ends(solver: Any) -> bool:
+    """Whether the first and the last of the stages k_i = h f_i of a step belong to its start and its end."""
+    method = solver.method if isinstance(solver, UnrolledERK) else solver
+    if not isinstance(method, diffrax.AbstractERK) or isinstance(method, diffrax.HalfSolver):
+        return False
+    tableau: Any = method.tableau
+    return tableau.fsal
 
 
 class UnrolledERK(diffrax.AbstractAdaptiveSolver[Any]):
