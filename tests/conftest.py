@@ -8,7 +8,7 @@ How to run them:
                                   own cache, and thrown away where they have become many
     JAXKANE_TEST_CACHE=FOLDER     keeps them elsewhere
     JAXKANE_TEST_CACHE=0          keeps none, and leaves XLA as a user has it
-    pytest -m ""                  the slow ones too, and with XLA's optimizations
+    pytest -m ""                  the slow ones too
     JAXKANE_VALIDATION=docs/validation.md pytest -m published    writes the table of published figures
 """
 
@@ -48,8 +48,10 @@ def pytest_configure(config):
         os.environ[CACHE] = str(_folder_of_programs(config))
     kept = os.environ[CACHE]
     jk.configure(cache=False if kept == "0" else kept, verbose=False)
-    if kept != "0" and config.option.markexpr == "not slow":
-        # What runs for milliseconds need not be optimized for seconds; native kernels are written as ever.
+    if kept != "0":
+        # What runs for milliseconds need not be optimized for seconds; native kernels are written as ever. The variable
+        # is for the processes that tests start.
+        os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
         jax.config.update("jax_disable_most_optimizations", True)
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -114,6 +116,22 @@ def pytest_terminal_summary(terminalreporter, config):
 
 
 MARK, END = "<!-- begin: written by `JAXKANE_VALIDATION=docs/validation.md pytest -m published` -->", "\n<!-- end -->"
+
+
+@pytest.fixture(autouse=True)
+def _optimized(request):
+    """The programs of tests that are marked so are those that a user has."""
+    marked = request.node.get_closest_marker("optimized") is not None and os.environ[CACHE] != "0"
+    if marked:
+        _leave_out_optimizations(False)
+    yield
+    if marked:
+        _leave_out_optimizations(True)
+
+
+def _leave_out_optimizations(most):
+    jax.clear_caches()
+    jax.config.update("jax_disable_most_optimizations", most)
 
 
 @pytest.fixture(autouse=True, scope="module")

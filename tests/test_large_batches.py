@@ -31,6 +31,7 @@ def test_products_of_matrices_by_jax_itself():
 
 
 @pytest.mark.slow
+@pytest.mark.optimized
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_equations_of_many_states(name, kernels):
     """Scalar programs, and above twelve speeds products of matrices."""
@@ -47,6 +48,7 @@ def test_equations_of_many_states(name, kernels):
 
 
 @pytest.mark.slow
+@pytest.mark.optimized
 def test_reduced_members_of_a_sweep():
     """`reduce` is code of the user, which may multiply matrices."""
     system, turn = SYSTEMS["double pendulum"], jnp.array([[0.0, 1.0], [-1.0, 0.5]])
@@ -60,6 +62,7 @@ def test_reduced_members_of_a_sweep():
 
 
 @pytest.mark.slow
+@pytest.mark.optimized
 def test_elimination_in_many_windows():
     n_z, n_b, n_x = 2, 1, 3
     k = n_z + n_b + n_x + 1

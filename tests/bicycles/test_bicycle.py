@@ -50,6 +50,7 @@ def test_states_that_three_independent_programs_agree_on(i):
         np.testing.assert_allclose(x, y, rtol=0, atol=rtol * np.abs(y).max())
 
 
+@pytest.mark.optimized
 @pytest.mark.published
 def test_the_published_nonlinear_state_of_basu_mandal(published):
     """Table 1, in the book's coordinates."""

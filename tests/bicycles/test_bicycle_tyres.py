@@ -93,6 +93,7 @@ class RoundedLoad(Part):
 
 
 @pytest.mark.slow
+@pytest.mark.optimized
 @pytest.mark.published
 def test_sharps_motorcycle_has_the_eigenvalues_of_his_table(published):
     """40 of 40 to the printed digits, with the load of the front wheel that he rounds to 226 lb."""

@@ -285,6 +285,7 @@ def random_example(name, rng):
     return system, rng.uniform(0.0, 5.0), q, u, inputs
 
 
+@pytest.mark.optimized
 @pytest.mark.published
 @pytest.mark.parametrize("seed", range(4))
 @pytest.mark.parametrize("name", PRINTED)

@@ -25,6 +25,7 @@ def test_accelerations_of_all_speeds_agree_with_sympy(name):
         np.testing.assert_allclose(np.concatenate([u_dot, u_dep_dot]), expected, rtol=RTOL)
 
 
+@pytest.mark.optimized
 @pytest.mark.published
 def test_four_bar_linkage_at_the_state_printed_in_sympys_test(published):
     printed = FIGURES["four_bar_linkage"]["published_in_test"]

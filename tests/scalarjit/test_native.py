@@ -168,6 +168,7 @@ def close(a, b):
 
 
 @pytest.mark.slow
+@pytest.mark.optimized
 @pytest.mark.usefixtures("native")
 def test_the_bicycle_and_its_derivatives_as_by_xla(bicycle):
     def many(system, t, q, u, inputs):

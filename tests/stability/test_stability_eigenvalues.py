@@ -54,6 +54,7 @@ def found():
     return eigenvalues(BIKE, jnp.linspace(0.0, 10.0, 101))
 
 
+@pytest.mark.optimized
 @pytest.mark.published
 def test_eigenvalues_of_the_benchmark_at_eleven_speeds(found, published):
     """Meijaard et al. (2007), Table 2."""
@@ -67,6 +68,7 @@ def test_eigenvalues_of_the_benchmark_at_eleven_speeds(found, published):
     published(MEIJAARD, "eigenvalues of the bicycle from 0 to 10 m/s, Table 2 [1/s]", theirs, ours, 1e-11)
 
 
+@pytest.mark.optimized
 @pytest.mark.published
 def test_matrices_of_the_benchmark(published):
     found = jk.stability.canonical(BIKE)
@@ -149,6 +151,7 @@ def test_where_modes_coalesce_there_is_no_derivative():
 # -- critical speeds
 
 
+@pytest.mark.optimized
 @pytest.mark.published
 def test_weave_and_capsize_speeds(published):
     found = critical_speeds(BIKE)
