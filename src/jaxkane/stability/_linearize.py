@@ -21,7 +21,7 @@ from .._kane.constraints import SINGULAR_ROUNDING, configuration_residual
 from .._kane.equations import dependent_speeds, diagnosis
 from .._kane.rhs import has_outputs, output_names, outputs_at, rates, values_of
 from .._scalarjit.cache_key import jit
-from .._scalarjit.components import Component, as_vector, solve, stack
+from .._scalarjit.components import Component, solve, stack
 from .._scalarjit.function import ScalarFunction
 from .._scalarjit.nan import nan_where
 from .._system.parameters import parameters_in
@@ -246,7 +246,7 @@ def _tangents(system: System, t, q, model_names: _ModelNames):
     d = [names.index(k) for k in model_names.dependent]
     T = [[float(i == j and i not in d) for j in range(len(names))] for i in range(len(names))]
     if d:
-        _, along = jax.linearize(lambda q: as_vector(tuple(system.configuration_constraints(t, [*q])), q), q)
+        _, along = jax.linearize(lambda q: configuration_residual(system, t, q), q)
         G = [along(jnp.asarray(dq)) for dq in np.eye(len(names), dtype=q.dtype)]  # columns of dh/dq (h, n_q)
         free = [j for j in range(len(names)) if j not in d]
         moves = solve([[G[j][i] for j in d] for i in range(len(d))], *([-x for x in G[j]] for j in free))
