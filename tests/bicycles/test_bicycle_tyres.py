@@ -167,6 +167,16 @@ def test_linear_models_on_a_grade():
     np.testing.assert_allclose(here.A, linearize(slope, up, states=slope.lateral).A, rtol=1e-12, atol=1e-12)
 
 
+@pytest.mark.slow
+def test_a_linear_model_on_a_road_is_made_of_programs(native):
+    """LAPACK solves its constraints; written out, their derivatives would be eight thousand operations of XLA."""
+    bicycle = Bicycle.benchmark().with_parts(road=Road(lambda x, y: 0.1 * jnp.sin(x)))
+    start = jk.assemble(bicycle, {"roll": 0.05}, {"rear_wheel_rate": -5.0 / bicycle.rR})
+    options = {"states": bicycle.lateral, "outputs": (), "steady": False}
+    program = str(jax.make_jaxpr(lambda start: linearize(bicycle, start, **options).A)(start))
+    assert program.count(" = mul ") < 300
+
+
 def test_along_a_road_linear_models_say_what_to_ask():
     road = Bicycle.benchmark().with_parts(road=Road(lambda x, y: 0.1 * x))
     for ask in (straight_ahead, linearize_straight, eigenvalues):
