@@ -47,7 +47,7 @@ from .inputs import (
 from .settings import Settings, with_scan_kind, with_tolerances
 from .status import Status
 from .step_control import ClipToDiscontinuities, ControlSettings, StepSizeController, Times, evenly_spread, times_of
-from .steps import UnrolledERK, take_steps
+from .steps import UnrolledERK, is_explicit, take_steps
 from .trajectory import InputDiscontinuities, Trajectory
 
 
@@ -239,7 +239,7 @@ def one_step(
 
 def _solver_for(settings: Settings, rates_are_native: bool) -> Any:
     solver: Any = settings.solver
-    if isinstance(solver, diffrax.AbstractERK) and not isinstance(solver, diffrax.HalfSolver):  # which may seem one
+    if is_explicit(solver):
         return UnrolledERK(solver) if rates_are_native else solver
     return with_tolerances(solver, settings.rtol, settings.atol)
 

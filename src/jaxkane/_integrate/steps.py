@@ -110,7 +110,10 @@ def take_steps(
         failed = None if isinstance(solver, UnrolledERK) else result != diffrax.RESULTS.successful
         decision = control.following(carry.progress, carry.t0, carry.t1, carry.y, y, error, failed, args)
         chosen = lambda new, old: jax.tree.map(functools.partial(jnp.where, decision.keep), new, old)  # noqa: E731
-        k: Any = None if carry.rates is None else constant(dense["k"])
+        rates = None
+        if carry.rates is not None:
+            k: Any = constant(dense["k"])
+            rates = chosen(k[-1], k[0]) / (carry.t1 - carry.t0)
         interpolation = solver.interpolation_cls(t0=carry.t0, t1=carry.t1, **dense)
 
         def is_due(samples: _Samples) -> Array:
@@ -125,7 +128,7 @@ def take_steps(
             t0=decision.t0,
             t1=decision.t1,
             y=chosen(y, carry.y),
-            rates=None if carry.rates is None else chosen(k[-1], k[0]) / (carry.t1 - carry.t0),
+            rates=rates,
             solver_state=chosen(solver_state, carry.solver_state),
             jumped=None if carry.jumped is None else chosen(decision.jumped, carry.jumped),
             progress=decision.progress,
@@ -156,13 +159,16 @@ def _loop(
     return eqxi.while_loop(condition, body, carry, buffers=buffers, kind=kind, **more)
 
 
+def is_explicit(solver: Any) -> bool:
+    """Whether it is an explicit Runge-Kutta method of diffrax, which a `HalfSolver` only seems to be."""
+    return isinstance(solver, diffrax.AbstractERK) and not isinstance(solver, diffrax.HalfSolver)
+
+
 def _has_rates_at_ends(solver: Any) -> bool:
     """Whether the first and the last of the stages k_i = h f_i of a step belong to its start and its end."""
     method = solver.method if isinstance(solver, UnrolledERK) else solver
-    if not isinstance(method, diffrax.AbstractERK) or isinstance(method, diffrax.HalfSolver):
-        return False
-    tableau: Any = method.tableau
-    return tableau.fsal
+    tableau: Any = method.tableau if is_explicit(method) else None
+    return tableau is not None and tableau.fsal
 
 
 class UnrolledERK(diffrax.AbstractAdaptiveSolver[Any]):
