@@ -90,6 +90,59 @@ def test_a_long_program_in_pieces(name, by_xla, monkeypatch):
     )
 
 
+@pytest.mark.parametrize("name", TRANSFORMATIONS)
+def test_a_program_as_windows(name, by_xla, monkeypatch):
+    monkeypatch.setattr(xla, "_SHORT", 0)
+    found = jax.jit(TRANSFORMATIONS[name](ScalarFunction(plain)))(*ARGUMENTS)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14), found, by_plain_jax(name))
+
+
+def many(a, x, flag):
+    y, z, w = x
+    smooth = jnp.sin(a) + jnp.arctan2(y, z) * jnp.tanh(w) + jnp.cbrt(y) ** 3 - jnp.exp2(w) / jnp.log1p(z * z)
+    steps = jnp.where((y > w) & ~flag | (z != y), a, jnp.floor(z)) + jax.lax.rem(z, a) + jnp.sign(w) * jnp.round(y)
+    others = jnp.clip(w, -0.1, 0.1) + jnp.maximum(y, w) ** 2.5 + jax.scipy.special.erf(z) + a**3 + flag.astype(a.dtype)
+    return {"numbers": jnp.stack([smooth, steps, others]), "is_less": y < w, "given": x, "fixed": jnp.array([1.0, a])}
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_every_operation_as_windows(dtype, by_xla, monkeypatch):
+    monkeypatch.setattr(xla, "_SHORT", 0)
+    values = np.array([[0.3, -1.5, 2.5], [0.0, -0.0, np.inf], [np.nan, 1.0, -1.0], [0.5, 0.5, 1e30]])
+    x = jnp.asarray(values, dtype)
+    a, flag = jnp.array(0.7, dtype), jnp.array([True, False, False, True])
+    for f in (
+        lambda f: [f(a, y, is_set) for y, is_set in zip(x, flag, strict=True)],
+        lambda f: jax.vmap(f, (None, 0, 0))(a, x, flag),
+        lambda f: jax.vmap(lambda a: jax.vmap(f, (None, 0, 0))(a, x, flag))(jnp.stack([a, 2 * a])),
+    ):
+        found = jax.jit(lambda f=f: f(ScalarFunction(many)))()
+        jax.tree.map(
+            lambda x, y: np.testing.assert_allclose(x, y, rtol=20 * jnp.finfo(dtype).eps, strict=True), found, f(many)
+        )
+
+
+@pytest.mark.optimized
+def test_windows_are_not_cut(by_xla, monkeypatch):
+    """Else a division that is read more than once ends a kernel, and every kernel has sines of its own."""
+
+    def divided(a, x):
+        total, results = jnp.ones_like(a), []
+        for y in x:
+            total = (jnp.sin(a) * total + y) / (jnp.cos(a) + total * total)
+            results.append(total)
+        return tuple(results)
+
+    x = jnp.linspace(0.5, 1.5, 6)
+    sines = {}
+    for shortest in (0, 1000):
+        monkeypatch.setattr(xla, "_SHORT", shortest)
+        f = ScalarFunction(divided)
+        compiled = jax.jit(lambda a, f=f: f(a, x)).lower(0.5).compile().as_text()
+        sines[shortest] = compiled.count(" cosine(") + compiled.count(" sine(")
+    assert sines[0] == 2 < sines[1000]
+
+
 def test_repetition_goes():
     once = cse(jax.make_jaxpr(lambda x: jnp.sin(x) + jnp.sin(x) * jnp.cos(x) + 0.0 * jnp.tan(x))(1.0))
     names = [e.primitive.name for e in once.jaxpr.eqns]

@@ -71,22 +71,25 @@ def _first_crossing(g0: Array, slope0: Array, g1: Array, slope1: Array, directio
     # Which way it must go: without a direction, away from the side that it is on.
     side = jnp.where(g0 != 0, g0, jnp.where(values[1] != 0, values[1], jnp.where(values[2] != 0, values[2], g1)))
     way = jnp.where(direction == 0, -jnp.sign(side), direction)
-    left, right, before, after, any_passes = places[0], places[1], values[0], values[1], jnp.zeros((), bool)
+    left, right, before, any_passes = places[0], places[1], values[0], jnp.zeros((), bool)
     for i in reversed(range(3)):
         passes = (way * values[i] <= 0) & (way * values[i + 1] >= 0) & (values[i] != values[i + 1])
         passes &= (direction != 0) | (values[i] != 0)
         left, right = jnp.where(passes, places[i], left), jnp.where(passes, places[i + 1], right)
-        before, after = jnp.where(passes, values[i], before), jnp.where(passes, values[i + 1], after)
-        any_passes |= passes
+        before, any_passes = jnp.where(passes, values[i], before), any_passes | passes
 
-    # Newton's method inside the bracket; the step that follows is measured anew, so a few digits are enough.
-    x = left + (right - left) * _ratio(before, before - after)
+    # Newton's method, on the side of the inflection on which the root is: from where the cubic bends away from zero it
+    # passes over no root. The step that follows is measured anew, so a few digits are enough.
+    inflection = jnp.clip(_ratio(-b, 3 * a), left, right)
+    is_behind = way * p(inflection) < 0
+    left, right = jnp.where(is_behind, inflection, left), jnp.where(is_behind, right, inflection)
+    x = jnp.where((before == 0) | (way * (3 * a * (left + right) + 2 * b) < 0), left, right)
     for _ in range(6):
-        value = p(x)
-        left, right = jnp.where(way * value <= 0, x, left), jnp.where(way * value > 0, x, right)
-        newton = x - _ratio(value, p_dot(x))
-        x = jnp.where((newton >= left) & (newton <= right), newton, 0.5 * (left + right))
-    return jnp.where(any_passes, x, jnp.inf)
+        slope = p_dot(x)
+        stays = slope == 0
+        x = jnp.where(stays, x, x * x * (2 * a * x + b) - g0) / jnp.where(stays, 1.0, slope)
+    # XLA computes anew, in each of its kernels, what comes after the last division.
+    return jnp.where(any_passes, jnp.clip(x, 0.0, 1.0), 1.0) / jnp.where(any_passes, 1.0, 0.0)
 
 
 def _extrema(a: Array, b: Array, c: Array) -> tuple[Array, Array]:

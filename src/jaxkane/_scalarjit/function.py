@@ -25,7 +25,7 @@ import numpy as np
 from .backends import native
 from .backends.native import Scalars, Where
 from .backends.numpy import NumPyProgram
-from .backends.xla import as_one_function
+from .backends.xla import Windows, as_one_function, pays_as_windows
 from .cache_key import Cache, CacheKey, explain_leaked_tracer, key_of, trace_with_snapshot, with_room
 from .compat import (
     MISSING,
@@ -425,6 +425,19 @@ class Program:
             self._tell_not_scalar(error)
             return None
 
+    def as_window(self, sizes: tuple[int, ...], where: Where) -> Windows | None:
+        """The program for XLA without cuts, where it can be and where that pays: not where XLA is to share between
+        tangents what their batch has in common."""
+        is_whole = self.is_fusable and all(map(all, self.out_where(where))) and not (sizes and self.tangents)
+        return self.windows if is_whole and pays_as_windows(self.program, sizes) else None
+
+    @functools.cached_property
+    def windows(self) -> Windows | None:
+        try:
+            return Windows(self.program)
+        except NotScalarError:
+            return None
+
     def groups(self, where: Where) -> tuple[tuple[int, ...], ...]:
         """The arguments as a native kernel takes them: many numbers of the same lanes are one array, since each
         argument takes XLA as long as some forty operations of a kernel; unless a loop had to make the array in each of
@@ -568,6 +581,9 @@ def _inlined(*args, program, sizes, where):
 
 
 def _by_xla(*args, program, sizes, where):
+    windows = program.as_window(sizes, where)
+    if windows:
+        return windows(args, sizes, where)
     if math.prod(sizes) > _MOST_LANES and sizes[0] > 1:
         return _in_chunks(args, program, sizes, where)
     program = program.batched(sizes, where) if sizes else program

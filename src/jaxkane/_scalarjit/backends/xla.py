@@ -1,23 +1,96 @@
-"""A program as one function of XLA:CPU, by its small call; a very long one outlined into a few.
+"""A program as one function of XLA:CPU.
 
-XLA cuts a program of scalars into many kernels and computes shared intermediates again in each. A call that carries the
-frontend attribute `xla_cpu_small_call` is compiled as one function, in which LLVM sees every intermediate once.
+XLA cuts a program of scalars into many kernels, and computes again in each what several divisions read: two thousand
+operations become eight thousand. What combines the elements of a window it does not cut: a program may combine windows
+of one element each, the members of a batch (`Windows`). Else it is a small call (`as_one_function`): a call that
+carries the frontend attribute `xla_cpu_small_call` is compiled as one function. Measured on the nonlinear bicycle
+(jax 0.12), as small calls and as windows: compilation 0.43 and 0.26 s; 0.35 and 0.22 us an evaluation, and 0.72 and
+0.22 us in a batch of 128.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 
 from ..compat import ClosedJaxpr, Jaxpr, evaluated, interpret, is_literal, jaxpr_as_fun, one_function
+from ..graph import ARITHMETIC, COMPARISONS, DTYPES, LIBRARY, LOGIC, SIMPLE, NotScalarError, graph_of, needed
 from ..jaxpr import replaced
+
+_FUNCTIONS: dict[str, Callable[..., Any]] = {
+    **{name: getattr(jax.lax, name) for name in ARITHMETIC | COMPARISONS | LIBRARY | SIMPLE | {"neg", "select"}},
+    **{name: getattr(jax.lax, f"bitwise_{name}") for name in LOGIC},
+}
+
+
+class Windows:
+    """A program of scalars, each combination of elements of which is an evaluation. Raises `NotScalarError` for any
+    other."""
+
+    def __init__(self, program: ClosedJaxpr):
+        graph, self.outputs = graph_of(program)
+        if not all(array.size for array in self.outputs):
+            raise NotScalarError("an empty result")
+        self.nodes, self.kept = graph.nodes, needed(graph.nodes, self.outputs)
+        self.constants = {k: graph.value(k) for k in self.kept if graph.nodes[k].operation == "constant"}
+        inputs = [k for k in self.kept if self.nodes[k].operation == "input"]
+        results = [*dict.fromkeys(int(k) for array in self.outputs for k in array.flat)]
+        # Input, result and type of each element: a combination has the types of what it combines.
+        self.elements: list[tuple[int | None, int | None, str]] = []
+        for dtype in DTYPES:
+            each = ([k for k in nodes if self.nodes[k].dtype == dtype] for nodes in (inputs, results))
+            self.elements += [(*pair, dtype) for pair in itertools.zip_longest(*each)]
+
+    def __call__(self, args: Sequence[Any], sizes: tuple[int, ...], where: Sequence[Sequence[bool]]) -> list[Any]:
+        """The results over a batch with leading axes `sizes`, of which argument i has those in `where[i]`."""
+        shape, rows = sizes or (1,), []
+        for x, has in zip(jax.lax.optimization_barrier([*args]), where, strict=True):  # which hides constants
+            own = x.shape[sum(has) :]
+            x = x.reshape(*(n if is_there else 1 for n, is_there in zip(sizes, has, strict=True)), *own)
+            rows.append(jnp.broadcast_to(x, (*sizes, *own)).reshape(*shape, math.prod(own)))
+        elements = [self._element(rows, shape, k, dtype) for k, _, dtype in self.elements]
+        starts, ones = tuple(np.zeros((), dtype)[()] for *_, dtype in self.elements), (1,) * len(shape)
+        combined = jax.lax.reduce_window(tuple(elements), starts, self._combined, ones, ones, "VALID")
+        found = {k: x for (_, k, _), x in zip(self.elements, combined, strict=True)}
+        stacked = [jnp.stack([found[int(k)] for k in array.flat], axis=-1) for array in self.outputs]
+        return [x.reshape(*sizes, *array.shape) for x, array in zip(stacked, self.outputs, strict=True)]
+
+    def _element(self, rows: Sequence[Any], shape: tuple[int, ...], node: int | None, dtype: str) -> Any:
+        if node is None:
+            return jnp.zeros(shape, dtype)
+        argument, element, _ = self.nodes[node].operands
+        return rows[argument][..., element]
+
+    def _combined(self, _: Any, elements: Sequence[Any]) -> tuple[Any, ...]:
+        values = {k: x for (k, *_), x in zip(self.elements, elements, strict=True)}
+        for k in self.kept:
+            operation, operands, dtype = self.nodes[k]
+            if operation == "constant":
+                values[k] = np.asarray(self.constants[k], dtype)
+            elif operation == "convert":
+                values[k] = jax.lax.convert_element_type(values[operands[0]], dtype)
+            elif operation != "input":
+                values[k] = _FUNCTIONS[operation](*(values[i] for i in operands))
+        return tuple(jnp.zeros((), dtype) if k is None else jnp.asarray(values[k]) for _, k, dtype in self.elements)
+
+
+def pays_as_windows(program: ClosedJaxpr, sizes: tuple[int, ...]) -> bool:
+    """Whether windows are the faster way. Each number is an array of its own then: without a batch, that costs a short
+    program more than the cuts do."""
+    return (0 if sizes else _SHORT) <= len(program.jaxpr.eqns) <= _WHOLE_UP_TO and 0 not in sizes
+
 
 # XLA's time to compile a function grows faster than its length, above all where values of the beginning are needed at
 # the end, as in a reverse derivative: 6000 equations take 17 s whole, and 2.5 s in pieces.
 _WHOLE_UP_TO = 2500
 _PIECE = 250
+_SHORT = 1000
 
 
 def as_one_function(program: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
