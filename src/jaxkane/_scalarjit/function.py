@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import copy
 import functools
-import math
 import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -25,7 +24,7 @@ import numpy as np
 from .backends import native
 from .backends.native import Scalars, Where
 from .backends.numpy import NumPyProgram
-from .backends.xla import Windows, as_one_function, pays_as_windows
+from .backends.xla import Windows, as_one_function, chunks_of, one_chunk_at_a_time, pays_as_windows
 from .cache_key import Cache, CacheKey, explain_leaked_tracer, key_of, trace_with_snapshot, with_room
 from .compat import (
     MISSING,
@@ -59,7 +58,6 @@ from .jaxpr import (
 )
 
 _FEW = 8  # numbers, that take XLA as long by themselves as to make an array of them
-_MOST_LANES = 128  # in XLA's hands: with more, intermediates no longer stay in the cache
 
 
 class Packed(eqx.Module):
@@ -425,14 +423,9 @@ class Program:
             self._tell_not_scalar(error)
             return None
 
-    def as_window(self, sizes: tuple[int, ...], where: Where) -> Windows | None:
-        """The program for XLA without cuts, where it can be and where that pays: not where XLA is to share between
-        tangents what their batch has in common."""
-        is_whole = self.is_fusable and all(map(all, self.out_where(where))) and not (sizes and self.tangents)
-        return self.windows if is_whole and pays_as_windows(self.program, sizes) else None
-
     @functools.cached_property
     def windows(self) -> Windows | None:
+        """The program as what combines windows, where it can be written so."""
         try:
             return Windows(self.program)
         except NotScalarError:
@@ -581,32 +574,19 @@ def _inlined(*args, program, sizes, where):
 
 
 def _by_xla(*args, program, sizes, where):
-    windows = program.as_window(sizes, where)
-    if windows:
-        return windows(args, sizes, where)
-    if math.prod(sizes) > _MOST_LANES and sizes[0] > 1:
-        return _in_chunks(args, program, sizes, where)
+    out_where = program.out_where(where)
+    if in_chunks := chunks_of(sizes):
+        bind = functools.partial(_program_p.bind, program=program, sizes=in_chunks, where=where)
+        outputs = _abstract(program=program, sizes=sizes, where=where)
+        return one_chunk_at_a_time(bind, args, outputs, in_chunks[0], [w[0] for w in where], [w[0] for w in out_where])
+    # Tangents share what their batch has in common, and windows share nothing.
+    shares = (sizes and program.tangents) or not all(map(all, out_where))
+    if program.is_fusable and not shares and pays_as_windows(program.program, sizes) and program.windows:
+        return program.windows(args, sizes, where)
     program = program.batched(sizes, where) if sizes else program
     if not program.is_fusable or 0 in sizes:
         return program.evaluate(*args)
     return as_one_function(program.program, args)
-
-
-def _in_chunks(args, program, sizes, where):
-    """A large batch, some of its first axis at a time; the last chunk begins earlier, so that all are alike."""
-    n, inner = sizes[0], sizes[1:]
-    size = max(1, min(n, _MOST_LANES // math.prod(inner)))
-    bind = functools.partial(_program_p.bind, program=program, sizes=(size, *inner), where=where)
-
-    def chunk(i, outputs):
-        start = jnp.minimum(i * size, n - size)
-        part = [jax.lax.dynamic_slice_in_dim(x, start, size) if w[0] else x for x, w in zip(args, where, strict=True)]
-        put = functools.partial(jax.lax.dynamic_update_slice_in_dim, start_index=start, axis=0)
-        each = zip(outputs, bind(*part), program.out_where(where), strict=True)
-        return [put(whole, piece) if has[0] else piece for whole, piece, has in each]
-
-    empty = [jnp.zeros(a.shape, a.dtype) for a in _abstract(program=program, sizes=sizes, where=where)]
-    return jax.lax.fori_loop(0, -(-n // size), chunk, empty)
 
 
 def _by_kernel(*args, program, sizes, where, target):

@@ -10,6 +10,7 @@ carries the frontend attribute `xla_cpu_small_call` is compiled as one function.
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Callable, Sequence
@@ -29,6 +30,14 @@ _FUNCTIONS: dict[str, Callable[..., Any]] = {
 }
 
 
+# XLA's time to compile a function grows faster than its length, above all where values of the beginning are needed at
+# the end, as in a reverse derivative: 6000 equations take 17 s whole, and 2.5 s in pieces.
+_WHOLE_UP_TO = 2500
+_PIECE = 250
+_SHORT = 1000  # each number is an array, which costs a shorter program more than the cuts, unless it has a batch
+_MOST_LANES = 128  # with more, intermediates no longer stay in the cache
+
+
 class Windows:
     """A program of scalars, each combination of elements of which is an evaluation. Raises `NotScalarError` for any
     other."""
@@ -44,8 +53,8 @@ class Windows:
         # Input, result and type of each element: a combination has the types of what it combines.
         self.elements: list[tuple[int | None, int | None, str]] = []
         for dtype in DTYPES:
-            each = ([k for k in nodes if self.nodes[k].dtype == dtype] for nodes in (inputs, results))
-            self.elements += [(*pair, dtype) for pair in itertools.zip_longest(*each)]
+            of_type = ([k for k in nodes if self.nodes[k].dtype == dtype] for nodes in (inputs, results))
+            self.elements += [(k, result, dtype) for k, result in itertools.zip_longest(*of_type)]
 
     def __call__(self, args: Sequence[Any], sizes: tuple[int, ...], where: Sequence[Sequence[bool]]) -> list[Any]:
         """The results over a batch with leading axes `sizes`, of which argument i has those in `where[i]`."""
@@ -81,16 +90,39 @@ class Windows:
 
 
 def pays_as_windows(program: ClosedJaxpr, sizes: tuple[int, ...]) -> bool:
-    """Whether windows are the faster way. Each number is an array of its own then: without a batch, that costs a short
-    program more than the cuts do."""
+    """Whether windows are the faster way."""
     return (0 if sizes else _SHORT) <= len(program.jaxpr.eqns) <= _WHOLE_UP_TO and 0 not in sizes
 
 
-# XLA's time to compile a function grows faster than its length, above all where values of the beginning are needed at
-# the end, as in a reverse derivative: 6000 equations take 17 s whole, and 2.5 s in pieces.
-_WHOLE_UP_TO = 2500
-_PIECE = 250
-_SHORT = 1000
+def chunks_of(sizes: tuple[int, ...]) -> tuple[int, ...]:
+    """The sizes of the chunks in which a large batch is evaluated, some of its first axis at a time; () for others."""
+    if math.prod(sizes) <= _MOST_LANES or sizes[0] == 1:
+        return ()
+    return (max(1, min(sizes[0], _MOST_LANES // math.prod(sizes[1:]))), *sizes[1:])
+
+
+def one_chunk_at_a_time(
+    f: Callable[..., list[Any]],
+    args: Sequence[Any],
+    outputs: Sequence[Any],
+    size: int,
+    in_batch: Sequence[bool],
+    out_in_batch: Sequence[bool],
+) -> list[Any]:
+    """`f` of a batch, in chunks of this size; the last one begins earlier, so that all are alike.
+
+    **Arguments:** the types of the `outputs`; which arguments and outputs have the axis of the batch.
+    """
+    n = next(x.shape[0] for x, is_in in zip(args, in_batch, strict=True) if is_in)
+
+    def chunk(i: Any, outputs: list[Any]) -> list[Any]:
+        start = jnp.minimum(i * size, n - size)
+        part = [jax.lax.dynamic_slice_in_dim(x, start, size) if b else x for x, b in zip(args, in_batch, strict=True)]
+        put = functools.partial(jax.lax.dynamic_update_slice_in_dim, start_index=start, axis=0)
+        each = zip(outputs, f(*part), out_in_batch, strict=True)
+        return [put(whole, piece) if is_in else piece for whole, piece, is_in in each]
+
+    return jax.lax.fori_loop(0, -(-n // size), chunk, [jnp.zeros(a.shape, a.dtype) for a in outputs])
 
 
 def as_one_function(program: ClosedJaxpr, args: Sequence[Any]) -> list[Any]:
