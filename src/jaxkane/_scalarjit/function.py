@@ -425,7 +425,7 @@ class Program:
 
     @functools.cached_property
     def windows(self) -> Windows | None:
-        """The program as what combines windows, where it can be written so."""
+        """The program as windows of XLA, where it can be written so."""
         try:
             return Windows(self.program)
         except NotScalarError:
