@@ -380,7 +380,9 @@ def test_the_first_crossing_of_cubics():
         crossings = [r for r, s in zip(roots, slopes) if 1e-9 < r <= 1 and way * s >= 0]
         if way and coefficients[3] == 0 and way * coefficients[2] > 0:
             crossings = [0.0]
-        np.testing.assert_allclose(x, crossings[0] if crossings else np.inf, atol=0.02)
+        first = crossings[0] if crossings else np.inf
+        np.testing.assert_allclose(x, first, atol=0.02)
+        assert (x == 0) == (first == 0)  # a motion ends where it starts only if it starts on its event
 
 
 @pytest.mark.slow

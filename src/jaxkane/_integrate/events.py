@@ -74,7 +74,6 @@ def _first_crossing(g0: Array, slope0: Array, g1: Array, slope1: Array, directio
     left, right, before, any_passes = places[0], places[1], values[0], jnp.zeros((), bool)
     for i in reversed(range(3)):
         passes = (way * values[i] <= 0) & (way * values[i + 1] >= 0) & (values[i] != values[i + 1])
-        passes &= (direction != 0) | (values[i] != 0)
         left, right = jnp.where(passes, places[i], left), jnp.where(passes, places[i + 1], right)
         before, any_passes = jnp.where(passes, values[i], before), any_passes | passes
 
