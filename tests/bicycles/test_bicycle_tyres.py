@@ -45,7 +45,8 @@ def slow_eigenvalues(bicycle):
 
 def test_camber_acts_as_so_much_slip():
     slip = LateralSlip(cornering_stiffness=2e4, camber_stiffness=900.0)
-    np.testing.assert_allclose(slip.force(0.02 + slip.equivalent(0.1), 800.0, 0.1), 2e4 * 0.02 + 900.0 * 0.1, rtol=1e-15)
+    force = slip.force(0.02 + slip.equivalent(0.1), 800.0, 0.1)
+    np.testing.assert_allclose(force, 2e4 * 0.02 + 900.0 * 0.1, rtol=1e-15)
     assert LateralSlip(cornering_stiffness=2e4).equivalent(0.1) == 0.0
 
 

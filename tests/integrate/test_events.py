@@ -366,10 +366,11 @@ def test_an_event_that_reads_no_speed_costs_no_accelerations():
 
 
 def test_the_first_crossing_of_cubics():
-    """Against the roots of random cubics, among them those that start on zero."""
+    """Against the roots of random cubics, among them those that start on zero, and those that come back at once."""
     rng = np.random.default_rng(0)
     p, direction = rng.normal(size=(300, 4)), rng.integers(-1, 2, size=300)
     p[::7, 3] = 0.0
+    p[:100:2] = [np.poly([x, x + 0.08, y]) for x, y in rng.uniform([0.1, 1.1], [0.9, 3.0], (50, 2))]
     ends = (p[:, 3], p[:, 2], p.sum(1), 3 * p[:, 0] + 2 * p[:, 1] + p[:, 2], direction.astype(float))
     of_one = lambda *x: first_crossing(*(y[None] for y in x))[0]  # noqa: E731
     found = np.asarray(jax.jit(jax.vmap(of_one))(*map(jnp.asarray, ends)))  # each of them is written out
