@@ -386,6 +386,17 @@ def test_the_first_crossing_of_cubics():
         assert (x == 0) == (first == 0)  # a motion ends where it starts only if it starts on its event
 
 
+def test_only_what_is_zero_at_the_start_passes_it_there():
+    """Values and slopes of any size make double roots, beside which rounding errors send Newton's method anywhere."""
+    rng = np.random.default_rng(0)
+    ends = rng.normal(size=(4, 20_000)) * 10.0 ** rng.uniform(-120, 120, size=(4, 20_000))
+    direction = rng.integers(-1, 2, size=20_000).astype(float)
+    of_one = lambda *x: first_crossing(*(y[None] for y in x))[0]  # noqa: E731
+    x = np.asarray(jax.jit(jax.vmap(of_one))(*map(jnp.asarray, (*ends, direction))))
+    assert np.all((x > 0) & ((x <= 1) | (x == np.inf)))
+    assert np.any(x <= 1)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("mode", ["forward", "reverse"])
 def test_derivatives_by_times_of_samples(mode):

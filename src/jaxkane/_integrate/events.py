@@ -85,10 +85,11 @@ def _first_crossing(g0: Array, slope0: Array, g1: Array, slope1: Array, directio
     x = jnp.where((before == 0) | (way * (3 * a * (left + right) + 2 * b) < 0), left, right)
     for _ in range(6):
         slope = p_dot(x)
-        stays = slope == 0
+        stays = (p(x) == 0) | (slope == 0)
         x = jnp.where(stays, x, x * x * (2 * a * x + b) - g0) / jnp.where(stays, 1.0, slope)
-    # XLA computes anew, in each of its kernels, what comes after the last division.
-    return jnp.where(any_passes, jnp.clip(x, 0.0, 1.0), 1.0) / jnp.where(any_passes, 1.0, 0.0)
+        x = jnp.clip(x, 0.0, 1.0)  # rounding errors beside a double root send it anywhere
+    # Infinity by a division: XLA computes in each of its kernels anew what comes after the last one.
+    return jnp.where(any_passes, jnp.clip(x, left, right), 1.0) / jnp.where(any_passes, 1.0, 0.0)
 
 
 def _extrema(a: Array, b: Array, c: Array) -> tuple[Array, Array]:

@@ -409,10 +409,7 @@ class Program:
     @functools.cached_property
     def numpy(self) -> NumPyProgram | None:
         """The program for NumPy, where it can be written so."""
-        try:
-            return NumPyProgram(self.program)
-        except NotScalarError:
-            return None
+        return _if_scalar(NumPyProgram, self.program)
 
     @functools.cached_property
     def scalars(self) -> Scalars | None:
@@ -426,10 +423,7 @@ class Program:
     @functools.cached_property
     def windows(self) -> Windows | None:
         """The program as windows of XLA, where it can be written so."""
-        try:
-            return Windows(self.program)
-        except NotScalarError:
-            return None
+        return _if_scalar(Windows, self.program)
 
     def groups(self, where: Where) -> tuple[tuple[int, ...], ...]:
         """The arguments as a native kernel takes them: many numbers of the same lanes are one array, since each
@@ -456,6 +450,13 @@ class Program:
 
     def _tell_not_scalar(self, error: NotScalarError) -> None:
         _tell(self.label, f"{error}", "native kernels do not know: XLA does its work, three to ten times slower")
+
+
+def _if_scalar(kind: Callable[[ClosedJaxpr], Any], program: ClosedJaxpr) -> Any:
+    try:
+        return kind(program)
+    except NotScalarError:
+        return None
 
 
 # A call stands for a batch over leading axes `sizes`; input i has those of them that `where[i]` says, the outputs those

@@ -44,17 +44,17 @@ class Windows:
     """A program of scalars as the function that combines windows. Raises `NotScalarError` for any other."""
 
     def __init__(self, program: ClosedJaxpr):
-        graph, self.outputs = graph_of(program)
+        self.graph, self.outputs = graph_of(program)
         if not all(array.size for array in self.outputs):
             raise NotScalarError("an empty result")
-        self.nodes, self.kept = graph.nodes, needed(graph.nodes, self.outputs)
-        self.constants = {k: graph.value(k) for k in self.kept if graph.nodes[k].operation == "constant"}
-        inputs = [k for k in self.kept if self.nodes[k].operation == "input"]
+        nodes = self.graph.nodes
+        self.order = needed(nodes, self.outputs)
+        inputs = [k for k in self.order if nodes[k].operation == "input"]
         results = [*dict.fromkeys(int(k) for array in self.outputs for k in array.flat)]
         # Input, result and type of each element: what is combined keeps its type.
         self.elements: list[tuple[int | None, int | None, str]] = []
         for dtype in DTYPES:
-            of_type = ([k for k in nodes if self.nodes[k].dtype == dtype] for nodes in (inputs, results))
+            of_type = ([k for k in group if nodes[k].dtype == dtype] for group in (inputs, results))
             self.elements += [(k, result, dtype) for k, result in itertools.zip_longest(*of_type)]
 
     def __call__(self, args: Sequence[Any], sizes: tuple[int, ...], where: Sequence[Sequence[bool]]) -> list[Any]:
@@ -67,22 +67,22 @@ class Windows:
         elements = [self._element(rows, shape, k, dtype) for k, _, dtype in self.elements]
         starts, ones = tuple(np.zeros((), dtype)[()] for *_, dtype in self.elements), (1,) * len(shape)
         combined = jax.lax.reduce_window(tuple(elements), starts, self._combined, ones, ones, "VALID")
-        found = {k: x for (_, k, _), x in zip(self.elements, combined, strict=True)}
-        stacked = [jnp.stack([found[int(k)] for k in array.flat], axis=-1) for array in self.outputs]
+        results = {k: x for (_, k, _), x in zip(self.elements, combined, strict=True)}
+        stacked = [jnp.stack([results[int(k)] for k in array.flat], axis=-1) for array in self.outputs]
         return [x.reshape(*sizes, *array.shape) for x, array in zip(stacked, self.outputs, strict=True)]
 
     def _element(self, rows: Sequence[Any], shape: tuple[int, ...], node: int | None, dtype: str) -> Any:
         if node is None:
             return jnp.zeros(shape, dtype)
-        argument, element, _ = self.nodes[node].operands
+        argument, element, _ = self.graph.nodes[node].operands
         return rows[argument][..., element]
 
     def _combined(self, _: Any, elements: Sequence[Any]) -> tuple[Any, ...]:
         values = {k: x for (k, *_), x in zip(self.elements, elements, strict=True)}
-        for k in self.kept:
-            operation, operands, dtype = self.nodes[k]
+        for k in self.order:
+            operation, operands, dtype = self.graph.nodes[k]
             if operation == "constant":
-                values[k] = np.asarray(self.constants[k], dtype)
+                values[k] = np.asarray(self.graph.value(k), dtype)
             elif operation == "convert":
                 values[k] = jax.lax.convert_element_type(values[operands[0]], dtype)
             elif operation != "input":
