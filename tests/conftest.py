@@ -12,12 +12,12 @@ How to run them:
     JAXKANE_VALIDATION=docs/validation.md pytest -m published    writes the table of published figures
 """
 
-import contextlib
 import gc
 import os
 import pathlib
 import shutil
 import tempfile
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -52,13 +52,23 @@ def pytest_configure(config):
         # What runs for milliseconds need not be optimized for seconds; native kernels are written as ever. The variable
         # is for the processes that tests start.
         os.environ["JAX_DISABLE_MOST_OPTIMIZATIONS"] = "1"
-        jax.config.update("jax_disable_most_optimizations", True)
+        _optimize(False)
     jax.config.update("jax_numpy_dtype_promotion", "strict")
     jax.config.update("jax_numpy_rank_promotion", "raise")
     touched.watch(config)
     # A trace makes a million small objects, most of which live on: to look through all of them again and again took a
     # tenth of the tests' time.
     gc.set_threshold(100_000, 50, 50)
+
+
+_is_optimized = True
+
+
+def _optimize(on):
+    global _is_optimized
+    jax.clear_caches()
+    jax.config.update("jax_disable_most_optimizations", not on)
+    _is_optimized = on
 
 
 def _folder_of_programs(config):
@@ -118,22 +128,6 @@ def pytest_terminal_summary(terminalreporter, config):
 MARK, END = "<!-- begin: written by `JAXKANE_VALIDATION=docs/validation.md pytest -m published` -->", "\n<!-- end -->"
 
 
-@pytest.fixture(autouse=True)
-def _optimized(request):
-    """The programs of tests that are marked so are those that a user has."""
-    marked = request.node.get_closest_marker("optimized") is not None and os.environ[CACHE] != "0"
-    if marked:
-        _leave_out_optimizations(False)
-    yield
-    if marked:
-        _leave_out_optimizations(True)
-
-
-def _leave_out_optimizations(most):
-    jax.clear_caches()
-    jax.config.update("jax_disable_most_optimizations", most)
-
-
 @pytest.fixture(autouse=True, scope="module")
 def _programs_are_forgotten():
     """Thousands of compiled programs would fill the memory of a small machine, of which half is left to others; and
@@ -153,30 +147,59 @@ def _mapped() -> float:
         return 0.0
 
 
-@contextlib.contextmanager
-def _switched(native):
-    if native and native_kernels.why_not():
+NATIVE = native_kernels.is_wanted()
+
+
+class Compilation(NamedTuple):
+    """How the programs of a test are compiled. Between two ways all programs are thrown away."""
+
+    native: bool
+    optimized: bool  # as a user has them
+
+    @classmethod
+    def of(cls, item):
+        return cls(
+            NATIVE if _kernels_of(item) is None else _kernels_of(item) == "native",
+            os.environ[CACHE] == "0" or item.get_closest_marker("optimized") is not None,
+        )
+
+
+def _kernels_of(item):
+    """"native" or "XLA" where a test asks for one of them."""
+    for fixture, kernels in (("native", "native"), ("by_xla", "XLA")):
+        if fixture in item.fixturenames:
+            return kernels
+    return item.callspec.params["kernels"] if "kernels" in item.fixturenames else None
+
+
+def pytest_collection_modifyitems(items):
+    """Tests of a file that are compiled in one way follow each other."""
+    files = {}
+    items.sort(key=lambda item: (files.setdefault(item.path, len(files)), Compilation.of(item)))
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item):
+    native, optimized = Compilation.of(item)
+    if _kernels_of(item) == "native" and native_kernels.why_not():
         pytest.skip(f"no native kernels: {native_kernels.why_not()}")
-    was = native_kernels.is_on()
-    native_kernels.use(native)
-    yield
-    native_kernels.use(was)
+    if native != native_kernels.is_wanted():
+        native_kernels.use(native)
+    if optimized != _is_optimized:
+        _optimize(optimized)
 
 
 @pytest.fixture(params=["native", "XLA"])
 def kernels(request):
     """A test once with native kernels, and once without."""
-    with _switched(request.param == "native"):
-        yield request.param
+    return request.param
 
 
 @pytest.fixture
 def native():
-    with _switched(True):
-        yield
+    """For tests of native kernels."""
 
 
 @pytest.fixture
 def by_xla():
-    with _switched(False):
-        yield
+    """For tests without native kernels."""
