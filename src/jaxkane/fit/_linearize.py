@@ -29,9 +29,9 @@ def starts_of(model: Model, windows: Windows, point: Unknowns) -> tuple[Array, A
 
     def start_of(arguments):
         window, z = arguments
-        start = lambda z, x: model.consistent(window, z, x)  # noqa: E731
-        by_z, by_x = jax.jacfwd(start, argnums=(0, 1))(z, point.x)
-        return start(z, point.x), jnp.concatenate([by_z, jnp.zeros((by_z.shape[0], n_b), by_z.dtype), by_x], axis=1)
+        both = lambda z, x: (model.consistent(window, z, x),) * 2  # noqa: E731
+        (by_z, by_x), start = jax.jacfwd(both, argnums=(0, 1), has_aux=True)(z, point.x)
+        return start, jnp.concatenate([by_z, jnp.zeros((by_z.shape[0], n_b), by_z.dtype), by_x], axis=1)
 
     return jax.lax.map(start_of, (windows, point.z))
 
