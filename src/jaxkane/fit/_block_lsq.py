@@ -18,10 +18,10 @@ from jaxtyping import Array, Float, Int
 
 
 class Blocks(eqx.Module):
-    """Linearized residuals: `R` (W, k, k) with k = n_z + n_next + n_b + n_x + 1, where n_next is n_z or, without
+    """Linearized residuals: `R` (W, m, k) with k = n_z + n_next + n_b + n_x + 1, where n_next is n_z or, without
     chains, 0; and the windows of every trial in their order (T, m), padded with W."""
 
-    R: Float[Array, "W k k"]
+    R: Float[Array, "W m k"]
     windows: Int[Array, "T m"]
     n_z: int = eqx.field(static=True)
     n_next: int = eqx.field(static=True)
@@ -30,6 +30,12 @@ class Blocks(eqx.Module):
     @property
     def n_x(self) -> int:
         return self.R.shape[-1] - self.n_z - self.n_next - self.n_b - 1
+
+    def of_x(self, places: Any) -> Blocks:
+        """Those of the x at `places` alone; the others stay where they are."""
+        first = self.n_z + self.n_next + self.n_b
+        columns = np.concatenate([np.arange(first), first + np.asarray(places), [self.R.shape[-1] - 1]])
+        return eqx.tree_at(lambda blocks: blocks.R, self, self.R[:, :, columns])
 
     @property
     def cost(self) -> Array:

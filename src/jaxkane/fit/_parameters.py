@@ -118,7 +118,23 @@ class Parameters(eqx.Module):
         """Those at `places`; all others keep their values at x."""
         at = jnp.asarray(places, dtype=jnp.int32)
         new = {name: getattr(self, name)[at] for name in ("start", "scale", "prior_mean", "prior_deviation", "places")}
-        return dataclasses.replace(self, **new, rest=self._all(x))
+        return dataclasses.replace(self, **new, rest=self.all(x))
+
+    @property
+    def spare(self) -> int:
+        """How many are not free."""
+        return self.rest.size - self.places.size
+
+    @property
+    def whole(self) -> Parameters:
+        """All of them, free, without priors: of every subset the same."""
+        n, zeros = self.rest.size, jnp.zeros_like(self.rest)
+        new = {"start": zeros, "scale": zeros, "prior_mean": zeros, "prior_deviation": jnp.full_like(zeros, jnp.inf)}
+        return dataclasses.replace(self, **new, places=jnp.arange(n, dtype=self.places.dtype), rest=zeros)
+
+    def all(self, x: Float[Array, " p"]) -> Float[Array, " all"]:
+        """The x of all of them."""
+        return self.rest.at[self.places].set(x)
 
     @property
     def entries(self) -> tuple[Entry, ...]:
@@ -160,14 +176,11 @@ class Parameters(eqx.Module):
 
     def log_determinant(self, x: Float[Array, " p"]) -> Array:
         """log |det d values / d x|: what a density over the values is multiplied by to be one over x."""
-        pairs = zip(self.bijections, self._parts(self._all(x)), strict=True)
+        pairs = zip(self.bijections, self._parts(self.all(x)), strict=True)
         return sum((jnp.linalg.slogdet(jax.jacfwd(f)(part))[1] for f, part in pairs), jnp.zeros((), x.dtype))
 
-    def _all(self, x: Float[Array, " p"]) -> Float[Array, " all"]:
-        return self.rest.at[self.places].set(x)
-
     def _all_values(self, x: Float[Array, " p"]) -> Float[Array, " all"]:
-        return jnp.concatenate([f(part) for f, part in zip(self.bijections, self._parts(self._all(x)), strict=True)])
+        return jnp.concatenate([f(part) for f, part in zip(self.bijections, self._parts(self.all(x)), strict=True)])
 
     def _parts(self, x: Any) -> list[Any]:
         split = np.split if isinstance(x, np.ndarray) else jnp.split

@@ -236,6 +236,9 @@ STEP_TOLERANCE = 0.05, 0.25
 """By how much halving the step of integration may move all residuals together, of a window and of all windows: it
 bounds the bias of an estimate in its standard errors."""
 
+MOST_SPARE_DERIVATIVES = 100_000
+"""Of samples by parameters that are not free: about a tenth of a second, where a program is compiled in three."""
+
 HALVINGS, STIFF_HALVINGS = 8, 5
 """Of a step between two samples, at most: what needs more is stiff or chaotic; and while the motion does not reach its
 end."""
@@ -403,8 +406,19 @@ class Problem:
         starts = self._starts(point)
         if starts is None:
             return None
-        blocks: Any = blocks_by_all_processes if self.specification.processes else blocks_of
-        return Linearization(*blocks(self.model, self.windows, self.by_trial, point, *starts))
+        evaluate: Any = blocks_by_all_processes if self.specification.processes else blocks_of
+        model, at = self._compiled(point)
+        blocks, prediction = evaluate(model, self.windows, self.by_trial, at, *starts)
+        return Linearization(blocks if at is point else blocks.of_x(self.parameters.places), prediction)
+
+    def _compiled(self, point: Unknowns) -> tuple[Model, Unknowns]:
+        """The model and the point of it whose program is run. Of a subset of parameters it is that of all of them, which
+        every subset runs, where to compile one for fewer takes longer than their derivatives."""
+        spare = self.parameters.spare
+        if not 0 < spare * self.windows.t.size <= MOST_SPARE_DERIVATIVES:
+            return self.model, point
+        whole = eqx.tree_at(lambda m: m.parameters, self.model, self.parameters.whole)
+        return whole, Unknowns(self.parameters.all(point.x), point.b, point.z)
 
     def cost(self, point: Unknowns) -> float:
         """Sum of squares, with process noise minus twice the log likelihood; NaN or infinite where a window could not
@@ -431,14 +445,16 @@ class Problem:
         return np.array(missing)
 
     def _starts(self, point: Unknowns) -> tuple[Array, Array] | None:
+        model, at = self._compiled(point)
         try:
-            return starts_of(self.model, self.windows, point)
+            return starts_of(model, self.windows, at)
         except eqx.EquinoxRuntimeError:  # Newton's linear solver raises on what is not finite
             return None
 
     def trajectories(self, point: Unknowns) -> list[Trajectory]:
         """The motion of every window, in the order of `slices`."""
-        rides = trajectories_of(self.model, self.windows, point, starts_of(self.model, self.windows, point)[0])
+        model, at = self._compiled(point)
+        rides = trajectories_of(model, self.windows, at, starts_of(model, self.windows, at)[0])
         return [
             jax.tree.map(lambda x, i=i, n=n: x[i, :n] if x.ndim > 1 else x[i], rides)
             for i, (_, _, n) in enumerate(self.slices)
