@@ -165,7 +165,7 @@ class Compilation(NamedTuple):
 
 
 def _kernels_of(item):
-    """"native" or "XLA" where a test asks for one of them."""
+    """Where a test asks for some: "native" or "XLA"."""
     for fixture, kernels in (("native", "native"), ("by_xla", "XLA")):
         if fixture in item.fixturenames:
             return kernels

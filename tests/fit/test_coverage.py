@@ -174,9 +174,9 @@ def rubbing(n, rng):
 
 @pytest.mark.slow
 def test_intervals_that_hold_where_friction_is_left_out():
-    """Of 100 sets of eight trials. The next run lies in the intervals by held-out scatter, and not in confidence
+    """Of 60 sets of eight trials. The next run lies in the intervals by held-out scatter, and not in confidence
     intervals. These are about what all runs have in common: the estimates from very many."""
-    rng, T, sets, sigma = np.random.default_rng(3), 8, 100, 0.003
+    rng, T, sets, sigma = np.random.default_rng(3), 8, 60, 0.003
 
     def fitted(n):
         push, x = rubbing(n, rng)

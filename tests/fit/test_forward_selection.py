@@ -19,13 +19,15 @@ from jaxkane.fit import (
     Offset,
     Simulation,
     Trial,
+    _problem,
     compare,
     cross_validate,
     fit,
     forward_selection,
     save_report,
 )
-from jaxkane.fit._candidates import compatible_groups
+from jaxkane.fit._candidates import AugmentedProblem, checked_candidates, compatible_groups
+from jaxkane.fit._linearize import blocks_of
 from jaxkane.fit._statistics import bic_change
 
 TS = np.linspace(0.0, 2.0, 41)
@@ -331,6 +333,26 @@ def test_fits_beside_each_other(rubbing, found):
         compare([rubbing, rubbing])
     with pytest.raises(TypeError, match="compare takes a Fit"):
         compare([rubbing.problem])
+
+
+def test_a_fit_of_one_candidate_runs_the_program_of_all(rubbing, monkeypatch):
+    """Nothing is compiled for it, and it has the derivatives of a program of its own."""
+    candidates = checked_candidates(rubbing, ["dry", Gain("torque"), "spring"])
+    order, minimum = [c.name for c in candidates], (rubbing.problem, rubbing.point)
+    augmented = AugmentedProblem.of(rubbing, minimum, candidates, (), order)
+    augmented.problem.linearize(augmented.point)
+    compiled = blocks_of.jitted._cached._cache_size()
+    fits = [augmented.with_only(candidate, np.ones(0)) for candidate in candidates]
+    together = [problem.linearize(dataclasses.replace(point, x=point.x + 0.01)) for problem, point in fits]
+    assert blocks_of.jitted._cached._cache_size() == compiled
+    monkeypatch.setattr(_problem, "MOST_SPARE_DERIVATIVES", 0)
+    for (problem, point), at in zip(fits, together, strict=True):
+        alone = problem.linearize(dataclasses.replace(point, x=point.x + 0.01))
+        assert at.blocks.n_x == alone.blocks.n_x == 3
+        np.testing.assert_allclose(at.simulated, alone.simulated, rtol=1e-12)
+        squares = [np.swapaxes(R, 1, 2) @ np.asarray(R) for R in (at.blocks.R, alone.blocks.R)]
+        np.testing.assert_allclose(*squares, rtol=1e-10, atol=1e-10)
+    assert blocks_of.jitted._cached._cache_size() == compiled + 1
 
 
 def test_a_page_of_the_report(found, tmp_path):

@@ -412,8 +412,8 @@ class Problem:
         return Linearization(blocks if at is point else blocks.of_x(self.parameters.places), prediction)
 
     def _compiled(self, point: Unknowns) -> tuple[Model, Unknowns]:
-        """The model and the point of it whose program is run. Of a subset of parameters it is that of all of them, which
-        every subset runs, where to compile one for fewer takes longer than their derivatives."""
+        """The model, and the point of it, whose program is run. A subset of parameters runs that of all of them, as
+        every other subset does, where compiling one for fewer takes longer than the derivatives that it spares."""
         spare = self.parameters.spare
         if not 0 < spare * self.windows.t.size <= MOST_SPARE_DERIVATIVES:
             return self.model, point
