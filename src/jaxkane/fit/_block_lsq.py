@@ -27,6 +27,12 @@ class Blocks(eqx.Module):
     n_next: int = eqx.field(static=True)
     n_b: int = eqx.field(static=True)
 
+    @classmethod
+    def of(cls, nuisance: Any, R: Any, windows: Any) -> Blocks:
+        """With the numbers of unknowns of a `Nuisance`."""
+        n_z = len(nuisance.start)
+        return cls(R, windows, n_z, n_z if nuisance.has_defects else 0, len(nuisance.trial))
+
     @property
     def n_x(self) -> int:
         return self.R.shape[-1] - self.n_z - self.n_next - self.n_b - 1

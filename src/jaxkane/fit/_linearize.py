@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Callable
 from typing import Any
@@ -51,10 +52,10 @@ def jacobian_of(model: Model, window: Windows, start: Array, start_dot: Array, z
 
 @jit
 def blocks_of(
-    model: Model, windows: Windows, by_trial: Array, point: Unknowns, starts: Array, starts_dot: Array
-) -> tuple[Blocks, Prediction]:
-    """Blocks, and the prediction of every window."""
-    n_z, n_b = point.z.shape[1], point.b.shape[1]
+    model: Model, windows: Windows, point: Unknowns, starts: Array, starts_dot: Array
+) -> tuple[Array, Prediction]:
+    """The triangles R (W, k, k) of `Blocks`, and the prediction of every window."""
+    n_z = point.z.shape[1]
     n_next = n_z if model.nuisance.has_defects else 0
 
     def window_block(arguments):
@@ -71,8 +72,7 @@ def blocks_of(
         A = jnp.concatenate([jnp.where(bad, 0.0, A), jnp.zeros((A.shape[1], A.shape[1]), A.dtype)])
         return jnp.where(bad, jnp.nan, jnp.linalg.qr(A, mode="r")), prediction
 
-    R, prediction = map_windows(window_block, _arguments(windows, point, starts, starts_dot))
-    return Blocks(R, by_trial, n_z, n_next, n_b), prediction
+    return map_windows(window_block, _arguments(windows, point, starts, starts_dot))
 
 
 def half_cost(model: Model, windows: Windows, by_trial: Array) -> Callable[[Unknowns], Array]:
@@ -87,7 +87,8 @@ def half_cost(model: Model, windows: Windows, by_trial: Array) -> Callable[[Unkn
         return linearized(point)[1] / 2
 
     def linearized(point: Unknowns):
-        blocks, prediction = blocks_of(model, windows, by_trial, point, *starts_of(model, windows, point))
+        R, prediction = blocks_of(model, windows, point, *starts_of(model, windows, point))
+        blocks = Blocks.of(model.nuisance, R, by_trial)
         return blocks, blocks.cost if prediction.cost is None else jnp.sum(prediction.cost)
 
     @f.defjvp
@@ -128,17 +129,10 @@ def map_windows(f: Callable[..., Any], windows: Any) -> Any:
 
 
 def blocks_by_all_processes(
-    model: Model, windows: Windows, by_trial: Array, point: Unknowns, starts: Array, starts_dot: Array
-) -> tuple[Blocks, Prediction]:
+    model: Model, windows: Windows, point: Unknowns, starts: Array, starts_dot: Array
+) -> tuple[Array, Prediction]:
     """`blocks_of`, each process for a share of the windows."""
-
-    def own(windows, point, starts, starts_dot):
-        blocks, prediction = blocks_of(model, windows, by_trial, point, starts, starts_dot)
-        return blocks.R, prediction
-
-    R, prediction = _by_all_processes(own, windows, point, starts, starts_dot)
-    n_z, n_b = point.z.shape[1], point.b.shape[1]
-    return Blocks(R, by_trial, n_z, n_z if model.nuisance.has_defects else 0, n_b), prediction
+    return _by_all_processes(functools.partial(blocks_of, model), windows, point, starts, starts_dot)
 
 
 def check_same(model: Model, windows: Windows) -> None:

@@ -187,6 +187,10 @@ class Prediction(eqx.Module):
     cost: Float[Array, " W"] | None = None
     unknowns: Float[Array, "W n_b"] | None = None
 
+    def until(self, n_t: int) -> Prediction:
+        """With so many samples."""
+        return jax.tree.map(lambda x: x[..., :n_t] if x.ndim == 3 else x, self)
+
     @property
     def with_deviations(self) -> np.ndarray:
         """Simulated measurements, followed by their deviations where there are such: (W, n_c or 2 n_c, n_t)."""

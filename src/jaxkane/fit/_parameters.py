@@ -121,9 +121,9 @@ class Parameters(eqx.Module):
         return dataclasses.replace(self, **new, rest=self.all(x))
 
     @property
-    def spare(self) -> int:
-        """How many are not free."""
-        return self.rest.size - self.places.size
+    def size(self) -> int:
+        """How many are free."""
+        return self.places.size
 
     @property
     def whole(self) -> Parameters:

@@ -23,6 +23,7 @@ from .._kane.rhs import output_names
 from .._scalarjit.compat import on_device
 from .._system.system import System
 from ..estimate._process_noise import noise_of
+from ._block_lsq import Blocks
 from ._declarations import Prior
 from ._linearize import (
     Linearization,
@@ -35,7 +36,7 @@ from ._linearize import (
 from ._model import Model, Nuisance, Simulation, Unknowns
 from ._parameters import Parameters, as_items, parameters_of
 from ._trial import Trial, as_trials
-from ._windows import Reach, Windows, WindowSlice, cut, state_names
+from ._windows import Reach, Shape, Windows, WindowSlice, cut, state_names
 
 Names = Sequence[str] | Mapping[str, float | None]
 """Names, or names with the standard deviation of a Gaussian prior around the initial guess (None: no prior)."""
@@ -236,6 +237,14 @@ STEP_TOLERANCE = 0.05, 0.25
 """By how much halving the step of integration may move all residuals together, of a window and of all windows: it
 bounds the bias of an estimate in its standard errors."""
 
+
+def _starts(*arguments: Any) -> tuple[Array, Array] | None:
+    try:
+        return starts_of(*arguments)
+    except eqx.EquinoxRuntimeError:  # Newton's linear solver raises on what is not finite
+        return None
+
+
 MOST_SPARE_DERIVATIVES = 100_000
 """Of samples by parameters that are not free: about a tenth of a second, where a program is compiled in three."""
 
@@ -259,6 +268,8 @@ class Problem:
     trials: tuple[Trial, ...]
     slices: tuple[WindowSlice, ...]
     specification: ProblemSpec
+    room: Shape | None = None
+    """Of the windows of a problem whose compiled program serves this one too, if it is large enough."""
 
     @classmethod
     @with_options
@@ -403,22 +414,34 @@ class Problem:
     def linearize(self, point: Unknowns) -> Linearization | None:
         """Residuals and their exact derivatives, by forward mode through the simulation; None where the constraints
         cannot be met at the start of a window."""
-        starts = self._starts(point)
+        model, windows, at = self._arguments(point)
+        starts = _starts(model, windows, at)
         if starts is None:
             return None
         evaluate: Any = blocks_by_all_processes if self.specification.processes else blocks_of
-        model, at = self._compiled(point)
-        blocks, prediction = evaluate(model, self.windows, self.by_trial, at, *starts)
-        return Linearization(blocks if at is point else blocks.of_x(self.parameters.places), prediction)
+        R, prediction = evaluate(model, windows, at, *starts)
+        if windows.shape != self.windows.shape:
+            W, n_t = self.windows.t.shape
+            R, prediction = jax.tree.map(lambda x: x[:W], (R, prediction.until(n_t)))
+        blocks = Blocks.of(self.model.nuisance, R, self.by_trial)
+        if self.parameters.size < at.x.size:
+            blocks = blocks.of_x(self.parameters.places)
+        return Linearization(blocks, prediction)
 
-    def _compiled(self, point: Unknowns) -> tuple[Model, Unknowns]:
-        """The model, and the point of it, whose program is run. A subset of parameters runs that of all of them, as
-        every other subset does, where compiling one for fewer takes longer than the derivatives that it spares."""
-        spare = self.parameters.spare
-        if not 0 < spare * self.windows.t.size <= MOST_SPARE_DERIVATIVES:
-            return self.model, point
-        whole = eqx.tree_at(lambda m: m.parameters, self.model, self.parameters.whole)
-        return whole, Unknowns(self.parameters.all(point.x), point.b, point.z)
+    def _arguments(self, point: Unknowns) -> tuple[Model, Windows, Unknowns]:
+        """What compiled programs take, which depend on the shape of the windows alone: the unknowns of its trial stand
+        beside each. With `room` they are as many, and as long, as those of another problem. A subset of parameters runs
+        the program of all of them, where compiling one for fewer takes longer than the derivatives that it spares."""
+        model, windows, x, owner = self.model, self.windows, point.x, np.asarray(self.windows.trial)
+        b, z = np.asarray(point.b)[owner], point.z
+        if self.room is not None and self.room != windows.shape and self.room.holds(windows.shape):
+            windows, rows = windows.padded(self.room), np.minimum(np.arange(self.room.windows), len(owner) - 1)
+            b, z = b[rows], on_device(np.asarray(z)[rows])
+        windows = dataclasses.replace(windows, trial=on_device(np.arange(len(b)), np.int32))
+        spare = self.parameters.rest.size - self.parameters.size
+        if 0 < spare * windows.t.size <= MOST_SPARE_DERIVATIVES:
+            model, x = eqx.tree_at(lambda m: m.parameters, model, self.parameters.whole), self.parameters.all(x)
+        return model, windows, Unknowns(x, on_device(b), z)
 
     def cost(self, point: Unknowns) -> float:
         """Sum of squares, with process noise minus twice the log likelihood; NaN or infinite where a window could not
@@ -441,20 +464,17 @@ class Problem:
         for i in range(len(self.slices)):
             windows, z = jax.tree.map(lambda x, i=i: x[i : i + 1], (self.windows, point.z))
             alone = dataclasses.replace(self, windows=windows)
-            missing.append(alone._starts(Unknowns(point.x, point.b, z)) is None)
+            missing.append(alone.starts(Unknowns(point.x, point.b, z)) is None)
         return np.array(missing)
 
-    def _starts(self, point: Unknowns) -> tuple[Array, Array] | None:
-        model, at = self._compiled(point)
-        try:
-            return starts_of(model, self.windows, at)
-        except eqx.EquinoxRuntimeError:  # Newton's linear solver raises on what is not finite
-            return None
+    def starts(self, point: Unknowns) -> Array | None:
+        """Where windows start (W, n), dependent coordinates among it; None where the constraints cannot be met."""
+        starts = _starts(*self._arguments(point))
+        return None if starts is None else starts[0][: len(self.slices)]
 
     def trajectories(self, point: Unknowns) -> list[Trajectory]:
         """The motion of every window, in the order of `slices`."""
-        model, at = self._compiled(point)
-        rides = trajectories_of(model, self.windows, at, starts_of(model, self.windows, at)[0])
+        rides = trajectories_of(self.model, self.windows, point, self.starts(point))
         return [
             jax.tree.map(lambda x, i=i, n=n: x[i, :n] if x.ndim > 1 else x[i], rides)
             for i, (_, _, n) in enumerate(self.slices)
@@ -491,9 +511,9 @@ class Problem:
         z = point.z[np.flatnonzero(np.isin(np.asarray(self.windows.trial), trials))]
         return Unknowns(point.x, point.b[np.asarray(trials)], z)
 
-    def by_trials(self) -> list[Problem]:
+    def by_trials(self, room: Shape | None = None) -> list[Problem]:
         """A problem of every trial, for all of which one program is compiled: a trial of fewer windows repeats its last
-        one, which counts nothing."""
+        one, which counts nothing. `room`: of the windows of another problem, whose program they may run."""
         owner, problems = np.asarray(self.windows.trial), []
         most = np.bincount(owner).max()
         for k, trial in enumerate(self.trials):
@@ -510,7 +530,7 @@ class Problem:
             )
             slices = tuple((0, *self.slices[j][1:]) for j in i)
             one = {"windows": windows, "by_trial": windows.by_trial, "trials": (trial,), "slices": slices}
-            problems.append(dataclasses.replace(self, **one))
+            problems.append(dataclasses.replace(self, room=room, **one))
         return problems
 
     def with_specification(self, spec: ProblemSpec) -> Problem:

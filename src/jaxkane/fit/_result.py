@@ -25,7 +25,7 @@ from ._block_lsq import Blocks
 from ._covariance import cluster_robust_covariance, clusters_of, intervals
 from ._identifiability import Identifiability, identifiability_at
 from ._io import described, read_state, tree_of, write_state
-from ._linearize import Linearization, starts_of
+from ._linearize import Linearization
 from ._model import Prediction, Unknowns
 from ._parameters import Parameters, leaf_names
 from ._problem import STEP_TOLERANCE, Problem, refuse_other
@@ -284,7 +284,7 @@ class Fit:
     def nuisance(self) -> dict[str, dict[str, Any]]:
         """By trial, values of the biases and gains, and of the starts of its windows (W,), by name."""
         problem, n = self.problem, self.problem.model.nuisance
-        starts = np.asarray(starts_of(problem.model, problem.windows, self.point)[0])[:, problem.model.unknown_places]
+        starts = np.asarray(problem.starts(self.point))[:, problem.model.unknown_places]
         owner = np.array([k for k, _, _ in problem.slices])
         filtered = self.linearization.prediction.unknowns  # with process noise a window is a trial
         b = self.point.b if filtered is None else filtered
@@ -470,9 +470,8 @@ def load(path: str | os.PathLike[str], problem: Problem) -> Fit:
     prediction = Prediction(jnp.zeros(()), jnp.zeros(()), of_filter, of_filter, of_filter)
     like = {"point": problem.start, "R": 0.0, "step_errors": 0.0, "history": 0.0, "prediction": prediction}
     state: dict[str, Any] = {name: tree_of(path, arrays, name, tree) for name, tree in like.items()}
-    point, n_z, n_b = state["point"], state["point"].z.shape[1], state["point"].b.shape[1]
-    blocks = Blocks(state["R"], problem.by_trial, n_z, n_z if problem.model.nuisance.has_defects else 0, n_b)
-    at = Linearization(blocks, state["prediction"])
+    point = state["point"]
+    at = Linearization(Blocks.of(problem.model.nuisance, state["R"], problem.by_trial), state["prediction"])
     if saved["program"] != key["program"]:
         now = problem.cost(point)
         if not abs(now - at.cost) <= SAME_COST * at.squares:

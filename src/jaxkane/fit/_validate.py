@@ -25,13 +25,17 @@ from ._statistics import folds_of, t_quantile, trial_names
 from ._tables import Rows, text_table
 from ._trial import Trial
 
+MOST_ADDED_WINDOWS = 1000
+"""Of one step each, in all: about as long as to compile a program without them."""
+
 
 def validate(fit: Fit, trials: Sequence[Trial] | Trial, *, progress: bool = False) -> Fit:
     """The parameters of a fit on other trials, of which only starts and biases are estimated (held-out data).
 
         jk.fit.validate(result, validation_trials).variance_accounted_for
 
-    The trials are simulated one by one, by a program that is compiled once for all of them. `progress`: a bar.
+    The trials are simulated one by one, by the program of the fit where they are no longer than its own, else by one
+    that is compiled for all of them. `progress`: a bar.
 
     **Returns:** a `Fit` of these trials, with the status "validated": its `cost`, `variance_accounted_for`, `tests` and
     report are those of these trials; its parameters were not fitted to them, and have no errors (NaN). Trials that
@@ -41,10 +45,12 @@ def validate(fit: Fit, trials: Sequence[Trial] | Trial, *, progress: bool = Fals
     """
     refuse_other(fit, Fit, "validate", "validate(fit(...), trials)")
     problem = Problem.with_first_steps(fit.problem.specification, trials)
-    names, failed = trial_names(problem), {}
+    names, failed, room = trial_names(problem), {}, fit.problem.windows.shape
+    if room.windows * len(names) > MOST_ADDED_WINDOWS:
+        room = None
     while True:
         validated = {}
-        ones = tqdm(problem.by_trials(), disable=not progress, desc="validation", unit=" trial")
+        ones = tqdm(problem.by_trials(room), disable=not progress, desc="validation", unit=" trial")
         for name, one in zip(names, ones, strict=True):
             try:
                 validated[name] = _validated(fit, one)
@@ -84,8 +90,7 @@ def _joined(fit: Fit, problem: Problem, fits: Sequence[Fit]) -> Fit:
     problem = problem.with_steps(joined(lambda one: one.problem.windows.step))
     b, z = jnp.concatenate([one.point.b for one in fits]), joined(lambda one: one.point.z)
     R, prediction = joined(lambda one: (one.linearization.blocks.R, one.linearization.prediction))
-    blocks = fits[0].linearization.blocks
-    at = Linearization(Blocks(R, problem.by_trial, blocks.n_z, blocks.n_next, blocks.n_b), prediction)
+    at = Linearization(Blocks.of(problem.model.nuisance, R, problem.by_trial), prediction)
     history = tuple(float(sum(costs)) for costs in zip(*(one.history for one in fits), strict=True))
     errors = np.concatenate([one.step_errors[:n] for one, n in zip(fits, counts, strict=True)])
     return Fit(problem, Unknowns(fit.point.x, b, z), at, errors, history, "validated", fit.method)

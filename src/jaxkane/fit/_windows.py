@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,6 +21,18 @@ Reach = tuple[float, float]
 
 WindowSlice = tuple[int, int, int]
 """Of a window: trial, first sample, number of samples."""
+
+
+class Shape(NamedTuple):
+    """Numbers of windows, of samples, of samples of the inputs, and of those that act within a window."""
+
+    windows: int
+    samples: int
+    inputs: int
+    acting: int
+
+    def holds(self, other: Shape) -> bool:
+        return all(a >= b for a, b in zip(self, other, strict=True))
 
 
 class Windows(eqx.Module):
@@ -59,6 +73,31 @@ class Windows(eqx.Module):
         first = jnp.maximum(jnp.searchsorted(times, self.t[0] - self.step, side="right") - 1, 0)
         chosen = lambda x: jax.lax.dynamic_slice_in_dim(x, first, self.n_acting, axis=-1)  # noqa: E731
         return chosen(times), chosen(self.inputs)
+
+    @property
+    def shape(self) -> Shape:
+        (W, n_t), n_in = self.t.shape, self.t_input.shape[1]
+        return Shape(W, n_t, n_in, self.n_acting)
+
+    def padded(self, shape: Shape) -> Windows:
+        """With more windows, of more samples, which count nothing: those added end one sample after their start."""
+        W, n_t = self.t.shape
+        rows, places = np.minimum(np.arange(shape.windows), W - 1), np.minimum(np.arange(shape.samples), n_t - 1)
+        added, spare = np.arange(shape.windows) >= W, np.arange(shape.samples) >= n_t
+        own = jax.tree.map(lambda x: np.asarray(x)[rows], self)
+        after = np.maximum(np.arange(shape.inputs) - own.t_input.shape[1] + 1, 0)  # samples behind the last
+        inputs = np.minimum(np.arange(shape.inputs), own.t_input.shape[1] - 1)
+        new = dataclasses.replace(
+            own,
+            t=np.where(added[:, None], own.t[:, np.minimum(places, 1)], own.t[:, places]),
+            measured=own.measured[:, :, places],
+            weight=np.where(added[:, None, None] | spare, 0.0, own.weight[:, :, places]),
+            t_input=own.t_input[:, inputs] + own.step[:, None] * after,
+            inputs=own.inputs[:, :, inputs],
+            linked=np.where(added, 0.0, own.linked),
+            n_acting=shape.acting,
+        )
+        return jax.tree.map(on_device, new)
 
     @property
     def by_trial(self) -> Array:
