@@ -10,6 +10,7 @@ from systems import POSED, PUSH, TRIAL, T, Track
 import jaxkane as jk
 from jaxkane.fit import (
     CrossValidation,
+    Delay,
     Free,
     Gain,
     LeastSquares,
@@ -17,6 +18,7 @@ from jaxkane.fit import (
     Problem,
     Simulation,
     Trial,
+    _validate,
     compare,
     cross_validate,
     fit,
@@ -95,6 +97,40 @@ def test_trials_go_one_by_one_through_one_program():
     more = validate(found, [*trials, trials[1], trials[0]])
     assert blocks_of.jitted._cached._cache_size() == compiled
     assert more.history[1] > held.cost + min(costs_by_trial(found.problem, found.point)[:2])
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        pytest.param({}, marks=pytest.mark.slow),
+        pytest.param({"zero_order_hold": "push"}, marks=pytest.mark.slow),
+        {"free": ("gain", Free("drift", start=0.2), Delay("push", bounds=(0.0, 0.3)))},
+        pytest.param({"noise": {"x_dot": 0.1}}, marks=pytest.mark.slow),
+        {"window": 1.0, "defect_std": {"x": 0.01, "x_dot": 0.02}},
+    ],
+    ids=["plain", "held", "late", "noise", "chained"],
+)
+def test_shorter_trials_run_the_program_of_the_fit(options, monkeypatch):
+    """To the numbers of a program of their own. Their windows are fewer, of fewer samples, and inputs of fewer."""
+    t = np.linspace(0.0, 3.0, 31)
+    trials = [
+        Trial(t[:n], {"x": 0.5 * t[:n] ** 2 + RNG.normal(0, 0.1, n)}, {"push": np.sin(t[:n])}, sigma=0.1)
+        for n in (31, 25, 22, 16)
+    ]
+    options = {"free": FREE, "unknown": ("x", "x_dot"), "simulation": STEP, "optimizer": LeastSquares(), **options}
+    found = fit(Track(), trials[:2], options.pop("free"), **options)
+    compiled = blocks_of.jitted._cached._cache_size()
+    one, together = validate(found, trials[3]), validate(found, trials[2:])
+    assert blocks_of.jitted._cached._cache_size() == compiled
+    monkeypatch.setattr(_validate, "MOST_ADDED_WINDOWS", 0)
+    for held, asked in ((one, trials[3]), (together, trials[2:])):
+        alone = validate(found, asked)
+        assert held.cost == pytest.approx(alone.cost, rel=1e-8)
+        assert held.history[0] == pytest.approx(alone.history[0], rel=1e-8)
+        for name, y in alone.fitted.items():
+            np.testing.assert_allclose(held.fitted[name]["x"], y["x"], atol=1e-7)
+        np.testing.assert_allclose(held.point.z, alone.point.z, atol=1e-6)
+    assert blocks_of.jitted._cached._cache_size() > compiled
 
 
 def test_a_trial_that_cannot_be_simulated_does_not_end_a_fit(falling, tmp_path):
