@@ -189,7 +189,7 @@ class Prediction(eqx.Module):
 
     def until(self, n_t: int) -> Prediction:
         """With so many samples."""
-        return jax.tree.map(lambda x: x[..., :n_t] if x.ndim == 3 else x, self)
+        return jax.tree.map(lambda x: np.asarray(x)[..., :n_t] if x.ndim == 3 else x, self)
 
     @property
     def with_deviations(self) -> np.ndarray:

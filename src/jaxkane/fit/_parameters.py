@@ -11,12 +11,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.linalg
 from jaxtyping import Array, Float, Int
 
 from .._common.lookup import as_names, hint, real_number, refuse_unknown
 from .._kane.rhs import output_names
 from .._scalarjit.cache_key import jit
-from .._scalarjit.compat import on_device
+from .._scalarjit.compat import Tracer, on_device
 from .._system.parameters import ANY, ParameterInfo, declared, leaf_name, learned_part, names_of_leaf
 from .._system.system import System, unit_of, units_of
 from ._bijections import Interval, PossibleBody
@@ -134,7 +135,9 @@ class Parameters(eqx.Module):
 
     def all(self, x: Float[Array, " p"]) -> Float[Array, " all"]:
         """The x of all of them."""
-        return self.rest.at[self.places].set(x)
+        if _are_traced(self.rest, x):
+            return self.rest.at[self.places].set(x)
+        return on_device(_with(self.rest, self.places, x))
 
     @property
     def entries(self) -> tuple[Entry, ...]:
@@ -158,21 +161,35 @@ class Parameters(eqx.Module):
         """Of every value the learned function that it belongs to, or "": such a number means nothing by itself."""
         return tuple(e.part for e in self.entries)
 
-    @jit
+    # Of numbers, each bijection is evaluated by a program of its own: all fits have the same few.
+
     def values(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
         """Parameters in their own units."""
-        return self._all_values(x)[self.places]
+        if _are_traced(self, x):
+            return self._all_values(x)[self.places]
+        return self._chosen(np.concatenate(self._each(_value, self.all(x))))
 
-    @jit
     def inverse(self, values: Float[Array, " p"]) -> Float[Array, " p"]:
         """The x (p,) of parameters in their own units; NaN outside their bounds."""
-        parts = self._parts(self._all_values(self.rest[self.places]).at[self.places].set(values))
-        return jnp.concatenate([f.inverse(part) for f, part in zip(self.bijections, parts, strict=True)])[self.places]
+        if _are_traced(self, values):
+            parts = self._parts(self._all_values(self.rest[self.places]).at[self.places].set(values))
+            of_all = jnp.concatenate([f.inverse(part) for f, part in zip(self.bijections, parts, strict=True)])
+            return of_all[self.places]
+        every = _with(np.concatenate(self._each(_value, self.rest)), self.places, values)
+        return self._chosen(np.concatenate(self._each(_inverse, every)))
 
-    @jit
     def slopes(self, x: Float[Array, " p"]) -> Float[Array, "p p"]:
         """d values / d x."""
-        return jax.jacfwd(self.values)(x)
+        if _are_traced(self, x):
+            return jax.jacfwd(self.values)(x)
+        return self._chosen(scipy.linalg.block_diag(*self._each(_slope, self.all(x))))
+
+    def _each(self, evaluate: Any, numbers: Any) -> list[Any]:
+        parts = self._parts(np.asarray(numbers))
+        return [np.asarray(evaluate(*pair)) for pair in zip(self.bijections, parts, strict=True)]
+
+    def _chosen(self, of_all: Any) -> Array:
+        return on_device(of_all[np.ix_(*[np.asarray(self.places)] * of_all.ndim)])
 
     def log_determinant(self, x: Float[Array, " p"]) -> Array:
         """log |det d values / d x|: what a density over the values is multiplied by to be one over x."""
@@ -202,10 +219,13 @@ class Parameters(eqx.Module):
                 leaves[number] = flat.reshape(leaf.shape)
         return jax.tree.unflatten(structure, leaves), calibration
 
-    @jit
     def prior_residuals(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
         """(value - mean) / deviation; zero without a prior."""
-        return (self.values(x) - self.prior_mean) / self.prior_deviation
+        numbers = self.values(x), self.prior_mean, self.prior_deviation
+        if _are_traced(numbers):
+            return (numbers[0] - numbers[1]) / numbers[2]
+        value, mean, deviation = map(np.asarray, numbers)
+        return on_device((value - mean) / deviation)
 
     @property
     def log_prior_constants(self) -> np.ndarray:
@@ -223,6 +243,21 @@ class Parameters(eqx.Module):
                 mean[i], deviation[i] = checked_prior(name, priors[name])
         new = (jnp.asarray(mean, self.start.dtype), jnp.asarray(deviation, self.start.dtype))
         return eqx.tree_at(lambda p: (p.prior_mean, p.prior_deviation), self, new)
+
+
+_value = jax.jit(lambda bijection, x: bijection(x))
+_inverse = jax.jit(lambda bijection, values: bijection.inverse(values))
+_slope = jax.jit(lambda bijection, x: jax.jacfwd(bijection)(x))
+
+
+def _are_traced(*numbers: Any) -> bool:
+    return any(isinstance(x, Tracer) for x in jax.tree.leaves(numbers))
+
+
+def _with(every: Any, places: Any, some: Any) -> np.ndarray:
+    every = np.array(every)
+    every[np.asarray(places)] = some
+    return every
 
 
 def checked_prior(name: str, prior: Any) -> Prior:

@@ -422,7 +422,7 @@ class Problem:
         R, prediction = evaluate(model, windows, at, *starts)
         if windows.shape != self.windows.shape:
             W, n_t = self.windows.t.shape
-            R, prediction = jax.tree.map(lambda x: x[:W], (R, prediction.until(n_t)))
+            R, prediction = jax.tree.map(lambda x: on_device(np.asarray(x)[:W]), (R, prediction.until(n_t)))
         blocks = Blocks.of(self.model.nuisance, R, self.by_trial)
         if self.parameters.size < at.x.size:
             blocks = blocks.of_x(self.parameters.places)
@@ -462,7 +462,7 @@ class Problem:
         """Whether the constraints can be met nowhere near the start of a window (W,)."""
         missing = []
         for i in range(len(self.slices)):
-            windows, z = jax.tree.map(lambda x, i=i: x[i : i + 1], (self.windows, point.z))
+            windows, z = jax.tree.map(lambda x, i=i: np.asarray(x)[i : i + 1], (self.windows, point.z))
             alone = dataclasses.replace(self, windows=windows)
             missing.append(alone.starts(Unknowns(point.x, point.b, z)) is None)
         return np.array(missing)
@@ -485,22 +485,18 @@ class Problem:
         windows, whole = self.windows, np.array([n for _, _, n in self.slices])
         if np.all(np.asarray(samples) >= whole):
             return self
-        keep = jnp.asarray(samples, dtype=jnp.int32)[:, None]  # (W, 1)
-        inside = jnp.arange(windows.t.shape[1], dtype=jnp.int32)[None, :] < keep  # (W, n_t)
-        t = jnp.where(inside, windows.t, jnp.take_along_axis(windows.t, keep - 1, axis=1))
-        t = jnp.where(jnp.asarray(samples >= whole)[:, None], windows.t, t)
-        weight = jnp.where(inside[:, None, :], windows.weight, 0.0)
-        linked = jnp.where(jnp.asarray(samples >= whole), windows.linked, 0.0)
-        new = eqx.tree_at(lambda w: (w.t, w.weight, w.linked), windows, (t, weight, linked))
+        t, keep, is_whole = np.asarray(windows.t), np.asarray(samples)[:, None], samples >= whole
+        inside = np.arange(t.shape[1]) < keep  # (W, n_t)
+        t = np.where(inside | is_whole[:, None], t, np.take_along_axis(t, keep - 1, axis=1))
+        weight, linked = np.asarray(windows.weight), np.asarray(windows.linked)
+        counted = np.where(inside[:, None, :], weight, 0), np.where(is_whole, linked, 0)
+        new = eqx.tree_at(lambda w: (w.t, w.weight, w.linked), windows, tuple(map(on_device, (t, *counted))))
         return dataclasses.replace(self, windows=new)
 
     def only(self, trials: Collection[int]) -> Problem:
         """The same problem in which only these trials (by number) count; nothing is compiled anew."""
-        counts = jnp.isin(self.windows.trial, jnp.asarray(sorted(trials), dtype=self.windows.trial.dtype))
-        weight = jnp.where(counts[:, None, None], self.windows.weight, 0.0)
-        linked = jnp.where(counts, self.windows.linked, 0.0)
-        new = eqx.tree_at(lambda w: (w.weight, w.linked), self.windows, (weight, linked))
-        return dataclasses.replace(self, windows=new)
+        windows = self.windows.where(np.isin(np.asarray(self.windows.trial), sorted(trials)))
+        return dataclasses.replace(self, windows=windows)
 
     def with_trials(self, trials: Sequence[Trial] | Trial) -> Problem:
         """The same specification with other trials."""
@@ -508,8 +504,8 @@ class Problem:
 
     def point_of(self, point: Unknowns, trials: Sequence[int]) -> Unknowns:
         """A point of this problem, as one of the problem with these of its trials."""
-        z = point.z[np.flatnonzero(np.isin(np.asarray(self.windows.trial), trials))]
-        return Unknowns(point.x, point.b[np.asarray(trials)], z)
+        own = np.isin(np.asarray(self.windows.trial), trials)
+        return Unknowns(point.x, *(on_device(np.asarray(x)[i]) for x, i in ((point.b, [*trials]), (point.z, own))))
 
     def by_trials(self, room: Shape | None = None) -> list[Problem]:
         """A problem of every trial, for all of which one program is compiled: a trial of fewer windows repeats its last
@@ -518,15 +514,14 @@ class Problem:
         most = np.bincount(owner).max()
         for k, trial in enumerate(self.trials):
             own = np.flatnonzero(owner == k)
-            i, counts = np.append(own, np.full(most - len(own), own[-1])), jnp.arange(most) < len(own)
-            windows = jax.tree.map(lambda x, i=i: x[i], self.windows)
+            i = np.append(own, np.full(most - len(own), own[-1]))
+            windows = jax.tree.map(lambda x, i=i: on_device(np.asarray(x)[i]), self.windows)
+            counts = np.arange(most) < len(own)
             windows = dataclasses.replace(
-                windows,
-                weight=jnp.where(counts[:, None, None], windows.weight, 0.0),
-                linked=jnp.where(counts, windows.linked, 0.0),
-                first=windows.first & counts,
-                very_first=windows.very_first & counts,
-                trial=jnp.zeros_like(windows.trial),
+                windows.where(counts),
+                first=on_device(np.asarray(windows.first) & counts),
+                very_first=on_device(np.asarray(windows.very_first) & counts),
+                trial=on_device(np.zeros(most), np.int32),
             )
             slices = tuple((0, *self.slices[j][1:]) for j in i)
             one = {"windows": windows, "by_trial": windows.by_trial, "trials": (trial,), "slices": slices}
@@ -592,7 +587,7 @@ class Problem:
         problem, first, before = self, self.windows.step, self.simulated(point)
         going, last = np.full(len(self.slices), True), np.full(len(self.slices), np.inf)
         for halvings in range(HALVINGS):
-            half = jnp.where(jnp.asarray(going), problem.windows.step / 2, problem.windows.step)
+            half = on_device(np.asarray(problem.windows.step) / np.where(going, 2, 1).astype(before.dtype))
             after = problem.with_steps(half).simulated(point)
             distance = self._distance(before, after)
             going &= ~(distance <= self.step_tolerance)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from .._scalarjit.compat import on_device
 from ._block_lsq import Blocks
 from ._covariance import intervals
 from ._fit import minimize, uninterrupted
@@ -84,11 +85,11 @@ def _joined(fit: Fit, problem: Problem, fits: Sequence[Fit]) -> Fit:
 
     def joined(of: Callable[[Fit], Any]) -> Any:
         """Arrays by window (W, ...)."""
-        rows = [jax.tree.map(lambda x, n=n: x[:n], of(one)) for one, n in zip(fits, counts, strict=True)]
-        return jax.tree.map(lambda *xs: jnp.concatenate(xs), *rows)
+        rows = [jax.tree.map(lambda x, n=n: np.asarray(x)[:n], of(one)) for one, n in zip(fits, counts, strict=True)]
+        return jax.tree.map(lambda *xs: on_device(np.concatenate(xs)), *rows)
 
     problem = problem.with_steps(joined(lambda one: one.problem.windows.step))
-    b, z = jnp.concatenate([one.point.b for one in fits]), joined(lambda one: one.point.z)
+    b, z = on_device(np.concatenate([one.point.b for one in fits])), joined(lambda one: one.point.z)
     R, prediction = joined(lambda one: (one.linearization.blocks.R, one.linearization.prediction))
     at = Linearization(Blocks.of(problem.model.nuisance, R, problem.by_trial), prediction)
     history = tuple(float(sum(costs)) for costs in zip(*(one.history for one in fits), strict=True))

@@ -79,6 +79,12 @@ class Windows(eqx.Module):
         (W, n_t), n_in = self.t.shape, self.t_input.shape[1]
         return Shape(W, n_t, n_in, self.n_acting)
 
+    def where(self, counts: np.ndarray) -> Windows:
+        """The same, in which only the measurements and links of some (W,) count."""
+        weight = np.where(counts[:, None, None], np.asarray(self.weight), 0)
+        linked = np.where(counts, np.asarray(self.linked), 0)
+        return dataclasses.replace(self, weight=on_device(weight), linked=on_device(linked))
+
     def padded(self, shape: Shape) -> Windows:
         """With more windows, of more samples, which count nothing: those added end one sample after their start."""
         W, n_t = self.t.shape
