@@ -548,6 +548,7 @@ def test_a_motion_that_an_event_ends_is_told():
     assert np.isfinite(far.cost)
 
 
+@pytest.mark.slow
 def test_an_implicit_solver_and_xla_give_the_same_filter(by_xla):
     """Their loops are differentiated forward."""
     _, y = drawn(1)
