@@ -122,7 +122,7 @@ def test_shorter_trials_run_the_program_of_the_fit(options, monkeypatch):
     compiled = blocks_of.jitted._cached._cache_size()
     one, together = validate(found, trials[3]), validate(found, trials[2:])
     assert blocks_of.jitted._cached._cache_size() == compiled
-    monkeypatch.setattr(_validate, "MOST_ADDED_WINDOWS", 0)
+    monkeypatch.setattr(_validate, "MOST_ADDED_SAMPLES", 0)
     for held, asked in ((one, trials[3]), (together, trials[2:])):
         alone = validate(found, asked)
         assert held.cost == pytest.approx(alone.cost, rel=1e-8)

@@ -485,13 +485,7 @@ class Problem:
         windows, whole = self.windows, np.array([n for _, _, n in self.slices])
         if np.all(np.asarray(samples) >= whole):
             return self
-        t, keep, is_whole = np.asarray(windows.t), np.asarray(samples)[:, None], samples >= whole
-        inside = np.arange(t.shape[1]) < keep  # (W, n_t)
-        t = np.where(inside | is_whole[:, None], t, np.take_along_axis(t, keep - 1, axis=1))
-        weight, linked = np.asarray(windows.weight), np.asarray(windows.linked)
-        counted = np.where(inside[:, None, :], weight, 0), np.where(is_whole, linked, 0)
-        new = eqx.tree_at(lambda w: (w.t, w.weight, w.linked), windows, tuple(map(on_device, (t, *counted))))
-        return dataclasses.replace(self, windows=new)
+        return dataclasses.replace(self, windows=windows.shortened(np.asarray(samples), whole))
 
     def only(self, trials: Collection[int]) -> Problem:
         """The same problem in which only these trials (by number) count; nothing is compiled anew."""
@@ -515,14 +509,7 @@ class Problem:
         for k, trial in enumerate(self.trials):
             own = np.flatnonzero(owner == k)
             i = np.append(own, np.full(most - len(own), own[-1]))
-            windows = jax.tree.map(lambda x, i=i: on_device(np.asarray(x)[i]), self.windows)
-            counts = np.arange(most) < len(own)
-            windows = dataclasses.replace(
-                windows.where(counts),
-                first=on_device(np.asarray(windows.first) & counts),
-                very_first=on_device(np.asarray(windows.very_first) & counts),
-                trial=on_device(np.zeros(most), np.int32),
-            )
+            windows = self.windows.of_one_trial(i, np.arange(most) < len(own))
             slices = tuple((0, *self.slices[j][1:]) for j in i)
             one = {"windows": windows, "by_trial": windows.by_trial, "trials": (trial,), "slices": slices}
             problems.append(dataclasses.replace(self, room=room, **one))

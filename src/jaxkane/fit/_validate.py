@@ -26,8 +26,8 @@ from ._statistics import folds_of, t_quantile, trial_names
 from ._tables import Rows, text_table
 from ._trial import Trial
 
-MOST_ADDED_WINDOWS = 1000
-"""Of one step each, in all: about as long as to compile a program without them."""
+MOST_ADDED_SAMPLES = 100_000
+"""Of windows that count nothing: to simulate so many some times takes as long as to compile a program without them."""
 
 
 def validate(fit: Fit, trials: Sequence[Trial] | Trial, *, progress: bool = False) -> Fit:
@@ -47,7 +47,7 @@ def validate(fit: Fit, trials: Sequence[Trial] | Trial, *, progress: bool = Fals
     refuse_other(fit, Fit, "validate", "validate(fit(...), trials)")
     problem = Problem.with_first_steps(fit.problem.specification, trials)
     names, failed, room = trial_names(problem), {}, fit.problem.windows.shape
-    if room.windows * len(names) > MOST_ADDED_WINDOWS:
+    if room.windows * room.samples * len(names) > MOST_ADDED_SAMPLES:
         room = None
     while True:
         validated = {}

@@ -85,6 +85,22 @@ class Windows(eqx.Module):
         linked = np.where(counts, np.asarray(self.linked), 0)
         return dataclasses.replace(self, weight=on_device(weight), linked=on_device(linked))
 
+    def of_one_trial(self, rows: np.ndarray, counts: np.ndarray) -> Windows:
+        """Those in these `rows` (m,), windows of one trial, of which only some (m,) count."""
+        own = jax.tree.map(lambda x: on_device(np.asarray(x)[rows]), self).where(counts)
+        first, very_first = (on_device(np.asarray(x) & counts) for x in (own.first, own.very_first))
+        trial = on_device(np.zeros(len(rows)), np.int32)
+        return dataclasses.replace(own, trial=trial, first=first, very_first=very_first)
+
+    def shortened(self, samples: np.ndarray, whole: np.ndarray) -> Windows:
+        """Of windows of `whole` (W,) samples only the first `samples` (W,)."""
+        t, keep, is_whole = np.asarray(self.t), samples[:, None], samples >= whole
+        inside = np.arange(t.shape[1]) < keep  # (W, n_t)
+        t = np.where(inside | is_whole[:, None], t, np.take_along_axis(t, keep - 1, axis=1))
+        weight = np.where(inside[:, None, :], np.asarray(self.weight), 0)
+        linked = np.where(is_whole, np.asarray(self.linked), 0)
+        return dataclasses.replace(self, t=on_device(t), weight=on_device(weight), linked=on_device(linked))
+
     def padded(self, shape: Shape) -> Windows:
         """With more windows, of more samples, which count nothing: those added end one sample after their start."""
         W, n_t = self.t.shape
