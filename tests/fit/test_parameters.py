@@ -1,6 +1,7 @@
 """Free parameters: entries of vectors, what is tied, bounds, scales, priors; each contradiction is one clear error."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -235,3 +236,23 @@ def test_a_fit_whose_data_want_more_ends_at_what_was_declared():
     assert found.estimates == pytest.approx({"gain": 0.7, "drift": best}, abs=1e-4)
     with pytest.raises(ValueError, match="do not determine gain"):
         profile(found, "gain")
+
+
+def asked(parameters, x):
+    y = parameters.values(x)
+    return y, parameters.slopes(x), parameters.inverse(y), parameters.prior_residuals(x), parameters.all(x)
+
+
+def test_numbers_are_mapped_as_under_a_trace():
+    """And while something else is traced: values, slopes, their inverse, and what priors say; of a subset, too."""
+    whole = parameters_of(Track(), ("gain", Free("drift", start=0.2, bounds=(0.0, 1.0), prior=(0.3, 0.1))))
+    for parameters, x in (
+        (whole, jnp.array([0.3, -0.7])),
+        (whole.subset([1], jnp.array([0.3, -0.7])), jnp.array([0.4])),
+    ):
+        numbers = asked(parameters, x)
+        np.testing.assert_allclose(numbers[2], x, rtol=1e-12)
+        while_traced = jax.jit(lambda _, p=parameters, x=x: asked(p, x))(0.0)
+        for others in (jax.jit(asked)(parameters, x), while_traced):
+            for a, b in zip(numbers, others, strict=True):
+                np.testing.assert_allclose(a, b, rtol=1e-14, atol=1e-15)

@@ -167,7 +167,7 @@ class Parameters(eqx.Module):
         """Parameters in their own units."""
         if _are_traced(self, x):
             return self._all_values(x)[self.places]
-        return self._chosen(np.concatenate(self._each(_value, self.all(x))))
+        return self._chosen(np.concatenate(self._each(_value, _with(self.rest, self.places, x))))
 
     def inverse(self, values: Float[Array, " p"]) -> Float[Array, " p"]:
         """The x (p,) of parameters in their own units; NaN outside their bounds."""
@@ -182,11 +182,12 @@ class Parameters(eqx.Module):
         """d values / d x."""
         if _are_traced(self, x):
             return jax.jacfwd(self.values)(x)
-        return self._chosen(scipy.linalg.block_diag(*self._each(_slope, self.all(x))))
+        return self._chosen(scipy.linalg.block_diag(*self._each(_slope, _with(self.rest, self.places, x))))
 
     def _each(self, evaluate: Any, numbers: Any) -> list[Any]:
         parts = self._parts(np.asarray(numbers))
-        return [np.asarray(evaluate(*pair)) for pair in zip(self.bijections, parts, strict=True)]
+        with jax.ensure_compile_time_eval():  # of numbers, also where something else is being traced
+            return [np.asarray(evaluate(*pair)) for pair in zip(self.bijections, parts, strict=True)]
 
     def _chosen(self, of_all: Any) -> Array:
         return on_device(of_all[np.ix_(*[np.asarray(self.places)] * of_all.ndim)])
