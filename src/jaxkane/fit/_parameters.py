@@ -10,6 +10,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import jax.scipy.linalg as jsl
 import numpy as np
 import scipy.linalg
 from jaxtyping import Array, Float, Int
@@ -135,9 +136,8 @@ class Parameters(eqx.Module):
 
     def all(self, x: Float[Array, " p"]) -> Float[Array, " all"]:
         """The x of all of them."""
-        if _are_traced(self.rest, x):
-            return self.rest.at[self.places].set(x)
-        return on_device(_with(self.rest, self.places, x))
+        every = _with(self.rest, self.places, x)
+        return every if _are_traced(every) else on_device(every)
 
     @property
     def entries(self) -> tuple[Entry, ...]:
@@ -161,35 +161,33 @@ class Parameters(eqx.Module):
         """Of every value the learned function that it belongs to, or "": such a number means nothing by itself."""
         return tuple(e.part for e in self.entries)
 
-    # Of numbers, each bijection is evaluated by a program of its own: all fits have the same few.
-
     def values(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
         """Parameters in their own units."""
-        if _are_traced(self, x):
-            return self._all_values(x)[self.places]
-        return self._chosen(np.concatenate(self._each(_value, _with(self.rest, self.places, x))))
+        return self._of_free(self._all_values(x))
 
     def inverse(self, values: Float[Array, " p"]) -> Float[Array, " p"]:
         """The x (p,) of parameters in their own units; NaN outside their bounds."""
-        if _are_traced(self, values):
-            parts = self._parts(self._all_values(self.rest[self.places]).at[self.places].set(values))
-            of_all = jnp.concatenate([f.inverse(part) for f, part in zip(self.bijections, parts, strict=True)])
-            return of_all[self.places]
-        every = _with(np.concatenate(self._each(_value, self.rest)), self.places, values)
-        return self._chosen(np.concatenate(self._each(_inverse, every)))
+        every = _with(self._each(_value, self.rest), self.places, values)
+        return self._of_free(self._each(_inverse, every))
 
     def slopes(self, x: Float[Array, " p"]) -> Float[Array, "p p"]:
         """d values / d x."""
-        if _are_traced(self, x):
-            return jax.jacfwd(self.values)(x)
-        return self._chosen(scipy.linalg.block_diag(*self._each(_slope, _with(self.rest, self.places, x))))
+        return self._of_free(self._each(_slope, _with(self.rest, self.places, x)))
 
-    def _each(self, evaluate: Any, numbers: Any) -> list[Any]:
-        parts = self._parts(np.asarray(numbers))
-        with jax.ensure_compile_time_eval():  # of numbers, also where something else is being traced
-            return [np.asarray(evaluate(*pair)) for pair in zip(self.bijections, parts, strict=True)]
+    def _each(self, evaluate: Any, numbers: Any) -> Any:
+        """Of every bijection, joined: vectors in a row, matrices on the diagonal. Numbers are evaluated by a program of
+        each kind of bijection, which all fits share, also while something else is traced."""
+        if _are_traced(self, numbers):
+            parts = [evaluate.__wrapped__(*pair) for pair in zip(self.bijections, self._parts(numbers), strict=True)]
+            return jnp.concatenate(parts) if parts[0].ndim == 1 else jsl.block_diag(*parts)
+        with jax.ensure_compile_time_eval():
+            pairs = zip(self.bijections, self._parts(np.asarray(numbers)), strict=True)
+            parts = [np.asarray(evaluate(*pair)) for pair in pairs]
+        return np.concatenate(parts) if parts[0].ndim == 1 else scipy.linalg.block_diag(*parts)
 
-    def _chosen(self, of_all: Any) -> Array:
+    def _of_free(self, of_all: Any) -> Array:
+        if _are_traced(self.places, of_all):
+            return of_all[jnp.ix_(*[self.places] * of_all.ndim)]
         return on_device(of_all[np.ix_(*[np.asarray(self.places)] * of_all.ndim)])
 
     def log_determinant(self, x: Float[Array, " p"]) -> Array:
@@ -197,8 +195,8 @@ class Parameters(eqx.Module):
         pairs = zip(self.bijections, self._parts(self.all(x)), strict=True)
         return sum((jnp.linalg.slogdet(jax.jacfwd(f)(part))[1] for f, part in pairs), jnp.zeros((), x.dtype))
 
-    def _all_values(self, x: Float[Array, " p"]) -> Float[Array, " all"]:
-        return jnp.concatenate([f(part) for f, part in zip(self.bijections, self._parts(self.all(x)), strict=True)])
+    def _all_values(self, x: Float[Array, " p"]) -> Any:
+        return self._each(_value, _with(self.rest, self.places, x))
 
     def _parts(self, x: Any) -> list[Any]:
         split = np.split if isinstance(x, np.ndarray) else jnp.split
@@ -255,7 +253,9 @@ def _are_traced(*numbers: Any) -> bool:
     return any(isinstance(x, Tracer) for x in jax.tree.leaves(numbers))
 
 
-def _with(every: Any, places: Any, some: Any) -> np.ndarray:
+def _with(every: Any, places: Any, some: Any) -> Any:
+    if _are_traced(every, places, some):
+        return jnp.asarray(every).at[places].set(some)
     every = np.array(every)
     every[np.asarray(places)] = some
     return every

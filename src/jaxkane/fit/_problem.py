@@ -237,16 +237,8 @@ STEP_TOLERANCE = 0.05, 0.25
 """By how much halving the step of integration may move all residuals together, of a window and of all windows: it
 bounds the bias of an estimate in its standard errors."""
 
-
-def _starts(*arguments: Any) -> tuple[Array, Array] | None:
-    try:
-        return starts_of(*arguments)
-    except eqx.EquinoxRuntimeError:  # Newton's linear solver raises on what is not finite
-        return None
-
-
 MOST_SPARE_DERIVATIVES = 100_000
-"""Of samples by parameters that are not free: about a tenth of a second, where a program is compiled in three."""
+"""Of samples by parameters that are not free: they take about a tenth of a second, and to compile a program three."""
 
 HALVINGS, STIFF_HALVINGS = 8, 5
 """Of a step between two samples, at most: what needs more is stiff or chaotic; and while the motion does not reach its
@@ -605,3 +597,10 @@ class Problem:
         """One over the standard deviations of what `simulated` gives."""
         weight = np.asarray(self.windows.weight)
         return np.tile(weight, (1, simulated.shape[1] // weight.shape[1], 1))
+
+
+def _starts(*arguments: Any) -> tuple[Array, Array] | None:
+    try:
+        return starts_of(*arguments)
+    except eqx.EquinoxRuntimeError:  # Newton's linear solver raises on what is not finite
+        return None
