@@ -176,7 +176,7 @@ def test_linear_models_on_a_grade():
 
 @pytest.mark.slow
 def test_a_linear_model_on_a_road_is_made_of_programs(native):
-    """LAPACK solves its constraints; written out, their derivatives would be eight thousand operations of XLA."""
+    """Written out, its derivatives would be eight thousand operations of XLA."""
     bicycle = Bicycle.benchmark().with_parts(road=Road(lambda x, y: 0.1 * jnp.sin(x)))
     start = jk.assemble(bicycle, {"roll": 0.05}, {"rear_wheel_rate": -5.0 / bicycle.rR})
     options = {"states": bicycle.lateral, "outputs": (), "steady": False}

@@ -23,6 +23,7 @@ from jaxkane._scalarjit.graph import Graph, unrolled
 from jaxkane.bicycles import (
     Arms,
     Bicycle,
+    ConstantSpeed,
     Drag,
     HeadTwist,
     LaneChange,
@@ -390,6 +391,19 @@ def carrying():
 def over_a_bump():
     bump = Road(lambda x, y: 0.05 * jnp.exp(-(((x - 2.0) / 0.5) ** 2)) + 0.01 * y)
     return Bicycle.benchmark().with_parts(road=bump, rear_tyre=Tyre(crown=0.02))
+
+
+@pytest.mark.slow
+def test_four_coupled_constraints_are_exported():
+    """A bicycle that holds its speed: 1e-12 at a start that leans and steers, with another mass too."""
+    bicycle = Bicycle.benchmark().with_parts(drive=(Drag(), ConstantSpeed(5.0)))
+    start = jk.assemble(bicycle, {"roll": 0.1, "steer": -0.2}, {"roll_rate": 0.3, "steer_rate": -0.1})
+    q, u, module = np.asarray(start.q), np.asarray(start.u), {}
+    exec(jk.export.numpy(bicycle, functions=("rates",)), module)
+    for other in (bicycle, bicycle.with_parts(mB=90.0)):
+        rates = module["rates"](0.3, q, u, np.zeros(len(bicycle.inputs)), jk.export.parameters(other))
+        expected = jk.coordinate_rates(other, 0.3, q, u), jk.accelerations(other, 0.3, q, u)
+        assert_close(rates, [np.asarray(x) for x in expected], 1e-12)
 
 
 @pytest.mark.slow

@@ -299,8 +299,8 @@ def test_products_of_small_matrices_are_written_out():
 @pytest.mark.filterwarnings("error")
 def test_lapack_of_the_method_itself_is_not_told():
     def solved(x):
-        rows = [[1.0 + x if i == j else 0.1 * x for j in range(4)] for i in range(4)]
-        return solve(rows, [x, 1.0, 2.0, 3.0])[0][0] + determinant(rows)
+        rows = [[1.0 + x if i == j else 0.1 * x for j in range(7)] for i in range(7)]
+        return solve(rows, [x, *map(float, range(1, 7))])[0][0] + determinant(rows)
 
     f = lambda x: jax.jvp(solved, (x,), (jnp.ones(()),))[1]  # noqa: E731
     np.testing.assert_allclose(ScalarFunction(f)(jnp.array(0.4)), f(jnp.array(0.4)), rtol=1e-14)

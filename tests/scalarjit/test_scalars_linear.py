@@ -14,9 +14,9 @@ def rows_of(A, values=None):
     return [[values[i, j] if x else 0.0 for j, x in enumerate(row)] for i, row in enumerate(A)]
 
 
-@pytest.mark.parametrize("sizes", [(3, 3, 3), (1, 3, 3), (2, 3), (1, 1, 1, 3), (4,), (1, 4)])
+@pytest.mark.parametrize("sizes", [(3, 3, 3), (1, 3, 3), (2, 3), (1, 1, 1, 3), (4,), (1, 4), (5, 6), (7,), (1, 7)])
 def test_systems_in_blocks(sizes):
-    """1e-12: against NumPy, rows and columns shuffled; a block of four goes to LAPACK."""
+    """1e-12: against NumPy, rows and columns shuffled; a block of seven goes to LAPACK."""
     rng = np.random.default_rng(len(sizes))
     n, end = sum(sizes), np.cumsum(sizes)
     A = np.eye(n)
@@ -28,10 +28,48 @@ def test_systems_in_blocks(sizes):
     np.testing.assert_allclose(np.array(found), np.linalg.solve(A, b.T).T, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(determinant(rows_of(A)), np.linalg.det(A), rtol=1e-12, atol=1e-12)
     traced = str(jax.make_jaxpr(lambda values: solve(rows_of(A, values), tuple(b[0])))(A))
-    assert ("_solved_by_lapack" in traced) == (4 in sizes)
+    assert ("_solved_by_lapack" in traced) == (7 in sizes)
 
 
 def test_a_system_that_is_singular_by_its_zeros_has_no_number():
     A = np.eye(5)
     A[4, 4] = 0.0
     assert not np.any(np.isfinite(np.array(solve(rows_of(A), [jnp.ones(())] * 5)[0])[4:]))
+
+
+@pytest.mark.parametrize("n", [4, 6])
+def test_elimination_exchanges_rows(n):
+    """1e-12: numbers that are zero on the diagonal, and pivots of 1e-17; derivatives by the linear equations."""
+    rng = np.random.default_rng(n)
+    A, b = rng.normal(size=(20, n, n)), rng.normal(size=(20, n))
+    A[:, np.arange(n), np.arange(n)] = 0.0
+    A[10:] += 1e-17 * np.eye(n)
+    dA, db = rng.normal(size=A.shape), rng.normal(size=b.shape)
+
+    def solved(A, b):
+        rows = [[*row] for row in A]
+        return jnp.stack(solve(rows, [*b])[0]), determinant(rows)
+
+    values, moved = jax.vmap(lambda *args: jax.jvp(solved, args[:2], args[2:]))(A, b, dA, db)
+    x = np.linalg.solve(A, b[..., None])
+    dx = np.linalg.solve(A, db[..., None] - dA @ x)
+    det = np.linalg.det(A)
+    for found, expected in (
+        (values[0], x[..., 0]),
+        (values[1], det),
+        (moved[0], dx[..., 0]),
+        (moved[1], det * np.trace(np.linalg.solve(A, dA), axis1=1, axis2=2)),
+    ):
+        np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
+
+
+def test_elimination_of_a_singular_matrix_has_no_number():
+    row = [jnp.asarray(x) for x in (1.0, 2.0, 3.0, 4.0)]
+    rows = [row, row, row[::-1], [2.0, 1.0, jnp.asarray(5.0), jnp.asarray(-1.0)]]
+    assert determinant(rows) == 0.0
+    assert not np.any(np.isfinite(np.array(solve(rows, row)[0])))
+
+
+def test_elimination_keeps_the_type():
+    rows = [[jnp.asarray(float(1 + i * j), jnp.float32) if i != j else 2.0 for j in range(4)] for i in range(4)]
+    assert {x.dtype for x in solve(rows, rows[0])[0]} == {determinant(rows).dtype} == {np.dtype("float32")}

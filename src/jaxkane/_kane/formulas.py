@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._scalarjit.compat import MISSING, ClosedJaxpr, jaxpr_as_fun
-from .._scalarjit.components import as_vector, is_written_out
+from .._scalarjit.components import ELIMINATE_UP_TO, as_vector, is_written_out
 from .._scalarjit.graph import Graph, NotScalarError, unrolled
 from .._scalarjit.jaxpr import Direction, cse, jacobian
 from .._system.parameters import ANY, ParameterInfo, declared, in_batches, leaf_name
@@ -230,7 +230,7 @@ class Formulas:
         if not is_written_out(n) and function not in ("equations", "coordinate_rates"):
             why = f"with {n} speeds the method solves its equations by LAPACK"
             remedy = "Take M and f, functions=('equations',), and solve M u_dot = f there"
-        elif k > 3:
+        elif k > ELIMINATE_UP_TO:
             why = f"with {k} dependent speeds the method solves for them by LAPACK"
             remedy = "Describe the mechanism with fewer"
         else:

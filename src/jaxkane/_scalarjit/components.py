@@ -1,8 +1,9 @@
 """Arithmetic, small linear systems and programs that know exact zeros and ones. Knows no mechanics.
 
-Small systems are written out (Cramer's rule up to three unknowns, L D L^T without pivoting for positive definite
-ones), which keeps exact zeros and lets a batch stay component-major; so are larger ones whose exact zeros let them fall
-apart into such, one after the other, as closed loops that hang on a bicycle. What is left goes to LAPACK.
+Small systems are written out (Cramer's rule up to three unknowns, Gaussian elimination up to six, L D L^T without
+pivoting for positive definite ones), which keeps exact zeros and lets a batch stay component-major; so are larger ones
+whose exact zeros let them fall apart into such, one after the other, as closed loops that hang on a bicycle. What is
+left goes to LAPACK.
 """
 
 from __future__ import annotations
@@ -154,22 +155,16 @@ def matvec(matrix: Sequence[Sequence[Component]], a: Sequence[Component]) -> tup
 Rows = Sequence[Sequence[Component]]
 
 _CRAMER_UP_TO = 3
+ELIMINATE_UP_TO = 6  # by XLA alone, the derivatives of eight take 14 s to compile
 _UNROLL_UP_TO = 12
 
 
 def solve(A: Rows, *rights: Sequence[Component]) -> list[tuple[Component, ...]]:
     """The solutions x of A x = b for several right-hand sides b."""
-    n = len(A)
-    if n == 0:
-        return [() for _ in rights]
-    if n > _CRAMER_UP_TO:
-        blocks = _blocks(A)
-        return _solved_by_lapack_rows(A, rights) if blocks is None else _solved_by_blocks(A, rights, blocks)
-    adjugate, det = _adjugate(A)
-    if is_zero(det):  # an unknown that no equation holds: no number is right, and a zero must not hide it
-        return [(math.nan,) * n for _ in rights]
-    reciprocal = 1.0 / det
-    return [tuple(mul(dot(row, b), reciprocal) for row in adjugate) for b in rights]
+    if len(A) <= _CRAMER_UP_TO:
+        return _solved_by_cramer(A, rights)
+    blocks = _blocks(A)
+    return _solved_by_lapack_rows(A, rights) if blocks is None else _solved_by_blocks(A, rights, blocks)
 
 
 def determinant(A: Rows) -> Component:
@@ -181,7 +176,8 @@ def determinant(A: Rows) -> Component:
         return _det_by_lapack(stack(A))
     rows, columns = ([i for block in blocks for i in block[side]] for side in (0, 1))
     sign = np.linalg.det(np.eye(len(A))[rows]) * np.linalg.det(np.eye(len(A))[columns])
-    factors = [_adjugate(_part(A, *block))[1] for block in blocks]
+    parts = [_part(A, *block) for block in blocks]
+    factors = [_adjugate(part)[1] if len(part) <= _CRAMER_UP_TO else _eliminated(part, ())[1] for part in parts]
     return functools.reduce(mul, factors, float(round(sign)))
 
 
@@ -215,7 +211,7 @@ def _blocks(A: Rows) -> list[Block] | None:
         follows = (follows.astype(int) @ follows) > 0
     together = follows & follows.T
     order = sorted({tuple(np.flatnonzero(row)) for row in together}, key=lambda rows: (follows[rows[0]].sum(), rows))
-    if max(map(len, order)) > _CRAMER_UP_TO:
+    if max(map(len, order)) > ELIMINATE_UP_TO:
         return None
     return [([int(i) for i in rows], sorted(int(column_of[i]) for i in rows)) for rows in order]
 
@@ -248,14 +244,65 @@ def _solved_by_blocks(A: Rows, rights: Sequence[Sequence[Component]], blocks: li
         remaining = []
         for b, x in zip(rights, solutions, strict=True):
             remaining.append([functools.reduce(sub, (mul(A[i][j], x[j]) for j in x), b[i]) for i in rows])
-        for x, solved in zip(solutions, solve(_part(A, rows, columns), *remaining), strict=True):
-            x.update(zip(columns, solved, strict=True))
+        part = _part(A, rows, columns)
+        solved = _solved_by_cramer(part, remaining) if len(part) <= _CRAMER_UP_TO else _eliminated(part, remaining)[0]
+        for x, found in zip(solutions, solved, strict=True):
+            x.update(zip(columns, found, strict=True))
     return [tuple(x[j] for j in range(len(A))) for x in solutions]
 
 
 def _solved_by_lapack_rows(A: Rows, rights: Sequence[Sequence[Component]]) -> list:
     solution = _solved_by_lapack(stack(A), jnp.stack([stack([b])[0] for b in rights], axis=-1))
     return [tuple(solution[i, j] for i in range(len(A))) for j in range(len(rights))]
+
+
+def _eliminated(A: Rows, rights: Sequence[Sequence[Component]]) -> tuple[list[tuple[Component, ...]], Component]:
+    """The solutions and det A by Gaussian elimination with partial pivoting.
+
+    The pivot row is found by exchanging rows in pairs, each by a selection among numbers. Rows whose leading entry is
+    an exact zero take no part.
+    """
+    n, det = len(A), 1.0
+    rows = [[*row, *(b[i] for b in rights)] for i, row in enumerate(A)]
+    for k in range(n):
+        first, *others = [i for i in range(k, n) if not is_zero(rows[i][k])] or [k]
+        if first != k:
+            rows[k], rows[first], det = rows[first], rows[k], mul(-1.0, det)
+        for i in others:
+            is_larger = abs(rows[i][k]) > abs(rows[k][k])
+            pairs = list(zip(rows[k], rows[i], strict=True))
+            rows[k], rows[i] = ([_chosen(is_larger, *pair[::way]) for pair in pairs] for way in (-1, 1))
+            det = _chosen(is_larger, mul(-1.0, det), det)
+        pivot = rows[k]
+        det = mul(det, pivot[k])
+        for i in others:
+            factor = rows[i][k] / pivot[k]
+            rows[i] = [sub(a, mul(factor, b)) for a, b in zip(rows[i], pivot, strict=True)]
+            rows[i][: k + 1] = [0.0] * (k + 1)
+    solutions = []
+    for j in range(n, n + len(rights)):
+        x: list[Component] = [0.0] * n
+        for i in reversed(range(n)):
+            x[i] = _quotient(sub(rows[i][j], dot(rows[i][i + 1 : n], x[i + 1 :])), rows[i][i])
+        solutions.append(tuple(x))
+    return solutions, det
+
+
+def _chosen(condition: Any, a: Component, b: Component) -> Component:
+    """`a` where the condition holds, else `b`."""
+    if isinstance(condition, bool):
+        return a if condition else b
+    return a if is_exact(a) and is_exact(b) and a == b else jnp.where(condition, a, b)
+
+
+def _solved_by_cramer(A: Rows, rights: Sequence[Sequence[Component]]) -> list[tuple[Component, ...]]:
+    if not A:
+        return [() for _ in rights]
+    adjugate, det = _adjugate(A)
+    if is_zero(det):  # an unknown that no equation holds: no number is right, and a zero must not hide it
+        return [(math.nan,) * len(A) for _ in rights]
+    reciprocal = 1.0 / det
+    return [tuple(mul(dot(row, b), reciprocal) for row in adjugate) for b in rights]
 
 
 def _adjugate(A: Rows) -> tuple[Rows, Component]:
