@@ -72,27 +72,11 @@ def test_the_same_as_plain_jax(name, compiled, kernels):
     )
 
 
-@pytest.mark.parametrize("name", ["jit", "reverse", "batch", "batch of gradients", "gradient of a loop"])
-def test_a_long_program_in_pieces(name, by_xla, monkeypatch):
-    monkeypatch.setattr(xla, "_WHOLE_UP_TO", 4)
-    monkeypatch.setattr(xla, "_PIECE", 3)
-
-    def chosen(a, b, x):
-        left = x[0] < a  # what is not a float goes from piece to piece too
-        y, z = plain(a, b, x)
-        return jnp.where(left, y, 2.0 * y), z
-
-    transform = TRANSFORMATIONS[name]
-    jax.tree.map(
-        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14),
-        jax.jit(transform(ScalarFunction(chosen)))(*ARGUMENTS),
-        jax.jit(transform(chosen))(*ARGUMENTS),
-    )
-
-
 @pytest.mark.parametrize("name", TRANSFORMATIONS)
-def test_a_program_as_windows(name, by_xla, monkeypatch):
+@pytest.mark.parametrize("long", [False, True], ids=["short", "long"])
+def test_a_program_as_windows(name, long, by_xla, monkeypatch):
     monkeypatch.setattr(xla, "_SHORT", 0)
+    monkeypatch.setattr(xla, "_LONG", 0 if long else 1000)
     found = jax.jit(TRANSFORMATIONS[name](ScalarFunction(plain)))(*ARGUMENTS)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14), found, by_plain_jax(name))
 

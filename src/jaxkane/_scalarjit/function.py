@@ -580,10 +580,8 @@ def _by_xla(*args, program, sizes, where):
         bind = functools.partial(_program_p.bind, program=program, sizes=in_chunks, where=where)
         outputs = _abstract(program=program, sizes=sizes, where=where)
         return one_chunk_at_a_time(bind, args, outputs, in_chunks[0], [w[0] for w in where], [w[0] for w in out_where])
-    # Tangents share what their batch has in common, and windows share nothing.
-    shares = (sizes and program.tangents) or not all(map(all, out_where))
-    if program.is_fusable and not shares and pays_as_windows(program.program, sizes) and program.windows:
-        return program.windows(args, sizes, where)
+    if program.is_fusable and pays_as_windows(program.program, sizes) and program.windows:
+        return program.windows(args, sizes, where, out_where)
     program = program.batched(sizes, where) if sizes else program
     if not program.is_fusable or 0 in sizes:
         return program.evaluate(*args)
