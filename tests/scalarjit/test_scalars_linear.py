@@ -63,6 +63,16 @@ def test_elimination_exchanges_rows(n):
         np.testing.assert_allclose(found, expected, rtol=1e-10, atol=1e-12)
 
 
+def test_elimination_passes_over_exact_zeros():
+    """1e-12: a row without a leading entry, and others whose entry becomes one."""
+    pattern = np.array([[0, 1, 0, 1], [1, 0, 1, 0], [0, 1, 1, 0], [1, 0, 0, 1]])
+    A, b = pattern * np.random.default_rng(0).normal(size=(4, 4)), np.arange(1.0, 5.0)
+    np.testing.assert_allclose(solve(rows_of(A), [*b])[0], np.linalg.solve(A, b), rtol=1e-12)
+    np.testing.assert_allclose(determinant(rows_of(A)), np.linalg.det(A), rtol=1e-12)
+    exact = [[float(x) for x in row] for row in pattern + np.eye(4)]
+    np.testing.assert_allclose(solve(exact, [*b])[0], np.linalg.solve(exact, b), rtol=1e-12)
+
+
 def test_elimination_of_a_singular_matrix_has_no_number():
     row = [jnp.asarray(x) for x in (1.0, 2.0, 3.0, 4.0)]
     rows = [row, row, row[::-1], [2.0, 1.0, jnp.asarray(5.0), jnp.asarray(-1.0)]]

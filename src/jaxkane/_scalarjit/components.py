@@ -271,7 +271,8 @@ def _eliminated(A: Rows, rights: Sequence[Sequence[Component]]) -> tuple[list[tu
         for i in others:
             is_larger = abs(rows[i][k]) > abs(rows[k][k])
             pairs = list(zip(rows[k], rows[i], strict=True))
-            rows[k], rows[i] = ([_chosen(is_larger, *pair[::way]) for pair in pairs] for way in (-1, 1))
+            rows[k] = [_chosen(is_larger, lower, upper) for upper, lower in pairs]
+            rows[i] = [_chosen(is_larger, upper, lower) for upper, lower in pairs]
             det = _chosen(is_larger, mul(-1.0, det), det)
         pivot = rows[k]
         det = mul(det, pivot[k])
