@@ -122,6 +122,8 @@ def test_shorter_trials_run_the_program_of_the_fit(options, monkeypatch):
     compiled = blocks_of.jitted._cached._cache_size()
     one, together = validate(found, trials[3]), validate(found, trials[2:])
     assert blocks_of.jitted._cached._cache_size() == compiled
+    padded = one.problem.by_trials(found.problem.windows.shape)[0]
+    np.testing.assert_allclose(padded.starts(one.point), one.problem.starts(one.point), rtol=1e-12, atol=1e-12)
     monkeypatch.setattr(_validate, "MOST_ADDED_SAMPLES", 0)
     for held, asked in ((one, trials[3]), (together, trials[2:])):
         alone = validate(found, asked)
@@ -131,6 +133,18 @@ def test_shorter_trials_run_the_program_of_the_fit(options, monkeypatch):
             np.testing.assert_allclose(held.fitted[name]["x"], y["x"], atol=1e-7)
         np.testing.assert_allclose(held.point.z, alone.point.z, atol=1e-6)
     assert blocks_of.jitted._cached._cache_size() > compiled
+
+
+def test_windows_that_do_not_count_are_linked_to_none():
+    """A window that is shortened ends before its next one starts, and trials left out count nothing."""
+    t = np.linspace(0.0, 3.0, 31)
+    trial = Trial(t, {"x": t}, {"push": np.sin(t)}, sigma=0.1)
+    chained = {"window": 1.0, "defect_std": {"x": 0.01, "x_dot": 0.02}, "unknown": ("x", "x_dot")}
+    problem = Problem.of(Track(), [trial, trial], FREE, simulation=STEP, **chained)
+    samples = np.array([n for *_, n in problem.slices])
+    np.testing.assert_array_equal(problem.windows.linked, [1, 1, 0, 1, 1, 0])
+    np.testing.assert_array_equal(problem.shortened(samples - [1, 0, 0, 0, 0, 0]).windows.linked, [0, 1, 0, 1, 1, 0])
+    np.testing.assert_array_equal(problem.only([1]).windows.linked, [0, 0, 0, 1, 1, 0])
 
 
 def test_a_trial_that_cannot_be_simulated_does_not_end_a_fit(falling, tmp_path):

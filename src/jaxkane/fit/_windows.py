@@ -102,7 +102,7 @@ class Windows(eqx.Module):
         return dataclasses.replace(self, t=on_device(t), weight=on_device(weight), linked=on_device(linked))
 
     def padded(self, shape: Shape) -> Windows:
-        """With more windows, of more samples, which count nothing: those added end one sample after their start."""
+        """With more samples, which count nothing, and more windows, which end one sample after their start."""
         W, n_t = self.t.shape
         rows, places = np.minimum(np.arange(shape.windows), W - 1), np.minimum(np.arange(shape.samples), n_t - 1)
         added, spare = np.arange(shape.windows) >= W, np.arange(shape.samples) >= n_t
@@ -113,10 +113,9 @@ class Windows(eqx.Module):
             own,
             t=np.where(added[:, None], own.t[:, np.minimum(places, 1)], own.t[:, places]),
             measured=own.measured[:, :, places],
-            weight=np.where(added[:, None, None] | spare, 0.0, own.weight[:, :, places]),
+            weight=np.where(spare, 0.0, own.weight[:, :, places]),
             t_input=own.t_input[:, inputs] + own.step[:, None] * after,
             inputs=own.inputs[:, :, inputs],
-            linked=np.where(added, 0.0, own.linked),
             n_acting=shape.acting,
         )
         return jax.tree.map(on_device, new)
