@@ -81,6 +81,24 @@ def test_a_program_as_windows(name, long, by_xla, monkeypatch):
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14), found, by_plain_jax(name))
 
 
+@pytest.mark.parametrize("name", ["jit", "reverse", "batch", "batch of gradients", "gradient of a loop"])
+def test_a_long_program_that_chooses(name, by_xla, monkeypatch):
+    monkeypatch.setattr(xla, "_SHORT", 0)
+    monkeypatch.setattr(xla, "_LONG", 0)
+
+    def chosen(a, b, x):
+        left = x[0] < a
+        y, z = plain(a, b, x)
+        return jnp.where(left, y, 2.0 * y), z
+
+    transform = TRANSFORMATIONS[name]
+    jax.tree.map(
+        lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-13, atol=1e-14),
+        jax.jit(transform(ScalarFunction(chosen)))(*ARGUMENTS),
+        jax.jit(transform(chosen))(*ARGUMENTS),
+    )
+
+
 def many(a, x, flag):
     y, z, w = x
     smooth = jnp.sin(a) + jnp.arctan2(y, z) * jnp.tanh(w) + jnp.cbrt(y) ** 3 - jnp.exp2(w) / jnp.log1p(z * z)
@@ -92,6 +110,7 @@ def many(a, x, flag):
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_every_operation_as_windows(dtype, by_xla, monkeypatch):
     monkeypatch.setattr(xla, "_SHORT", 0)
+    monkeypatch.setattr(xla, "_LONG", 0 if dtype == np.float32 else 1000)
     values = np.array([[0.3, -1.5, 2.5], [0.0, -0.0, np.inf], [np.nan, 1.0, -1.0], [0.5, 0.5, 1e30]])
     x = jnp.asarray(values, dtype)
     a, flag = jnp.array(0.7, dtype), jnp.array([True, False, False, True])

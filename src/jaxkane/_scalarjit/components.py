@@ -162,7 +162,7 @@ _UNROLL_UP_TO = 12
 def solve(A: Rows, *rights: Sequence[Component]) -> list[tuple[Component, ...]]:
     """The solutions x of A x = b for several right-hand sides b."""
     if len(A) <= _CRAMER_UP_TO:
-        return _solved_by_cramer(A, rights)
+        return _solutions_and_det(A, rights)[0]
     blocks = _blocks(A)
     return _solved_by_lapack_rows(A, rights) if blocks is None else _solved_by_blocks(A, rights, blocks)
 
@@ -170,14 +170,13 @@ def solve(A: Rows, *rights: Sequence[Component]) -> list[tuple[Component, ...]]:
 def determinant(A: Rows) -> Component:
     """det A."""
     if len(A) <= _CRAMER_UP_TO:
-        return _adjugate(A)[1]
+        return _solutions_and_det(A)[1]
     blocks = _blocks(A)
     if blocks is None:
         return _det_by_lapack(stack(A))
     rows, columns = ([i for block in blocks for i in block[side]] for side in (0, 1))
     sign = np.linalg.det(np.eye(len(A))[rows]) * np.linalg.det(np.eye(len(A))[columns])
-    parts = [_part(A, *block) for block in blocks]
-    factors = [_adjugate(part)[1] if len(part) <= _CRAMER_UP_TO else _eliminated(part, ())[1] for part in parts]
+    factors = [_solutions_and_det(_part(A, *block))[1] for block in blocks]
     return functools.reduce(mul, factors, float(round(sign)))
 
 
@@ -244,16 +243,30 @@ def _solved_by_blocks(A: Rows, rights: Sequence[Sequence[Component]], blocks: li
         remaining = []
         for b, x in zip(rights, solutions, strict=True):
             remaining.append([functools.reduce(sub, (mul(A[i][j], x[j]) for j in x), b[i]) for i in rows])
-        part = _part(A, rows, columns)
-        solved = _solved_by_cramer(part, remaining) if len(part) <= _CRAMER_UP_TO else _eliminated(part, remaining)[0]
-        for x, found in zip(solutions, solved, strict=True):
-            x.update(zip(columns, found, strict=True))
+        for x, solved in zip(solutions, _solutions_and_det(_part(A, rows, columns), remaining)[0], strict=True):
+            x.update(zip(columns, solved, strict=True))
     return [tuple(x[j] for j in range(len(A))) for x in solutions]
 
 
 def _solved_by_lapack_rows(A: Rows, rights: Sequence[Sequence[Component]]) -> list:
     solution = _solved_by_lapack(stack(A), jnp.stack([stack([b])[0] for b in rights], axis=-1))
     return [tuple(solution[i, j] for i in range(len(A))) for j in range(len(rights))]
+
+
+def _solutions_and_det(
+    A: Rows, rights: Sequence[Sequence[Component]] = ()
+) -> tuple[list[tuple[Component, ...]], Component]:
+    """Of as many equations as are written out."""
+    n = len(A)
+    if n == 0:
+        return [() for _ in rights], 1.0
+    if n > _CRAMER_UP_TO:
+        return _eliminated(A, rights)
+    adjugate, det = _adjugate(A)
+    if is_zero(det):  # an unknown that no equation holds: no number is right, and a zero must not hide it
+        return [(math.nan,) * n for _ in rights], det
+    reciprocal = 1.0 / det
+    return [tuple(mul(dot(row, b), reciprocal) for row in adjugate) for b in rights], det
 
 
 def _eliminated(A: Rows, rights: Sequence[Sequence[Component]]) -> tuple[list[tuple[Component, ...]], Component]:
@@ -294,16 +307,6 @@ def _chosen(condition: Any, a: Component, b: Component) -> Component:
     if isinstance(condition, bool):
         return a if condition else b
     return a if is_exact(a) and is_exact(b) and a == b else jnp.where(condition, a, b)
-
-
-def _solved_by_cramer(A: Rows, rights: Sequence[Sequence[Component]]) -> list[tuple[Component, ...]]:
-    if not A:
-        return [() for _ in rights]
-    adjugate, det = _adjugate(A)
-    if is_zero(det):  # an unknown that no equation holds: no number is right, and a zero must not hide it
-        return [(math.nan,) * len(A) for _ in rights]
-    reciprocal = 1.0 / det
-    return [tuple(mul(dot(row, b), reciprocal) for row in adjugate) for b in rights]
 
 
 def _adjugate(A: Rows) -> tuple[Rows, Component]:

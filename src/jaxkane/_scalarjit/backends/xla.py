@@ -34,8 +34,8 @@ _FUNCTIONS: dict[str, Callable[..., Any]] = {
 }
 
 
-_SHORT = 1000  # as windows each number is an array, which costs a shorter program more than the cuts, without a batch
-_LONG = 3000  # nodes: outside of a loop, XLA computes longer windows again for each of several results
+_SHORT = 1000  # equations: without a batch, the arrays that windows take cost a shorter program more than XLA's cuts
+_LONG = 3000  # nodes: outside of loops, XLA computes a longer program several times, unless it is one function
 _MOST_LANES = 128  # with more, intermediates no longer stay in the cache
 
 
@@ -64,7 +64,7 @@ class Windows:
         out_where: Sequence[Sequence[bool]],
     ) -> list[Any]:
         """The results over a batch with leading axes `sizes`, of which argument i has those in `where[i]`, and result j
-        those in `out_where[j]`. What all members share is computed for each: it is compiled sooner than it is shared.
+        those in `out_where[j]`. What all members share is computed for each of them, since that compiles sooner.
         """
         shape, rows = sizes or (1,), []
         for x, has in zip(jax.lax.optimization_barrier([*args]), where, strict=True):  # which hides constants
@@ -82,7 +82,10 @@ class Windows:
         results = {k: x for (_, k, _), x in zip(self.elements, combined, strict=True)}
         stacked = [jnp.stack([results[int(k)] for k in array.flat], axis=-1) for array in self.outputs]
         whole = [x.reshape(*sizes, *array.shape) for x, array in zip(stacked, self.outputs, strict=True)]
-        return [x[tuple(slice(None) if is_there else 0 for is_there in has)] for x, has in zip(whole, out_where)]
+        return [
+            x[tuple(slice(None) if is_there else 0 for is_there in has)]
+            for x, has in zip(whole, out_where, strict=True)
+        ]
 
     def _element(self, rows: Sequence[Any], shape: tuple[int, ...], node: int | None, dtype: str) -> Any:
         if node is None:
