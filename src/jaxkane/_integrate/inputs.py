@@ -86,15 +86,21 @@ class _GridSamples(Samples):
         return self.values[_INTERVALS["zero-order hold on a grid"](self.ts, t)]
 
 
-_FEW = 2048  # comparing with so many samples is one short vector operation; a bisection, a loop of small kernels
+_FEW_SAMPLES, _FEW_TIMES = 2048, 16  # to compare these is a short vector operation; a bisection, a loop of kernels
 
 
 def _count(ts: Array, t: Array) -> Array:
-    return jnp.searchsorted(ts, t, side="right", method="compare_all" if ts.size <= _FEW else "scan")
+    # Of many times, comparisons would take memory for each sample at each time.
+    if ts.size <= _FEW_SAMPLES and t.size <= _FEW_TIMES:
+        shape = (*t.shape, ts.size)
+        until = jnp.broadcast_to(ts, shape) <= jnp.broadcast_to(t[..., None], shape)
+        return jnp.sum(until, axis=-1, dtype=jnp.int32)
+    return jnp.searchsorted(ts, t, side="right").astype(jnp.int32)
 
 
 @jax.custom_batching.custom_vmap
 def _count_until(ts: Array, t: Array) -> Array:
+    """How many of the times `ts` (n_t,) are not later than t, of any shape."""
     return _count(ts, t)
 
 
@@ -102,8 +108,7 @@ def _count_until(ts: Array, t: Array) -> Array:
 def _(size: int, is_batched: Any, ts: Array, t: Array) -> tuple[Array, bool]:
     if is_batched[0]:
         return jax.vmap(_count, (0, 0 if is_batched[1] else None))(ts, t), True
-    # Of many times, comparisons would take memory for each sample at each time.
-    return jnp.searchsorted(ts, t, side="right"), True
+    return _count_until(ts, t), True
 
 
 def _interval(kind: str) -> Any:
@@ -158,6 +163,22 @@ def inputs_at(
     return {
         name: jnp.asarray(values.get(name, 0.0), dtype=state.q.dtype) for name in (names if all_of_them else values)
     }
+
+
+class RateArguments(NamedTuple):
+    """What the rates read beside time and state: the `system`, maybe packed; the `signals`; and the `disturbance`."""
+
+    system: Any
+    signals: Any
+    disturbance: Any
+
+    def sampled(self, times: Array) -> dict[str, Array]:
+        """The signals that are samples at some times (n,), all of which are looked up at once."""
+        return {} if callable(self.signals) else {k: jax.vmap(x)(times) for k, x in self.signals.items() if _is_samples(x)}
+
+    def with_numbers(self, inputs: dict[str, Array]) -> RateArguments:
+        """With numbers for some of the signals."""
+        return self._replace(signals=self.signals | inputs) if inputs else self
 
 
 _CONTROLLER = "The function of the inputs"

@@ -35,6 +35,7 @@ from .events import EventPoint, Events, EventValues, event_values, events_of, ne
 from .inputs import (
     Discontinuities,
     InputState,
+    RateArguments,
     Samples,
     discontinuities_of,
     for_fixed_steps,
@@ -140,7 +141,7 @@ class InitialValueProblem(NamedTuple):
     valid: Array
     rates: Callable[..., Any]
     are_native: bool
-    args: Any
+    args: RateArguments
     events: Events
     settings: Settings
 
@@ -211,7 +212,7 @@ def solve(
         valid=valid,
         rates=_rates(settings.stabilize if constrained else 0.0, settings.is_forward),
         are_native=rates_are_native(stepped, times.start, start, inputs_at(system, signals, times.start, state)),
-        args=(stepped, signals, disturbance),
+        args=RateArguments(stepped, signals, disturbance),
         events=events_of(system, times.start, state),
         settings=settings,
     )
@@ -226,7 +227,7 @@ def one_step(
 ) -> Array:
     """The packed state after one step of the solver from `t0` to `t1`: the motion of `solve` without its checks, events
     and outputs. NaN where an implicit solver finds no solution. `signals` for steps of one length."""
-    args = (system, signals, disturbance)
+    args = RateArguments(system, signals, disturbance)
     constrained = has_configuration_constraints(system, t0, unpacked(system, y).q)
     rates = _rates(settings.stabilize if constrained else 0.0)
     inputs = inputs_at(system, signals, t0, unpacked(system, y))
@@ -286,7 +287,7 @@ def refuse_captured(system: System) -> None:
 def _rates(stabilize: float, forward: bool = False) -> Callable[..., Any]:
     """(t, y, args) -> y_dot. `stabilize` [1/s]: how fast constraints are led back; `forward`: see `vector_field`."""
 
-    def rates(t: Array, y: Array, args: Any) -> Array:
+    def rates(t: Array, y: Array, args: RateArguments) -> Array:
         packed_system, signals, disturbance = args
         system = tree_of(packed_system)
         state = unpacked(system, y)
@@ -339,8 +340,8 @@ def _controller_of(problem: InitialValueProblem) -> StepSizeController:
     """What ends the steps: the last time, events, and dependent speeds that are about to be singular."""
     system, settings, times, events = problem.system, problem.settings, problem.times, problem.events
 
-    def quantities(t: Array, y: Array, args: Any) -> EventValues:
-        return event_values(args[0], t, y, problem.rates(t, y, args) if events.read_speeds else None)
+    def quantities(t: Array, y: Array, args: RateArguments) -> EventValues:
+        return event_values(args.system, t, y, problem.rates(t, y, args) if events.read_speeds else None)
 
     as_number = lambda x: jnp.asarray(x, times.end.dtype)  # noqa: E731
     fixed, kinks = settings.step is not None, problem.discontinuities
@@ -388,7 +389,7 @@ def _located(problem: InitialValueProblem, ending: Ending) -> EventPoint:
     negligible unless the motion is very much longer than what is fastest in it. XLA alone would compile it for seconds,
     and leaves it out.
     """
-    system, events = problem.args[0], problem.events
+    system, events = problem.args.system, problem.events
     t, y, y_dot = ending.near
     t = constant(t)
     if y_dot is None:

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array
 
 from .._scalarjit.nan import constant
+from .inputs import RateArguments
 from .settings import with_scan_kind
 from .step_control import Progress, StepSizeController
 
@@ -204,17 +205,24 @@ class UnrolledERK(diffrax.AbstractAdaptiveSolver[Any]):
 
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
         tableau: Any = self.method.tableau
-        h, rates = terms.contr(t0, t1), jax.jit(lambda t, y: terms.vf(t, y, args))
+        h, times = terms.contr(t0, t1), [t0, *(t1 if c == 1 else t0 + float(c) * (t1 - t0) for c in tableau.c)]
+        knows = isinstance(args, RateArguments)
+        sampled = args.sampled(jnp.stack(times)) if knows else {}
+        at_once = jax.jit(lambda t, y, now: terms.vf(t, y, args.with_numbers(now) if knows else args))
+
+        def rates(i: int, y: Array) -> Array:
+            return at_once(times[i], y, {name: x[i] for name, x in sampled.items()})
+
         if solver_state is None:
-            f = rates(t0, y0)
+            f = rates(0, y0)
         elif made_jump is False:
             f = solver_state
         else:
-            f = jax.lax.cond(made_jump, lambda: rates(t0, y0), lambda: solver_state)
+            f = jax.lax.cond(made_jump, lambda: rates(0, y0), lambda: solver_state)
         k, y = [terms.prod(f, h)], y0
-        for a, c in zip(tableau.a_lower, map(float, tableau.c), strict=True):
+        for i, a in enumerate(tableau.a_lower, start=1):
             y = y0 + _weighted(a, k)
-            f = rates(t1 if c == 1 else t0 + c * (t1 - t0), y)
+            f = rates(i, y)
             k.append(terms.prod(f, h))
         y1 = y if tableau.ssal else y0 + _weighted(tableau.b_sol, k)
         dense = {"y0": y0, "y1": y1, "k": jnp.stack(k)}
