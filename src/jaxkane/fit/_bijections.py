@@ -32,6 +32,10 @@ class Interval(eqx.Module):
     bounded: tuple[bool, bool] = eqx.field(static=True)
     uniform: bool = eqx.field(static=True, default=True)
 
+    @property
+    def size(self) -> int:
+        return 1
+
     def __call__(self, x: Float[Array, " 1"]) -> Float[Array, " 1"]:
         start, scale = self.start, self.scale
         if self.bounded == (False, False):
@@ -119,6 +123,10 @@ class PossibleBody(eqx.Module):
         scale = np.concatenate([[0.5], place, [0.5] * 3, [size / 2] * 3])
         dtype = jnp.result_type(float)
         return cls(jnp.asarray(start, dtype), jnp.asarray(scale, dtype), moves, wheel)
+
+    @property
+    def size(self) -> int:
+        return len(self.moves)
 
     def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         return self.all_values(self.factors(x))[np.array(self.moves)]

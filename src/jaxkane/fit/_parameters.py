@@ -19,6 +19,7 @@ from .._common.lookup import as_names, hint, real_number, refuse_unknown
 from .._kane.rhs import output_names
 from .._scalarjit.cache_key import jit
 from .._scalarjit.compat import Tracer, on_device
+from .._scalarjit.function import ScalarFunction
 from .._system.parameters import ANY, ParameterInfo, declared, leaf_name, learned_part, names_of_leaf
 from .._system.system import System, unit_of, units_of
 from ._bijections import Interval, PossibleBody
@@ -103,7 +104,6 @@ class Parameters(eqx.Module):
 
     all_entries: tuple[Entry, ...] = eqx.field(static=True)
     bijections: tuple[Interval | PossibleBody, ...]
-    sizes: tuple[int, ...] = eqx.field(static=True)
     start: Float[Array, " p"]
     scale: Float[Array, " p"]
     prior_mean: Float[Array, " p"]
@@ -138,6 +138,11 @@ class Parameters(eqx.Module):
         """The x of all of them."""
         every = _with(self.rest, self.places, x)
         return every if _are_traced(every) else on_device(every)
+
+    @property
+    def sizes(self) -> tuple[int, ...]:
+        """How many values each bijection has."""
+        return tuple(f.size for f in self.bijections)
 
     @property
     def entries(self) -> tuple[Entry, ...]:
@@ -196,7 +201,8 @@ class Parameters(eqx.Module):
         return sum((jnp.linalg.slogdet(jax.jacfwd(f)(part))[1] for f, part in pairs), jnp.zeros((), x.dtype))
 
     def _all_values(self, x: Float[Array, " p"]) -> Any:
-        return self._each(_value, _with(self.rest, self.places, x))
+        every = _with(self.rest, self.places, x)
+        return _values(self.bijections, every) if _are_traced(self, every) else self._each(_value, every)
 
     def _parts(self, x: Any) -> list[Any]:
         split = np.split if isinstance(x, np.ndarray) else jnp.split
@@ -213,9 +219,9 @@ class Parameters(eqx.Module):
             if entry.role is not None:
                 calibration[entry.role] = value
             for number, place, factor in entry.targets:
-                leaf = leaves[number]
-                flat = jnp.ravel(leaf).at[place].set((factor * value).astype(leaf.dtype))
-                leaves[number] = flat.reshape(leaf.shape)
+                leaf, new = leaves[number], factor * value
+                new = new.astype(leaf.dtype)
+                leaves[number] = new if leaf.ndim == 0 else jnp.ravel(leaf).at[place].set(new).reshape(leaf.shape)
         return jax.tree.unflatten(structure, leaves), calibration
 
     def prior_residuals(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
@@ -244,6 +250,13 @@ class Parameters(eqx.Module):
         return eqx.tree_at(lambda p: (p.prior_mean, p.prior_deviation), self, new)
 
 
+@ScalarFunction.once
+def _values(bijections: tuple[Interval | PossibleBody, ...], x: Array) -> Array:
+    # As one program: XLA would make a dozen kernels of it.
+    places = np.cumsum([f.size for f in bijections])[:-1]
+    return jnp.concatenate([f(part) for f, part in zip(bijections, jnp.split(x, places), strict=True)])
+
+
 _value = jax.jit(lambda bijection, x: bijection(x))
 _inverse = jax.jit(lambda bijection, values: bijection.inverse(values))
 _slope = jax.jit(lambda bijection, x: jax.jacfwd(bijection)(x))
@@ -255,7 +268,8 @@ def _are_traced(*numbers: Any) -> bool:
 
 def _with(every: Any, places: Any, some: Any) -> Any:
     if _are_traced(every, places, some):
-        return jnp.asarray(every).at[places].set(some)
+        # Of places that are told to differ, the derivative is found at once.
+        return jnp.asarray(every).at[places].set(some, unique_indices=True, mode="promise_in_bounds")
     every = np.array(every)
     every[np.asarray(places)] = some
     return every
@@ -331,7 +345,6 @@ def parameters_of(
     return Parameters(
         all_entries=tuple(entries),
         bijections=tuple(part[1] for part in parts),
-        sizes=tuple(len(part[0]) for part in parts),
         start=array([s for part in parts for s in part[2]]),
         scale=array([s for part in parts for s in part[3]]),
         prior_mean=array([mean for mean, _ in priors]),
