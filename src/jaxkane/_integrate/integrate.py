@@ -58,7 +58,7 @@ def _is_small(x: Any) -> bool:
 
 def _is_rising(ts: Array) -> Array:
     # A window of a fit may stand still at its last time.
-    return all_finite(ts) & jnp.all(ts[1:] >= ts[:-1]) & (ts[-1] > ts[0])
+    return jnp.all(ts[1:] >= ts[:-1]) & (ts[-1] > ts[0]) & jnp.isfinite(ts[0]) & jnp.isfinite(ts[-1])
 
 
 def is_valid(system: System, y: Array, t: Array, signals: Any) -> Array:

@@ -202,7 +202,7 @@ class Parameters(eqx.Module):
 
     def _all_values(self, x: Float[Array, " p"]) -> Any:
         every = _with(self.rest, self.places, x)
-        return _values(self.bijections, every) if _are_traced(self, every) else self._each(_value, every)
+        return jnp.stack(_values(self.bijections, every)) if _are_traced(self, every) else self._each(_value, every)
 
     def _parts(self, x: Any) -> list[Any]:
         split = np.split if isinstance(x, np.ndarray) else jnp.split
@@ -213,9 +213,8 @@ class Parameters(eqx.Module):
         """The system with these parameters; gains, offsets, delays and the noise's by ("gain of input", name)."""
         leaves, structure = jax.tree.flatten(system)
         calibration = {}
-        values = self._all_values(x)
-        for i, entry in enumerate(self.all_entries):
-            value = values[i]
+        values = _values(self.bijections, self.all(x))
+        for entry, value in zip(self.all_entries, values, strict=True):
             if entry.role is not None:
                 calibration[entry.role] = value
             for number, place, factor in entry.targets:
@@ -251,10 +250,10 @@ class Parameters(eqx.Module):
 
 
 @ScalarFunction.once
-def _values(bijections: tuple[Interval | PossibleBody, ...], x: Array) -> Array:
-    # As one program: XLA would make a dozen kernels of it.
+def _values(bijections: tuple[Interval | PossibleBody, ...], x: Array) -> list[Array]:
+    """The value of each, as one program: XLA would make a dozen kernels of it."""
     places = np.cumsum([f.size for f in bijections])[:-1]
-    return jnp.concatenate([f(part) for f, part in zip(bijections, jnp.split(x, places), strict=True)])
+    return [y for f, part in zip(bijections, jnp.split(x, places), strict=True) for y in f(part)]
 
 
 _value = jax.jit(lambda bijection, x: bijection(x))
