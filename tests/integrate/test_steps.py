@@ -253,7 +253,8 @@ def test_the_last_time_and_the_first_have_derivatives(jacobian):
 
 
 def test_a_step_ends_beside_a_kink_or_leaves_half_of_the_way_to_it():
-    kinks = ClipToDiscontinuities.of(Discontinuities(jnp.array([0.5, 1.0]), jumps=False, restart=False), jnp.array(2.0))
+    at = Discontinuities(jnp.array([0.5, 1.0]), jumps=False, restart=False)
+    kinks = ClipToDiscontinuities.of(at, times_of(jnp.array(0.0), jnp.array(1.0), jnp.array(2.0)))
     for length in (0.1, 0.3, 0.5 - 1e-9, 0.5, 0.7, 1.2):
         times = times_of(jnp.array(0.0), jnp.array(1.0), jnp.array(2.0))._replace(first=jnp.array(length))
         settings = ControlSettings(jnp.array(1e-6), jnp.array(1e-6), None, times, 5.0, None, ())

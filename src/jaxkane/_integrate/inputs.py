@@ -86,12 +86,12 @@ class _GridSamples(Samples):
         return self.values[_INTERVALS["zero-order hold on a grid"](self.ts, t)]
 
 
-_FEW_SAMPLES, _FEW_TIMES = 2048, 16  # to compare these is a short vector operation; a bisection, a loop of kernels
+_FEW = 8192  # comparisons, which are one short vector operation; a bisection is a loop of small kernels
 
 
 def _count(ts: Array, t: Array) -> Array:
-    # Of many times, comparisons would take memory for each sample at each time.
-    if ts.size <= _FEW_SAMPLES and t.size <= _FEW_TIMES:
+    # More comparisons would take memory for each sample at each time.
+    if ts.size * t.size <= _FEW:
         shape = (*t.shape, ts.size)
         until = jnp.broadcast_to(ts, shape) <= jnp.broadcast_to(t[..., None], shape)
         return jnp.sum(until, axis=-1, dtype=jnp.int32)
@@ -99,16 +99,16 @@ def _count(ts: Array, t: Array) -> Array:
 
 
 @jax.custom_batching.custom_vmap
-def _count_until(ts: Array, t: Array) -> Array:
+def count_until(ts: Array, t: Array) -> Array:
     """How many of the times `ts` (n_t,) are not later than t, of any shape."""
     return _count(ts, t)
 
 
-@_count_until.def_vmap
+@count_until.def_vmap
 def _(size: int, is_batched: Any, ts: Array, t: Array) -> tuple[Array, bool]:
     if is_batched[0]:
         return jax.vmap(_count, (0, 0 if is_batched[1] else None))(ts, t), True
-    return _count_until(ts, t), True
+    return count_until(ts, t), True
 
 
 def _interval(kind: str) -> Any:
@@ -118,7 +118,7 @@ def _interval(kind: str) -> Any:
         ts, at = jax.lax.stop_gradient((ts, jnp.asarray(t, ts.dtype)))
         if kind == "zero-order hold on a grid":
             at = at + 1e-4 * (ts[1] - ts[0])
-        return jnp.clip(_count_until(ts, at) - 1, 0, ts.shape[0] - (2 if kind == "linear" else 1))
+        return jnp.clip(count_until(ts, at) - 1, 0, ts.shape[0] - (2 if kind == "linear" else 1))
 
     index.__name__ = index.__qualname__ = _INTERVAL_OF + kind
     return jax.jit(index)
@@ -174,7 +174,9 @@ class RateArguments(NamedTuple):
 
     def sampled(self, times: Array) -> dict[str, Array]:
         """The signals that are samples at some times (n,), all of which are looked up at once."""
-        return {} if callable(self.signals) else {k: jax.vmap(x)(times) for k, x in self.signals.items() if _is_samples(x)}
+        return (
+            {} if callable(self.signals) else {k: jax.vmap(x)(times) for k, x in self.signals.items() if _is_samples(x)}
+        )
 
     def with_numbers(self, inputs: dict[str, Array]) -> RateArguments:
         """With numbers for some of the signals."""

@@ -356,7 +356,7 @@ def _controller_of(problem: InitialValueProblem) -> StepSizeController:
     )
     may_end = quantities if events.names or system.dependent_speeds else None
     return StepSizeController(
-        control, may_end, None if kinks is None or fixed else ClipToDiscontinuities.of(kinks, times.end)
+        control, may_end, None if kinks is None or fixed else ClipToDiscontinuities.of(kinks, times)
     )
 
 

@@ -19,7 +19,7 @@ from .._scalarjit.function import ScalarFunction
 from .._scalarjit.jaxpr import LARGEST_SUM
 from .._scalarjit.nan import constant
 from .events import EventValues, first_crossing
-from .inputs import Discontinuities
+from .inputs import Discontinuities, count_until
 from .status import Status
 
 
@@ -83,29 +83,22 @@ class ClipToDiscontinuities(eqx.Module):
     restart: bool = eqx.field(static=True)
 
     @classmethod
-    def of(cls, discontinuities: Discontinuities, end: Array) -> ClipToDiscontinuities:
-        """Those before the `end`. A step that ends beside a kink at the end would leave the end out."""
-        rounding = _rounding(discontinuities.times)
-        times = jnp.where(discontinuities.times < end - rounding, discontinuities.times, jnp.inf)
-        return cls(times, _rounding(times), discontinuities.restart)
+    def of(cls, discontinuities: Discontinuities, times: Times) -> ClipToDiscontinuities:
+        """Those before the end. A step that ends beside a kink at the end would leave the end out."""
+        are_before = discontinuities.times < times.end - times.rounding
+        return cls(jnp.where(are_before, discontinuities.times, jnp.inf), times.rounding, discontinuities.restart)
 
     def after(self, t: Array) -> Array:
         """The next kink; infinity where there is none."""
-        i = jnp.searchsorted(self.times, t + self.rounding, side="right")
+        i = count_until(*jax.lax.stop_gradient((self.times, t + self.rounding)))
         return jnp.where(i < len(self.times), self.times[jnp.minimum(i, len(self.times) - 1)], jnp.inf)
 
     def beside(self, t0: Array, t1: Array) -> NearbyDiscontinuities:
-        """Of a step."""
-        kink = self.times[jnp.minimum(jnp.searchsorted(self.times, t1 - self.rounding), len(self.times) - 1)]
+        """Of a step, which ends at the next kink after its start or before."""
+        kink = self.after(t0)
         at_end = jnp.abs(t1 - kink) <= self.rounding
         start = jnp.where(at_end, kink + 0.25 * self.rounding, t1)
-        return NearbyDiscontinuities(at_end, start, self.after(start), self.after(t0), self.rounding)
-
-
-def _rounding(times: Array) -> Array:
-    """How near to one of these times rounding errors keep another."""
-    times = jax.lax.stop_gradient(times)
-    return 64 * jnp.finfo(times.dtype).eps * jnp.max(jnp.where(jnp.isfinite(times), jnp.abs(times), 0.0))
+        return NearbyDiscontinuities(at_end, start, self.after(start), kink, self.rounding)
 
 
 class NearbyDiscontinuities(NamedTuple):
