@@ -319,8 +319,9 @@ def audit(system: System, trajectory: Trajectory) -> Audit:
     of its times.
     """
     reached = reached_times("audit", system, trajectory)
-    t, q, u = (x[reached] for x in (trajectory.t, trajectory.q, trajectory.u))
-    inputs = {key: x[reached] for key, x in trajectory.values.items()}
+    t, q, u, inputs = jax.tree.map(
+        lambda x: np.asarray(x)[reached], (trajectory.t, trajectory.q, trajectory.u, trajectory.values)
+    )
     quantities = _quantities_along(system, t, q, u, inputs)
     quantities = jax.tree.map(lambda x: np.asarray(x, dtype=float), quantities)
     ts, C, independent = np.asarray(t, dtype=float), quantities["C"], len(system.speeds)

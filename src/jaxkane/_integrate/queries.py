@@ -37,7 +37,11 @@ def along(f: Callable[..., Any], system: System, t: Any, q: Any, u: Any, inputs:
     if not (q is None and u is None and inputs is None):
         raise TypeError("A Trajectory holds coordinates, speeds and inputs already: give the system and it alone.")
     refuse_other_system(type(system).__name__, system, t)
+    return _over_times(system, f, t)
 
+
+@jit
+def _over_times(system: System, f: Callable[..., Any], t: Trajectory) -> Any:
     def at(system: System, sample: Any, first: Any) -> Any:
         reached = jnp.all(jnp.isfinite(jnp.concatenate([sample[1], sample[2]])))
         first = jax.tree.map(lambda x: jnp.where(jnp.isfinite(x), x, 1.0), first)

@@ -411,7 +411,7 @@ def _state_and_outputs(formulas: Formulas, functions: Iterable[str]) -> tuple[di
         args = [*state.values(), *formulas.values().values()]
         with jax.enable_x64(formulas.dtype == "float64"):
             for function in functions:
-                outputs = jax.tree.map(np.asarray, formulas.by_jax(function, *args))
+                outputs = jax.tree.map(np.asarray, jax.jit(formulas.by_jax, static_argnums=0)(function, *args))
                 expected[function] = dict(zip(formulas.nodes(function), outputs, strict=True))
         if all(np.all(np.isfinite(x)) for outputs in expected.values() for x in outputs.values()):
             break

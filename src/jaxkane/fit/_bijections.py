@@ -174,6 +174,7 @@ def _matrix(six: Any) -> np.ndarray:
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
+@jax.jit
 def _factors(values: Float[Array, " 10"]) -> Float[Array, " 10"]:
     """The inverse of `all_values`; NaN where no body is so."""
     m, (Ixx, Iyy, Izz, Ixy, Ixz, Iyz) = values[0], values[4:]

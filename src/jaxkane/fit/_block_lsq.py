@@ -16,6 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from .._scalarjit.compat import on_device
+
 
 class Blocks(eqx.Module):
     """Linearized residuals: `R` (W, m, k) with k = n_z + n_next + n_b + n_x + 1, where n_next is n_z or, without
@@ -41,7 +43,7 @@ class Blocks(eqx.Module):
         """Those of the x at `places` alone; the others stay where they are."""
         first = self.n_z + self.n_next + self.n_b
         columns = np.concatenate([np.arange(first), first + np.asarray(places), [self.R.shape[-1] - 1]])
-        return eqx.tree_at(lambda blocks: blocks.R, self, self.R[:, :, columns])
+        return eqx.tree_at(lambda blocks: blocks.R, self, on_device(np.asarray(self.R)[:, :, columns]))
 
     @property
     def cost(self) -> Array:

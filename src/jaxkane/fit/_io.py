@@ -96,8 +96,8 @@ def described(problem: Problem) -> dict[str, Any]:
     """All that residuals and their derivatives depend on, by name."""
     model, settings = problem.model, problem.model.settings
     numbers, rest = eqx.partition(model, eqx.is_array)
-    window = jax.tree.map(lambda x: x[0], problem.windows)
-    point = problem.start
+    first = lambda tree: jax.tree.map(lambda x: np.asarray(x)[0], tree)  # noqa: E731
+    window, point = first(problem.windows), problem.start
     fixed, guessed = _fixed_and_guessed(problem)
 
     def residuals(numbers, window, z, b, x):
@@ -122,7 +122,7 @@ def described(problem: Problem) -> dict[str, Any]:
         "fixed parameter": {name: digest(x) if np.ndim(x) else float(x) for name, x in fixed.items()},
         "initial guesses, priors": digest(jax.tree.leaves(dataclasses.replace(numbers, system=guessed))),
         "data": digest(jax.tree.leaves(problem.windows)),
-        "program": digest(jax.make_jaxpr(residuals)(numbers, window, point.z[0], point.b[0], point.x)),
+        "program": digest(jax.make_jaxpr(residuals)(numbers, window, first(point.z), first(point.b), point.x)),
     }
 
 

@@ -118,8 +118,8 @@ class Parameters(eqx.Module):
 
     def subset(self, places: Sequence[int], x: Float[Array, " p"]) -> Parameters:
         """Those at `places`; all others keep their values at x."""
-        at = jnp.asarray(places, dtype=jnp.int32)
-        new = {name: getattr(self, name)[at] for name in ("start", "scale", "prior_mean", "prior_deviation", "places")}
+        names = ("start", "scale", "prior_mean", "prior_deviation", "places")
+        new = {name: on_device(np.asarray(getattr(self, name))[list(places)]) for name in names}
         return dataclasses.replace(self, **new, rest=self.all(x))
 
     @property
@@ -245,7 +245,7 @@ class Parameters(eqx.Module):
         for i, name in enumerate(self.names):
             if name in priors:
                 mean[i], deviation[i] = checked_prior(name, priors[name])
-        new = (jnp.asarray(mean, self.start.dtype), jnp.asarray(deviation, self.start.dtype))
+        new = (on_device(mean, self.start.dtype), on_device(deviation, self.start.dtype))
         return eqx.tree_at(lambda p: (p.prior_mean, p.prior_deviation), self, new)
 
 

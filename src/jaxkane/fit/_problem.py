@@ -303,8 +303,8 @@ class Problem:
             guess=starts.guess,
         )
         if noise is not None:  # a filter goes from sample to sample: a longer step is none, and half of it neither
-            longest = jnp.max(jnp.diff(windows.t, axis=1), axis=1)
-            windows = eqx.tree_at(lambda w: w.step, windows, jnp.minimum(windows.step, longest))
+            longest = np.max(np.diff(np.asarray(windows.t), axis=1), axis=1)
+            windows = eqx.tree_at(lambda w: w.step, windows, on_device(np.minimum(windows.step, longest)))
         varying = any(np.ptp(x) > 0 for trial in trials for x in trial.inputs.values())
         model = Model(
             system=system,
@@ -540,9 +540,9 @@ class Problem:
         one, together = STEP_TOLERANCE
         return min(one, together / len(self.slices) ** 0.5)
 
-    def with_steps(self, step: Array) -> Problem:
+    def with_steps(self, step: Any) -> Problem:
         """The same problem with other steps of integration (W,) [s]; nothing is compiled anew."""
-        return dataclasses.replace(self, windows=eqx.tree_at(lambda w: w.step, self.windows, step))
+        return dataclasses.replace(self, windows=eqx.tree_at(lambda w: w.step, self.windows, on_device(step)))
 
     def step_errors(self, point: Unknowns, now: np.ndarray | None = None) -> np.ndarray:
         """By how much halving the step moves all residuals of every window (W,) together, in standard deviations; NaN
@@ -553,7 +553,7 @@ class Problem:
         if not self.has_steps:
             return np.full(len(self.slices), np.nan)
         now = self.simulated(point) if now is None else now
-        return self._distance(now, self.with_steps(self.windows.step / 2).simulated(point))
+        return self._distance(now, self.with_steps(np.asarray(self.windows.step) / 2).simulated(point))
 
     def finer(self, point: Unknowns) -> Problem:
         """The problem with steps halved where that changes what is simulated at a point by more than a share of the
@@ -563,10 +563,11 @@ class Problem:
         steps; a step from kink to kink meets none. Measured (the rides of a steered bicycle, 100 Hz, 1 s): 1300 steps
         at a tolerance of 1e-7 against 100 of Bosh3, which differ by 0.002 of the measurements' deviation.
         """
-        problem, first, before = self, self.windows.step, self.simulated(point)
+        problem, first, before = self, np.asarray(self.windows.step), self.simulated(point)
         going, last = np.full(len(self.slices), True), np.full(len(self.slices), np.inf)
         for halvings in range(HALVINGS):
-            half = on_device(np.asarray(problem.windows.step) / np.where(going, 2, 1).astype(before.dtype))
+            steps = np.asarray(problem.windows.step)
+            half = steps / np.where(going, 2, 1).astype(steps.dtype)
             after = problem.with_steps(half).simulated(point)
             distance = self._distance(before, after)
             going &= ~(distance <= self.step_tolerance)
@@ -576,13 +577,14 @@ class Problem:
             going &= (halvings < 2) | falls | (~np.isfinite(distance) & (halvings < STIFF_HALVINGS))
             if not going.any():
                 break
-            problem = problem.with_steps(jnp.where(jnp.asarray(going), half, problem.windows.step))
+            problem = problem.with_steps(np.where(going, half, steps))
             before, last = np.where(going[:, None, None], after, before), distance
         lost = ~np.all(np.isfinite(np.where(self._weights(before) > 0, before, 0.0)), axis=(1, 2))
         # What does not reach its end from the initial guess may do so from a better one: with steps as short as others
         # need.
         halvings = 0.0 if lost.all() else np.max(np.log2(np.asarray(first / problem.windows.step))[~lost])
-        return problem.with_steps(jnp.where(jnp.asarray(lost), first / 2.0**halvings, problem.windows.step))
+        shortest = first / first.dtype.type(2.0**halvings)
+        return problem.with_steps(np.where(lost, shortest, problem.windows.step))
 
     def _distance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """The norm (W,) of a difference of simulations, in standard deviations; infinite where one of the two ended

@@ -192,7 +192,7 @@ def cross_validate(fit: Fit, folds: int | Sequence[Sequence[int]] | None = None)
         held_out[group] = costs_by_trial(fit.problem, trained.point)[group]
         estimates.append(trained.estimates)
     owner = np.asarray(fit.problem.windows.trial)
-    counts = np.asarray(jnp.sum(fit.problem.windows.weight > 0, axis=(1, 2)))
+    counts = np.sum(np.asarray(fit.problem.windows.weight) > 0, axis=(1, 2))
     return CrossValidation(
         fit=fit,
         trials=fit.trial_names,

@@ -239,6 +239,7 @@ def eigvals(A: Float[Array, "*batch n n"]) -> Complex[Array, "*batch n"]:
     return jnp.vectorize(_values, signature="(n,n)->(n)")(A)
 
 
+@jax.jit
 def _condition(values, left, right):
     s = jnp.abs(jnp.sum(left.conj() * right, axis=-2))
     far = jax.lax.stop_gradient(jnp.abs(values[..., :, None] - values[..., None, :]))
@@ -276,6 +277,7 @@ def _keys(values):
     return -values.imag, -values.real, jnp.abs(values.imag)
 
 
+@jax.jit
 def _in_order(values):
     return values[jnp.lexsort(_keys(values))]
 

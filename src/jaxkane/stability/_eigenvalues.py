@@ -53,7 +53,8 @@ class Eigenvalues(eqx.Module):
     def __getitem__(self, mode: str) -> Complex[Array, "m n_mode"]:
         if mode not in self.modes:
             raise not_there(mode, self.modes, "these modes")
-        return self.eigenvalues[:, np.array([i for i, name in enumerate(self.modes) if name == mode])]
+        places = np.array([i for i, name in enumerate(self.modes) if name == mode])
+        return jnp.take(self.eigenvalues, places, axis=1)
 
     @property
     def stable(self) -> Any:

@@ -142,13 +142,10 @@ def linearize(
     wrong = jnp.array(False)
     if not is_concrete(*origin):
         wrong = is_not_steady(*origin, steady) | ~_parameters_are_allowed(system)
-    # Numbers in the place of NaN, which would spoil the gradients of callers who do not use it (0 * NaN).
-    at = tuple(jnp.where(jnp.all(jnp.isfinite(y)), y, 0.1) for y in (t, q, u, x, w))
-    model, follows = _derivatives((system, *at), _ModelNames(dependent, states, rows), functions)
+    model, follows = _derivatives(origin, wrong, _ModelNames(dependent, states, rows), functions)
     if is_concrete(*origin, model) and not (follows and all(np.isfinite(M).all() for M in model)):
         raise ValueError(_no_linear_model(origin, dependent, bool(follows)))
-    A, B, C, D = nan_where(wrong | ~follows, model, origin)
-    return LinearModel(A, B, C, D, states, tuple(system.inputs), rows)
+    return LinearModel(*model, states, tuple(system.inputs), rows)
 
 
 def _parameters_are_allowed(system: System) -> Array:
@@ -197,7 +194,9 @@ class _ModelNames(eqx.Module):
 
 
 @jit
-def _derivatives(at, model_names: _ModelNames, functions: dict[str, Callable[..., Any]]):
+def _derivatives(origin, wrong, model_names: _ModelNames, functions: dict[str, Callable[..., Any]]):
+    # Numbers in the place of NaN, which would spoil the gradients of callers who do not use it (0 * NaN).
+    at = (origin[0], *(jnp.where(jnp.all(jnp.isfinite(y)), y, 0.1) for y in origin[1:]))
     q, w = at[2], at[5]
     T = _tangents(*at[:3], model_names)
     x = jnp.zeros(len(model_names.states), q.dtype)
@@ -206,7 +205,7 @@ def _derivatives(at, model_names: _ModelNames, functions: dict[str, Callable[...
     B, D = jacobian(lambda w: _at_deviation(x, w, at, T, model_names, functions), w)
     # Multiplied by more than that, a rounding error is as large as what it belongs to.
     follows = jnp.max(jnp.abs(jax.lax.stop_gradient(T)), initial=0.0) < 1 / SINGULAR_ROUNDING
-    return (A, B, C, D), follows
+    return nan_where(wrong | ~follows, (A, B, C, D), origin), follows
 
 
 def _at_deviation(x, w, at, T, model_names: _ModelNames, functions: dict[str, Callable[..., Any]]):
