@@ -299,13 +299,13 @@ def test_printed_equations(name, seed, published):
 
     b = -left_minus_right(np.zeros(n))
     A = np.stack([left_minus_right(a) + b for a in np.eye(n)], axis=1)
-    M, f = equations_of_motion(system, t, q, u, inputs)
+    M, f = map(np.asarray, equations_of_motion(system, t, q, u, inputs))
     factors = np.array(ROW_FACTORS[name](p, q) if name in ROW_FACTORS else np.ones(n))
     # The rows have units of their own, so each is held to its own size; a right side may be a small difference.
     for row_M, row_f, row_A, row_b in zip(factors[:, None] * M, factors * f, A, b, strict=True):
         np.testing.assert_allclose(row_M, row_A, rtol=0, atol=RTOL * np.abs(row_A).max())
         np.testing.assert_allclose(row_f, row_b, rtol=0, atol=RTOL * (np.abs(row_A).max() + np.abs(row_b)))
-    u_dot = accelerations(system, t, q, u, inputs)
+    u_dot = np.asarray(accelerations(system, t, q, u, inputs))
     np.testing.assert_allclose(u_dot, np.linalg.solve(A, b), rtol=0, atol=RTOL * np.linalg.cond(A) * abs(u_dot).max())
     what = "final equations of Examples 1 to 6, Exercises 5.1 to 5.8"
     published("Kamman, Volume II, Unit 5", what, f"at random states, {RTOL:.0e}")

@@ -141,16 +141,16 @@ def test_forces_balance_at_the_accelerations(example):
     assert_close(M @ example.u_dot, f, 1e-11, scale)
     # F_r = sum V_r . dp/dt + W_r . dH/dt, with momenta resolved in N before they are differentiated: no omega x there
     _, momentum_rates = example.along_motion(example.momenta)
-    partials = jnp.stack(jk.partial_velocities(*example.at), axis=1)  # (b,2,3,n)
-    assert_close(Fr, jnp.einsum("bvxn,bvx->n", partials, momentum_rates), 1e-11, scale)
+    partials = np.stack(jk.partial_velocities(*example.at), axis=1)  # (b,2,3,n)
+    assert_close(Fr, np.einsum("bvxn,bvx->n", partials, momentum_rates), 1e-11, scale)
 
 
 def test_partial_velocities_and_drift_give_the_velocities(example):
     # v = V u + v_t,  omega = W u + omega_t
-    V, W = jk.partial_velocities(*example.at)
+    V, W = map(np.asarray, jk.partial_velocities(*example.at))
     _, t, q, u = example.at
     drift = example.velocities(t, q, jnp.zeros_like(u))
-    partial = jnp.stack([V @ u, W @ u], axis=1)
+    partial = np.stack([V @ u, W @ u], axis=1)
     assert_close(partial + drift, example.velocities(t, q, u), 1e-13)
 
 
@@ -161,11 +161,12 @@ def test_power_of_the_loads_is_the_rate_of_kinetic_energy(example):
     _, T_dot = example.along_motion(lambda t, q, u: jk.kinetic_energy(system, t, q, u))
     _, momentum_rates = example.along_motion(example.momenta)
     drift = example.velocities(t, q, jnp.zeros_like(u))
-    forces, velocities = example.loads(u, example.inputs)
-    _, load_drift = example.loads(jnp.zeros_like(u), example.inputs)
-    prescribed = jnp.sum(momentum_rates * drift) - jnp.sum(forces * load_drift)
-    scale = np.abs(np.array(momentum_rates * example.velocities(t, q, u))).sum() + np.abs(forces * velocities).sum()
-    assert_close(T_dot, jnp.sum(forces * velocities) + prescribed, 1e-12, scale)
+    forces, velocities = map(np.asarray, example.loads(u, example.inputs))
+    _, load_drift = map(np.asarray, example.loads(jnp.zeros_like(u), example.inputs))
+    momentum_rates, drift = np.asarray(momentum_rates), np.asarray(drift)
+    prescribed = np.sum(momentum_rates * drift) - np.sum(forces * load_drift)
+    scale = np.abs(momentum_rates * example.velocities(t, q, u)).sum() + np.abs(forces * velocities).sum()
+    assert_close(T_dot, np.sum(forces * velocities) + prescribed, 1e-12, scale)
 
 
 def test_conservative_says_whether_energy_is_kept(example):
@@ -212,10 +213,9 @@ def test_derivatives_equal_central_differences(example):
         system, q, u = unravel(x)
         return jk.accelerations(system, T, q, u, example.inputs)
 
-    directions = jnp.eye(x.size)
-    h = 1e-5 * jnp.maximum(jnp.abs(x), 0.1)
-    steps = directions @ jnp.diag(h)
-    weights = jnp.array(INPUTS[: example.u.size])
+    directions = np.eye(x.size)
+    steps = np.diag(1e-5 * np.maximum(np.abs(x), 0.1))
+    weights = INPUTS[: example.u.size]
 
     @jax.jit
     def derivatives(x):
@@ -223,8 +223,8 @@ def test_derivatives_equal_central_differences(example):
         forward = jax.vmap(lambda dx: jax.jvp(f, (x,), (dx,))[1])(directions)
         return differences, forward, jax.grad(lambda x: weights @ f(x))(x)
 
-    differences, forward, reverse = derivatives(x)
-    sizes = jnp.abs(directions @ x)[:, None]  # a derivative by a small parameter is judged by what the parameter does
+    differences, forward, reverse = map(np.asarray, derivatives(x))
+    sizes = np.abs(x)[:, None]  # a derivative by a small parameter is judged by what the parameter does
     for derivative, difference in zip(forward * sizes, differences * sizes, strict=True):
         assert_close(derivative, difference, rtol, scale=np.abs(difference).max() + 1e-3 * np.abs(example.u_dot).max())
 

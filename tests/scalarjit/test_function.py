@@ -121,7 +121,9 @@ def test_every_operation_as_windows(dtype, by_xla, monkeypatch):
     ):
         found = jax.jit(lambda f=f: f(ScalarFunction(many)))()
         jax.tree.map(
-            lambda x, y: np.testing.assert_allclose(x, y, rtol=20 * jnp.finfo(dtype).eps, strict=True), found, f(many)
+            lambda x, y: np.testing.assert_allclose(x, y, rtol=20 * jnp.finfo(dtype).eps, strict=True),
+            found,
+            jax.jit(lambda f=f: f(many))(),
         )
 
 
@@ -346,9 +348,9 @@ def test_a_program_is_transposed_as_jax_transposes_it():
         linear = functools.partial(moving_about, jnp.array(a))
         cts = [jnp.cos(jnp.arange(1.0, out.size + 1.0)).reshape(out.shape) for out in linear(x, y)]
         cts[-1] = jnp.zeros(())  # of what does not follow from them
-        expected = jax.vjp(linear, x, y)[1](tuple(cts))
+        expected = jax.jit(lambda *cts, linear=linear: jax.vjp(linear, x, y)[1](cts))(*cts)
         traced = cse(jax.make_jaxpr(lambda a, x, y, z: moving_about(a, x, y))(a, x, y, unused))
-        found = jaxpr_as_fun(transposed_program(traced, [1, 2, 3]))(jnp.array(a), *cts)
+        found = jax.jit(jaxpr_as_fun(transposed_program(traced, [1, 2, 3])))(jnp.array(a), *cts)
         for ours, theirs in zip(found, (*expected, jnp.zeros(())), strict=True):
             np.testing.assert_allclose(ours, theirs, rtol=rtol)
 
@@ -370,9 +372,9 @@ def test_the_derivative_of_a_program_is_that_of_jax(moving):
     program = cse(jax.make_jaxpr(of_many_operations)(*args))
     tangent, moves = tangent_program(program, moving)
     assert moves == (True, True, False, False, 0 in moving, False, False, False)
-    found = jaxpr_as_fun(tangent)(*args, *dxs)
+    found = jax.jit(jaxpr_as_fun(tangent))(*args, *dxs)
     of_moving = lambda *xs: of_many_operations(*[dict(zip(moving, xs)).get(i, x) for i, x in enumerate(args)])  # noqa: E731
-    expected = jax.jvp(of_moving, [args[i] for i in moving], dxs)[1]
+    expected = jax.jit(lambda *dxs: jax.jvp(of_moving, [args[i] for i in moving], [*dxs])[1])(*dxs)
     for ours, theirs in zip(found, [dy for dy, m in zip(expected, moves) if m], strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=rtol)
     # Nor is anything left in it that could be found once more, or that no result needs.
@@ -473,9 +475,9 @@ def test_value_and_derivative_as_one_operation(shape, modes, native):
     for mode in reversed(modes):
         ours, plain = mode(ours), mode(plain)
     v = jnp.array([0.3, 0.7])
-    np.testing.assert_allclose(jax.jit(ours)(v), plain(v), rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(jax.jit(ours)(v), jax.jit(plain)(v), rtol=1e-13, atol=1e-14)
     vs = jnp.stack([v, 2.0 * v, -v])
-    np.testing.assert_allclose(jax.jit(jax.vmap(ours))(vs), jax.vmap(plain)(vs), rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(jax.jit(jax.vmap(ours))(vs), jax.jit(jax.vmap(plain))(vs), rtol=1e-13, atol=1e-14)
 
 
 @pytest.mark.parametrize("shape", [once, in_a_loop])
@@ -488,7 +490,8 @@ def test_value_and_derivative_as_one_operation_by_linearize_and_in_batches(shape
         np.testing.assert_allclose(slope(dv), jax.jvp(plain, (v,), (dv,))[1], rtol=1e-14)
     vs = jnp.stack([(1.0 + 0.01 * i) * v for i in range(150)])  # more than XLA takes at once
     for derivative in (lambda f: jax.vmap(FWD(f)), lambda f: lambda vs: jnp.sum(FWD(jax.vmap(f))(vs), axis=2)):
-        np.testing.assert_allclose(jax.jit(derivative(ours))(vs), derivative(plain)(vs), rtol=1e-12, atol=1e-13)
+        found, expected = (jax.jit(derivative(f))(vs) for f in (ours, plain))
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-13)
 
 
 def test_value_and_derivative_are_one_kernel(native):
