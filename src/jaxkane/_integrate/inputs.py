@@ -174,9 +174,8 @@ class RateArguments(NamedTuple):
 
     def sampled(self, times: Array) -> dict[str, Array]:
         """The signals that are samples at some times (n,), all of which are looked up at once."""
-        return (
-            {} if callable(self.signals) else {k: jax.vmap(x)(times) for k, x in self.signals.items() if _is_samples(x)}
-        )
+        signals = {} if callable(self.signals) else self.signals
+        return {name: jax.vmap(x)(times) for name, x in signals.items() if _is_samples(x)}
 
     def with_numbers(self, inputs: dict[str, Array]) -> RateArguments:
         """With numbers for some of the signals."""
