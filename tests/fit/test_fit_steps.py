@@ -86,6 +86,15 @@ def test_steps_too_coarse_are_told_or_halved(trial):
     assert len(finer.history) > len(direct.history)
 
 
+def test_steps_are_halved_where_that_changes_anything(trial):
+    at_rest = Trial(
+        t, {"x": np.zeros(t.size)}, {"push": np.zeros(t.size)}, sigma=SIGMA, initial={"x": 0.0, "x_dot": 0.0}
+    )
+    steps = np.asarray(Problem.of(GUESS, [trial, at_rest], NAMES).windows.step)
+    assert steps[0] < H / 2
+    assert steps[1] == H
+
+
 def test_a_step_longer_than_a_window_is_one_that_halving_shortens(trial):
     posed = [Problem.of(GUESS, trial, NAMES, simulation=Simulation(step=x)) for x in (t[-1], 100.0 * t[-1])]
     errors = [problem.step_errors(problem.start) for problem in posed]

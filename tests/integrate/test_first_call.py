@@ -11,8 +11,10 @@ import pytest
 import jaxkane as jk
 from jaxkane._integrate.integrate import solve
 from jaxkane._integrate.settings import settings_for
+from jaxkane._scalarjit.backends import native
 from jaxkane._scalarjit.compat import nothing_is_traced
 from jaxkane._scalarjit.function import ScalarFunction
+from jaxkane.catalog import DoublePendulum
 
 TS = jnp.linspace(0.0, 1.0, 11)
 
@@ -142,6 +144,14 @@ def _two(scale, x):
     (a, b), t = x
     product = a * b
     return {"product": [scale * product, 3.0], "sum": (a + b * t, jnp.where(a > b, a, b) / 2.0), "zero": 0.0 * t}
+
+
+@pytest.mark.skipif(not native.is_on(), reason="the stages are a loop without native kernels")
+def test_samples_are_looked_up_at_all_stages_of_a_step_together():
+    push = {"shoulder_torque": jk.Samples(TS, jnp.cos(TS))}
+    q, u = jnp.zeros(2), jnp.zeros(2)
+    program = jax.make_jaxpr(lambda q: jk.simulate(DoublePendulum(), jk.State(q, u), TS, push).q)(q)
+    assert "bool[7,11]" in str(program)  # seven stages, eleven samples
 
 
 def test_a_record_gives_what_was_asked_for_and_keeps_exact_values():

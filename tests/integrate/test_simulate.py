@@ -338,6 +338,37 @@ def test_going_on_from_where_a_ride_ended():
     np.testing.assert_allclose(second.q[-1], whole.q[-1], atol=1e-9)
 
 
+def test_times_and_samples_that_cannot_be_are_told_under_a_trace():
+    """Where no check sees the numbers."""
+    kinds = (False, True)
+
+    @jax.jit
+    @jax.vmap
+    def statuses(ts, knots, values):
+        rides = [jk.simulate(PENDULUM, START, ts)]
+        rides += [jk.simulate(PENDULUM, START, TS, {"shoulder_torque": jk.Samples(knots, values, k)}) for k in kinds]
+        return [ride.status for ride in rides]
+
+    def with_entry(x, place, value):
+        x = np.array(x)
+        x[place] = value
+        return x
+
+    knots, values = np.linspace(-0.5, 1.5, 9), np.ones(9)
+    wrong = [(0, -np.inf), (0, np.nan), (-1, np.inf), (-1, np.nan), (4, np.nan), (4, 9.0)]
+    of_times = statuses(
+        np.stack([with_entry(TS, *entry) for entry in wrong]),
+        np.stack([with_entry(knots, *entry) for entry in wrong]),
+        np.stack([values] * len(wrong)),
+    )
+    np.testing.assert_array_equal(of_times, jk.Status.INVALID)
+    places = [with_entry(values, i, x) for i in (0, 4, -1) for x in (np.nan, np.inf)]
+    good = [np.stack([np.asarray(x)] * (len(places) + 1)) for x in (TS, knots)]
+    _, *of_values = statuses(*good, np.stack([*places, values]))
+    np.testing.assert_array_equal(np.array(of_values)[:, :-1], jk.Status.INVALID)
+    np.testing.assert_array_equal(np.array(of_values)[:, -1], jk.Status.COMPLETED)
+
+
 def test_progress_is_shown_on_request_only(capfd):
     jk.simulate(PENDULUM, START, TS)
     assert capfd.readouterr() == ("", "")
