@@ -216,6 +216,14 @@ def rates(system: System, t: Array, q: Array, u: Array, values: dict[str, Array]
     return unpacked(system, vector_field(system, t, packed(State(q, u, x)), values))
 
 
+def rates_by_numpy(system: System, t: Any, q: Any, u: Any, x: Any, inputs: dict[str, Any]) -> State | None:
+    """`rates` of numbers without compiling; None where NumPy cannot evaluate them."""
+    args = system, t, packed(State(q, u, x if system.states else None)), inputs
+    if not is_written_out(len(system.speeds)) or not _vector_field.is_numpy(*args):
+        return None
+    return unpacked(system, _vector_field.numpy(*args))
+
+
 def vector_field(system: System, t: Array, y: Array, inputs: Mapping[str, Any], forward: bool = False) -> Array:
     """The right-hand side as a solver asks for it: of a packed state (n_q + n_u + n_x,), packed, so that one array goes
     through the steps. `forward`: with its derivative in forward mode as one operation."""

@@ -17,7 +17,7 @@ from .._kane.arguments import as_array, check_is_system, check_time, checked_val
 from .._kane.checks import check_system
 from .._kane.constraints import configuration_residual
 from .._kane.equations import dependent_speeds, diagnosis
-from .._kane.rhs import rates, values_of
+from .._kane.rhs import rates, rates_by_numpy, values_of
 from .._scalarjit.cache_key import Cache, jit, version_of
 from .._scalarjit.compat import concretely
 from .._scalarjit.components import Component
@@ -425,7 +425,11 @@ def is_not_steady(system: System, t, q, u, x, w, steady: bool):
 
 def check_steady(system: System, t, q, u, x, w, steady: bool) -> None:
     name = type(system).__name__
-    q_dot, u_dot, x_dot, h = map(np.asarray, _all_rates(system, t, q, u, x, w))
+    if rate := rates_by_numpy(system, t, q, u, x, inputs_by_name(system, w)):
+        found = rate.q, rate.u, x if rate.x is None else rate.x, configuration_residual.numpy(system, t, q)
+    else:
+        found = _all_rates(system, t, q, u, x, w)
+    q_dot, u_dot, x_dot, h = map(np.asarray, found)
     tol, slack = _tolerances(system, u)
     names = (*system.coordinates, *system.speeds, *system.states, *system.inputs, "t")
     values = np.concatenate([np.asarray(y) for y in (q, u, x, w, t[None])])
