@@ -142,10 +142,10 @@ def linearize(
     wrong = jnp.array(False)
     if not is_concrete(*origin):
         wrong = is_not_steady(*origin, steady) | ~_parameters_are_allowed(system)
-    model, follows = _derivatives(origin, wrong, _ModelNames(dependent, states, rows), functions)
-    if is_concrete(*origin, model) and not (follows and all(np.isfinite(M).all() for M in model)):
+    (A, B, C, D), follows = _derivatives(origin, wrong, _ModelNames(dependent, states, rows), functions)
+    if is_concrete(*origin, A) and not (follows and all(np.isfinite(M).all() for M in (A, B, C, D))):
         raise ValueError(_no_linear_model(origin, dependent, bool(follows)))
-    return LinearModel(*model, states, tuple(system.inputs), rows)
+    return LinearModel(A, B, C, D, states, tuple(system.inputs), rows)
 
 
 def _parameters_are_allowed(system: System) -> Array:
