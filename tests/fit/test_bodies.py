@@ -44,6 +44,17 @@ def test_every_number_is_a_possible_body_and_back(moves, wheel):
         np.testing.assert_allclose(back(jnp.asarray(x)), x, rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize("jacobian", [jax.jacfwd, jax.jacrev])
+def test_values_of_numbers_and_of_bodies_are_one_program(jacobian):
+    """Where they are not, a warning ends the test."""
+    free = ("c", Free("zB", bounds=(None, -0.1)), frame_inertia("H"), frame_inertia("F", fixed=()))
+    parameters = parameters_of(BICYCLE, free)
+    values = lambda x: parameters.values(x)  # noqa: E731, JAX hashes methods
+    x = jnp.linspace(-0.3, 0.2, parameters.size)
+    np.testing.assert_allclose(jax.jit(values)(x), values(x), rtol=1e-14)
+    np.testing.assert_allclose(jax.jit(jacobian(values))(x), parameters.slopes(x), rtol=1e-13, atol=1e-14)
+
+
 @pytest.mark.slow
 def test_intervals_and_their_inverse():
     free = (

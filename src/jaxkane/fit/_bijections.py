@@ -129,15 +129,18 @@ class PossibleBody(eqx.Module):
         return len(self.moves)
 
     def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        return self.all_values(self.factors(x))[np.array(self.moves)]
+        values = self.all_values(self.factors(x))
+        return jnp.stack([values[i] for i in self.moves])
 
     def factors(self, x: Float[Array, " n"]) -> Float[Array, " 10"]:
         """All ten factors, [a, t1, t2, t3, d1, d2, d3, s12, s13, s23]."""
-        factors = self.start.at[np.array(self.moves)].add(self.scale[np.array(self.moves)] * x)
+        factors = [*self.start]
+        for i, step in zip(self.moves, x, strict=True):
+            factors[i] = factors[i] + self.scale[i] * step
         if self.wheel:
             a, b = self.wheel
-            factors = factors.at[4 + b].set(factors[4 + a])
-        return factors
+            factors[4 + b] = factors[4 + a]
+        return jnp.stack(factors)
 
     def inverse(self, values: Float[Array, " n"]) -> Float[Array, " n"]:
         full = self.all_values(self.start).at[np.array(self.moves)].set(values)
