@@ -95,7 +95,7 @@ def _count(ts: Array, t: Array) -> Array:
         shape = (*t.shape, ts.size)
         until = jnp.broadcast_to(ts, shape) <= jnp.broadcast_to(t[..., None], shape)
         return jnp.sum(until, axis=-1, dtype=jnp.int32)
-    return jnp.searchsorted(ts, t, side="right").astype(jnp.int32)
+    return jnp.searchsorted(ts, t, side="right")
 
 
 @jax.custom_batching.custom_vmap
@@ -179,7 +179,7 @@ class RateArguments(NamedTuple):
 
     def with_numbers(self, inputs: dict[str, Array]) -> RateArguments:
         """With numbers for some of the signals."""
-        return self._replace(signals=self.signals | inputs) if inputs else self
+        return self._replace(signals=self.signals | inputs)
 
 
 _CONTROLLER = "The function of the inputs"

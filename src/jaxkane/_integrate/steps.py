@@ -179,7 +179,8 @@ class UnrolledERK(diffrax.AbstractAdaptiveSolver[Any]):
 
     diffrax makes one loop of the stages, so that the right-hand side is compiled once. Where that is a native kernel, a
     call of it costs nothing to compile, and the loop costs more than the stages: it carries all of them in one array,
-    which XLA transposes in each. The numbers are those of `method`, to rounding errors.
+    which XLA transposes in each. Samples are looked up at the times of all stages together. The numbers are those of
+    `method`, to rounding errors.
     """
 
     method: diffrax.AbstractERK
@@ -206,12 +207,11 @@ class UnrolledERK(diffrax.AbstractAdaptiveSolver[Any]):
     def step(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any) -> Any:
         tableau: Any = self.method.tableau
         h, times = terms.contr(t0, t1), [t0, *(t1 if c == 1 else t0 + float(c) * (t1 - t0) for c in tableau.c)]
-        knows = isinstance(args, RateArguments)
-        sampled = args.sampled(jnp.stack(times)) if knows else {}
-        at_once = jax.jit(lambda t, y, now: terms.vf(t, y, args.with_numbers(now) if knows else args))
+        sampled = args.sampled(jnp.stack(times)) if isinstance(args, RateArguments) else {}
+        rates_at = jax.jit(lambda t, y, numbers: terms.vf(t, y, args.with_numbers(numbers) if numbers else args))
 
         def rates(i: int, y: Array) -> Array:
-            return at_once(times[i], y, {name: x[i] for name, x in sampled.items()})
+            return rates_at(times[i], y, {name: x[i] for name, x in sampled.items()})
 
         if solver_state is None:
             f = rates(0, y0)

@@ -16,7 +16,7 @@ from .._system.system import System
 from ._bijections import Interval
 from ._declarations import CalibrationTerm, Delay, Free
 from ._model import Simulation, Unknowns
-from ._parameters import as_items, parameters_of
+from ._parameters import as_items, parameters_of, with_entries
 from ._problem import Names, Problem, ProblemSpec, deviations_by_name
 from ._result import Fit
 
@@ -275,7 +275,7 @@ def mapped_point(source: Problem, at: Unknowns, problem: Problem, names: Sequenc
     source_names, targets = source.parameters.names, problem.parameters.names
     if bool(eqx.tree_equal(problem.system, source.system)):
         to, of = (np.array([one.index(name) for name in names], dtype=int) for one in (targets, source_names))
-        point = eqx.tree_at(lambda p: p.x, point, _with(point.x, to, np.asarray(at.x)[of]))
+        point = eqx.tree_at(lambda p: p.x, point, on_device(with_entries(point.x, to, np.asarray(at.x)[of])))
     else:
         values = np.asarray(source.parameters.values(at.x))
         point = problem.at({name: float(values[source_names.index(name)]) for name in names}, point)
@@ -284,11 +284,6 @@ def mapped_point(source: Problem, at: Unknowns, problem: Problem, names: Sequenc
     for pairs, where in ((b, lambda p: p.b), (z, lambda p: p.z)):
         if pairs:
             to, of = (np.array(places, dtype=int) for places in zip(*pairs, strict=True))
-            point = eqx.tree_at(where, point, _with(where(point), (slice(None), to), np.asarray(where(at))[:, of]))
+            columns = with_entries(np.asarray(where(point)).T, to, np.asarray(where(at)).T[of])
+            point = eqx.tree_at(where, point, on_device(columns.T))
     return point
-
-
-def _with(x: Any, places: Any, values: np.ndarray) -> Any:
-    new = np.array(x)
-    new[places] = values
-    return on_device(new)

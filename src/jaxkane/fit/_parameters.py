@@ -136,7 +136,7 @@ class Parameters(eqx.Module):
 
     def all(self, x: Float[Array, " p"]) -> Float[Array, " all"]:
         """The x of all of them."""
-        every = _with(self.rest, self.places, x)
+        every = with_entries(self.rest, self.places, x)
         return every if _are_traced(every) else on_device(every)
 
     @property
@@ -172,12 +172,12 @@ class Parameters(eqx.Module):
 
     def inverse(self, values: Float[Array, " p"]) -> Float[Array, " p"]:
         """The x (p,) of parameters in their own units; NaN outside their bounds."""
-        every = _with(self._each(_value, self.rest), self.places, values)
+        every = with_entries(self._each(_value, self.rest), self.places, values)
         return self._of_free(self._each(_inverse, every))
 
     def slopes(self, x: Float[Array, " p"]) -> Float[Array, "p p"]:
         """d values / d x."""
-        return self._of_free(self._each(_slope, _with(self.rest, self.places, x)))
+        return self._of_free(self._each(_slope, with_entries(self.rest, self.places, x)))
 
     def _each(self, evaluate: Any, numbers: Any) -> Any:
         """Of every bijection, joined: vectors in a row, matrices on the diagonal. Numbers are evaluated by a program of
@@ -201,7 +201,7 @@ class Parameters(eqx.Module):
         return sum((jnp.linalg.slogdet(jax.jacfwd(f)(part))[1] for f, part in pairs), jnp.zeros((), x.dtype))
 
     def _all_values(self, x: Float[Array, " p"]) -> Any:
-        every = _with(self.rest, self.places, x)
+        every = with_entries(self.rest, self.places, x)
         return jnp.stack(_values(self.bijections, every)) if _are_traced(self, every) else self._each(_value, every)
 
     def _parts(self, x: Any) -> list[Any]:
@@ -265,9 +265,10 @@ def _are_traced(*numbers: Any) -> bool:
     return any(isinstance(x, Tracer) for x in jax.tree.leaves(numbers))
 
 
-def _with(every: Any, places: Any, some: Any) -> Any:
+def with_entries(every: Any, places: Any, some: Any) -> Any:
+    """`every` with `some` at `places` of its first axis, each of them once; an array of NumPy unless one is traced."""
     if _are_traced(every, places, some):
-        # Of places that are told to differ, the derivative is found at once.
+        # Told that the places differ, JAX differentiates this as one assignment; else as ten kernels.
         return jnp.asarray(every).at[places].set(some, unique_indices=True, mode="promise_in_bounds")
     every = np.array(every)
     every[np.asarray(places)] = some

@@ -425,10 +425,11 @@ def is_not_steady(system: System, t, q, u, x, w, steady: bool):
 
 def check_steady(system: System, t, q, u, x, w, steady: bool) -> None:
     name = type(system).__name__
-    if rate := rates_by_numpy(system, t, q, u, x, inputs_by_name(system, w)):
-        found = rate.q, rate.u, x if rate.x is None else rate.x, configuration_residual.numpy(system, t, q)
-    else:
+    rate = rates_by_numpy(system, t, q, u, x, inputs_by_name(system, w))
+    if rate is None:
         found = _all_rates(system, t, q, u, x, w)
+    else:
+        found = rate.q, rate.u, x if rate.x is None else rate.x, configuration_residual.numpy(system, t, q)
     q_dot, u_dot, x_dot, h = map(np.asarray, found)
     tol, slack = _tolerances(system, u)
     names = (*system.coordinates, *system.speeds, *system.states, *system.inputs, "t")
