@@ -148,6 +148,22 @@ def test_windows_are_not_cut(by_xla, monkeypatch):
     assert sines[0] == 2 < sines[1000]
 
 
+@pytest.mark.parametrize("name", TRANSFORMATIONS)
+@pytest.mark.parametrize("long", [False, True], ids=["short", "long"])
+def test_on_a_gpu_a_short_program_is_one_kernel(name, long, monkeypatch):
+    monkeypatch.setattr(xla, "_LONG", 0 if long else 1000)
+    f = jax.jit(TRANSFORMATIONS[name](ScalarFunction(plain)))
+    text = f.trace(*ARGUMENTS).lower(lowering_platforms=("cuda",)).as_text()
+    sines, windows = text.count("stablehlo.sine"), text.count("stablehlo.reduce_window")
+    assert windows == 0 if long else windows >= sines > 0  # one in each of its programs, that of values or a derivative
+
+
+def test_an_empty_batch_on_a_gpu():
+    f = jax.jit(jax.vmap(ScalarFunction(plain), in_axes=(None, None, 0)))
+    text = f.trace(*ARGUMENTS[:2], jnp.zeros((0, 2))).lower(lowering_platforms=("cuda",)).as_text()
+    assert "stablehlo.reduce_window" not in text
+
+
 def test_repetition_goes():
     once = cse(jax.make_jaxpr(lambda x: jnp.sin(x) + jnp.sin(x) * jnp.cos(x) + 0.0 * jnp.tan(x))(1.0))
     names = [e.primitive.name for e in once.jaxpr.eqns]

@@ -198,10 +198,11 @@ def new_primitive(
     batch: Callable[..., Any],
     traced: Callable[..., Any],
     lower_on_cpu: Callable[..., Any],
+    traced_on_gpu: Callable[..., Any] | None = None,
     parts: Callable[..., Any] | None = None,
 ) -> Any:
     """An operation of JAX with several results and these rules; `traced` is what it stands for, `lower_on_cpu` makes
-    its text for XLA there. `parts`: see `_partially_evaluated`."""
+    its text for XLA there. `traced_on_gpu`: what it stands for under CUDA; `parts`: see `_partially_evaluated`."""
     primitive = Primitive(name)
     primitive.multiple_results = True
     primitive.def_impl(evaluate)
@@ -211,6 +212,8 @@ def new_primitive(
     batching.primitive_batchers[primitive] = batch
     mlir.register_lowering(primitive, mlir.lower_fun(traced, multiple_results=True))
     mlir.register_lowering(primitive, lower_on_cpu, platform="cpu")
+    if traced_on_gpu is not None:
+        mlir.register_lowering(primitive, mlir.lower_fun(traced_on_gpu, multiple_results=True), platform="cuda")
     if parts is not None:
         custom_partial_eval_rules[primitive] = functools.partial(_partially_evaluated, primitive, parts)
     return primitive

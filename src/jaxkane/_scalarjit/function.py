@@ -574,6 +574,12 @@ def _inlined(*args, program, sizes, where):
     return (program.batched(sizes, where) if sizes else program).evaluate(*args)
 
 
+def _on_gpu(*args, program, sizes, where):
+    if program.is_fusable and 0 not in sizes and program.windows and not program.windows.is_long:
+        return program.windows(args, sizes, where, program.out_where(where))
+    return _inlined(*args, program=program, sizes=sizes, where=where)
+
+
 def _by_xla(*args, program, sizes, where):
     out_where = program.out_where(where)
     if in_chunks := chunks_of(sizes):
@@ -610,5 +616,6 @@ if MISSING is None:
         batch=_batch,
         traced=_inlined,
         lower_on_cpu=_lower_on_cpu,
+        traced_on_gpu=_on_gpu,
         parts=_parts,
     )

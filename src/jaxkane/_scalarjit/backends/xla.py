@@ -1,4 +1,4 @@
-"""A program as one function of XLA:CPU.
+"""A program as one function of XLA.
 
 XLA cuts a program of scalars into many kernels, and repeats in each what several divisions read: two thousand
 operations become eight thousand. There are two ways around that. XLA does not cut the function by which
@@ -74,7 +74,7 @@ class Windows:
         elements = [self._element(rows, shape, k, dtype) for k, _, dtype in self.elements]
         starts, ones = tuple(np.zeros((), dtype)[()] for *_, dtype in self.elements), (1,) * len(shape)
         combine = lambda *xs: jax.lax.reduce_window(xs, starts, self._combined, ones, ones, "VALID")  # noqa: E731
-        if len(self.order) > _LONG:
+        if self.is_long:
             with one_function():
                 combined = jax.jit(combine)(*elements)
         else:
@@ -86,6 +86,10 @@ class Windows:
             x[tuple(slice(None) if is_there else 0 for is_there in has)]
             for x, has in zip(whole, out_where, strict=True)
         ]
+
+    @property
+    def is_long(self) -> bool:
+        return len(self.order) > _LONG
 
     def _element(self, rows: Sequence[Any], shape: tuple[int, ...], node: int | None, dtype: str) -> Any:
         if node is None:
