@@ -164,6 +164,17 @@ def test_an_empty_batch_on_a_gpu():
     assert "stablehlo.reduce_window" not in text
 
 
+@pytest.mark.parametrize("whole", [jnp.int32(3), jnp.array([1, 2])], ids=["int32", "two of int64"])
+@pytest.mark.parametrize("transform", ["jit", "batch"])
+@pytest.mark.filterwarnings("ignore:.*its description uses a result of int")
+def test_whole_numbers_among_the_results(whole, transform, kernels):
+    f = ScalarFunction(lambda a, b, x: (plain(a, b, x)[0], whole))
+    _, found = jax.jit(TRANSFORMATIONS[transform](f))(*ARGUMENTS)
+    np.testing.assert_array_equal(found, jnp.broadcast_to(whole, found.shape), strict=True)
+    np.testing.assert_array_equal(f.numpy(*ARGUMENTS)[1], whole, strict=True)
+    jax.jit(TRANSFORMATIONS[transform](f)).trace(*ARGUMENTS).lower(lowering_platforms=("cuda",))
+
+
 def test_repetition_goes():
     once = cse(jax.make_jaxpr(lambda x: jnp.sin(x) + jnp.sin(x) * jnp.cos(x) + 0.0 * jnp.tan(x))(1.0))
     names = [e.primitive.name for e in once.jaxpr.eqns]

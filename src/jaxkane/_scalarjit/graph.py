@@ -136,7 +136,11 @@ def graph_of(program: ClosedJaxpr) -> tuple[Graph, list[np.ndarray]]:
     """A program as a graph, and its outputs as arrays of node numbers. Element e of argument i is an input (i, e, the
     argument's size)."""
     graph, inputs = Graph(), []
-    for i, aval in enumerate(types_of(program)[0]):
+    given, results = types_of(program)
+    for aval in results:
+        if str(aval.dtype) not in DTYPES:  # whole numbers are no nodes
+            raise NotScalarError(f"a result of {aval.dtype}")
+    for i, aval in enumerate(given):
         elements = [graph.add("input", (i, e, aval.size), str(aval.dtype)) for e in range(aval.size)]
         inputs.append(np.array(elements, np.int64).reshape(aval.shape))
     return graph, unrolled(program, inputs, graph)
