@@ -11,8 +11,8 @@ us an evaluation; in a batch of 128, 0.72 and 0.22 us. Its derivative along 27 d
 and 12.7 us. Whatever is executed with windows in it takes 0.1 us longer for each of their operations, once and not in
 each step of a loop.
 
-XLA:GPU compiles windows too (jax 0.11, H200): 65 536 rides of the bicycle first take 4.8 s instead of 9.6, and then 97 ms
-instead of 125. A derivative of 4700 operations did not compile within a minute.
+XLA:GPU compiles windows too (jax 0.11, H200): 65 536 rides of the bicycle first take 4.8 s instead of 9.6, and then
+97 ms instead of 125. A derivative of 4700 operations did not compile within a minute.
 """
 
 from __future__ import annotations
