@@ -1,11 +1,13 @@
 """Many motions at once: each as if it were alone."""
 
+import jax
 import numpy as np
 import pytest
 from mechanisms import Bead, Slider
 
 import jaxkane as jk
 from jaxkane.catalog import DoublePendulum
+from jaxkane.sweep._chunks import Task
 
 TS = np.linspace(0.0, 1.0, 6)
 
@@ -39,6 +41,22 @@ def test_members_move_as_if_alone(rides):
         for end in (rides.trajectory.end, rides.member(i).end):
             q = end.q if end.q.ndim == 1 else end.q[i]
             np.testing.assert_allclose(q, alone.end.q, atol=1e-12)
+
+
+def test_off_the_cpu_chunks_are_larger_and_one_batch(monkeypatch):
+    sizes, solve = [], Task.solve
+
+    def counted(task, members, size):
+        sizes.append(size)
+        return solve(task, members, size)
+
+    monkeypatch.setattr(Task, "solve", counted)
+    here = jk.sweep.sweep(Ring(), starts(300), TS)
+    assert sizes == [256, 256]
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")  # which is all that is asked
+    there = jk.sweep.sweep(Ring(), starts(300), TS)
+    assert sizes[2:] == [320]  # ten groups
+    np.testing.assert_allclose(there.q, here.q, rtol=0, atol=1e-12)
 
 
 def test_a_member_with_a_body_that_cannot_be_is_invalid():

@@ -362,5 +362,6 @@ def test_what_is_given_twice_is_refused():
             jk.sweep.sweep(dataclasses.replace(Drop(), mass=np.ones(2)), REST, TS, table=table)
         with pytest.raises(ValueError, match=r"given twice: push \(a column of the table, and in `inputs`\)"):
             jk.sweep.sweep(Drop(), REST, TS, {"push": 1.0}, table={**dict(mass=[1.0, 2.0]), "push": [0.0, 1.0]})
-    with pytest.raises(ValueError, match="`chunk` is a number of members"):
-        run(chunk=0)
+    for chunk in (0, "32", 2.5):
+        with pytest.raises(ValueError, match=f"`chunk` is a number of members, at least one; got {chunk!r}"):
+            run(chunk=chunk)
