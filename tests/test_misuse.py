@@ -303,6 +303,8 @@ NO_NUMBERS = {
     "complexes": [1j, 0.0],
     "uneven": [[1.0], [1.0, 2.0]],
     "object": object(),
+    "a duration": np.timedelta64(1, "s"),
+    "masked": np.ma.masked,
     "three numbers": [0.0, 0.1, 0.2],
 }
 AT = {"t": 0.0, "q": [0.3], "u": [0.5], "inputs": {"torque": 1.0}}

@@ -57,6 +57,25 @@ def posed(system, free, *trials, **options):
     return Problem.of(system, trials, free, simulation=Simulation(step=0.5), **options)
 
 
+def test_a_start_that_is_measured_later_is_no_start():
+    wire = Wire(follows=("y",))
+    gap = {"x": [np.nan, 0.3, 0.4]}
+    late = Trial(np.arange(5.0), {"x": [0.1, 0.2, np.nan, 0.4, 0.5]}, sigma=0.1, name="late")
+    for trials, options, where in (
+        ([Trial(t, gap, sigma=0.1, initial={"x_dot": 0.6}, name="late")], {}, 0),
+        ([late], {"window": 2.0}, 2),
+        ([late.between(0.0, 1.0), late.between(2.0, 4.0)], {}, 2),
+    ):
+        message = rf"late: x is not measured at t = {where} s, where a window starts. Name it in `unknown`"
+        with pytest.raises(ValueError, match=message):
+            posed(wire, ["mass"], *trials, **options)
+        posed(wire, ["mass"], *trials, **options, unknown=["x"])
+    posed(wire, ["mass"], late)
+    posed(wire, ["mass"], Trial(t, gap, sigma=0.1, initial={"x": 0.2}))
+    posed(wire, ["mass"], Trial(t, {"x": [0.2, np.nan, 0.4], "y": [np.nan, 0.7, 0.6]}, sigma=0.1))
+    posed(wire, ["mass"], Trial(t, gap | {"x_dot": [np.nan] * 3}, sigma=0.1), unknown=["x"])
+
+
 def starts(problem):
     """The coordinates (W, n_q) where the windows start."""
     consistent = jax.jit(jax.vmap(lambda window, z: problem.model.consistent(window, z, problem.start.x)))

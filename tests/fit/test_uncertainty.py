@@ -6,7 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from systems import Cart
+from systems import POSED, PUSH, Cart, Track
+from systems import T as SAMPLED
 from test_transcriptions import GUESS, TRUTH, record
 
 import jaxkane as jk
@@ -74,6 +75,26 @@ def test_intervals_hold_the_truth_as_often_as_they_say(problem):
         hits += [low <= float(getattr(TRUTH, name)) <= high for name, (low, high) in found.intervals(level).items()]
     # 32 of 40 are expected; a binomial count is outside 24 to 38 once in a hundred.
     assert np.all((hits >= 24) & (hits <= 38)), hits
+
+
+def test_intervals_beside_a_bound_hold_the_truth():
+    """They are those of a fit without the bound, and end there."""
+    rng, hits, beside = np.random.default_rng(5), 0, 0
+    for _ in range(40):
+        noisy = Trial(SAMPLED, {"x": rng.normal(0.0, 0.005, SAMPLED.size)}, {"push": PUSH}, sigma=0.005)
+        free, bounded = (
+            minimize(Problem.of(Track(), noisy, [gain, "drift"], **POSED), LeastSquares())
+            for gain in ("gain", Free("gain", bounds=(-0.05, 5.0)))  # it is 0
+        )
+        low, high = bounded.intervals()["gain"]
+        hits += low <= 0.0 <= high
+        if free.estimates["gain"] > -0.04:
+            beside += low == -0.05
+            np.testing.assert_allclose((low, high), np.clip(free.intervals()["gain"], -0.05, 5.0), atol=0.002)
+        elif not np.isfinite(bounded.errors["gain"]):
+            assert (low, high) == (-0.05, 5.0)
+    assert hits >= 35  # of 38 that are expected
+    assert beside > 5
 
 
 def test_white_residuals_are_called_white(result):

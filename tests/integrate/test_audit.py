@@ -1,5 +1,7 @@
 """The audit: energy balance of every entry, its honesty about quadrature, and what it says of what went wrong."""
 
+import dataclasses
+
 import jax.numpy as jnp
 import matplotlib
 import numpy as np
@@ -84,6 +86,15 @@ def test_a_run_that_ended_early_is_audited_up_to_there():
     np.testing.assert_array_equal(audit.t, ts[np.cos(ts) > 0.3])  # until y = 0.3 on the circle of 1 m
     assert "low" in str(audit)
     assert audit.energy_balance < 1e-7
+
+
+@pytest.mark.parametrize("place", [0, 3, -1])
+def test_coordinates_that_are_not_finite_between_are_no_audit(place):
+    ride = jk.simulate(Bead(), jk.State([0.0, 1.0], [0.1]), np.linspace(0.0, 1.0, 6))
+    for name in ("q", "u"):
+        spoilt = dataclasses.replace(ride, **{name: getattr(ride, name).at[place, 0].set(jnp.nan)})
+        with pytest.raises(ValueError, match="not finite at"):
+            jk.audit(Bead(), spoilt)
 
 
 def test_quadrature_is_exact_for_polynomials_at_uneven_times():

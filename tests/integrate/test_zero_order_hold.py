@@ -59,6 +59,17 @@ def test_steps_of_one_length_that_end_at_the_samples():
         jk.simulate(Cart(), jk.State([0.0], [0.0]), ts, {"push": push}, step=0.1)
 
 
+@pytest.mark.parametrize("mode", [jax.jacfwd, jax.jacrev])
+def test_steps_of_one_length_have_a_derivative_by_values_and_none_by_times(mode):
+    def end(delay, factor):
+        push = jk.Samples(ts + delay, factor * values, zero_order_hold=True)
+        ride = jk.simulate(Cart(), jk.State([0.0], [0.0]), ts, {"push": push}, step=0.1, solver=diffrax.Bosh3())
+        return ride["place"][-1]
+
+    np.testing.assert_allclose(mode(end, argnums=1)(0.0, 1.0), place(ts[-1], 0.0), rtol=1e-12)
+    assert np.isnan(mode(end)(0.0, 1.0))
+
+
 def test_a_rejected_step_behind_a_jump_begins_anew():
     """Its first stage is not the last one before the jump, for the step that is repeated neither."""
     system, state = jk.catalog.DoublePendulum(), jk.State([0.5, -0.2], [0.7, 1.0])

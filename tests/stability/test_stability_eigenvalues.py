@@ -438,5 +438,7 @@ def test_what_is_missing_is_asked_for():
     found = eigenvalues(system, motion=jk.State(jnp.zeros(1), jnp.zeros(1)), modes=("fall", "recoil"))
     np.testing.assert_allclose(found.eigenvalues.sum(), -1 / 0.72, rtol=1e-12)
     assert found.modes == ("fall", "recoil")
+    with pytest.raises(ValueError, match="this motion is not steady"):
+        eigenvalues(system, motion=jk.State(0.1 * jnp.ones(1), jnp.zeros(1)))
     with pytest.raises(ValueError, match="2 modes, but 1 names: fall"):
         eigenvalues(system, motion=jk.State(jnp.zeros(1), jnp.zeros(1)), modes=("fall",))

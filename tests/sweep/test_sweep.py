@@ -59,6 +59,23 @@ def test_off_the_cpu_chunks_are_larger_and_one_batch(monkeypatch):
     np.testing.assert_allclose(there.q, here.q, rtol=0, atol=1e-12)
 
 
+def test_samples_whose_times_differ_and_a_recording_with_a_gap():
+    ts, values = np.array([0.1, 0.4, 0.8]), np.array([1.0, -2.0, 0.5])
+    names = {"shoulder_torque": np.outer([1.0, np.nan], np.ones(6))}
+    shifted = jk.Samples(np.stack([ts, ts + 0.05]), np.stack([values, -values]))
+    rest, pendulum = jk.State([0.3, 0.1], [0.0, 0.0]), DoublePendulum()
+    found = jk.sweep.sweep(pendulum, rest, TS, {"elbow_torque": shifted})
+    for i in range(2):
+        alone = jk.simulate(pendulum, rest, TS, {"elbow_torque": jk.Samples(shifted.ts[i], shifted.values[i])})
+        np.testing.assert_allclose(found.q[i], alone.q, atol=1e-12)
+    found = jk.sweep.sweep(pendulum, rest, TS, names | {"elbow_torque": jk.Samples(shifted.ts, values)})
+    np.testing.assert_array_equal(found.status, [jk.Status.COMPLETED, jk.Status.INVALID])
+    with pytest.raises(ValueError, match=r"differ in length: elbow_torque \(3\), times of elbow_torque \(2\)"):
+        jk.sweep.sweep(pendulum, rest, TS, {"elbow_torque": jk.Samples(shifted.ts, np.ones((3, 3)))})
+    with pytest.raises(ValueError, match="'elbow_torque' is a batch of samples"):
+        jk.simulate(pendulum, rest, TS, {"elbow_torque": shifted})
+
+
 def test_a_member_with_a_body_that_cannot_be_is_invalid():
     swept = jk.sweep.sweep(Slider(inertia=np.array([0.1, -0.1])), jk.State(np.array([0.0, 0.3]), np.ones(2)), TS)
     np.testing.assert_array_equal(swept.status, [jk.Status.COMPLETED, jk.Status.INVALID])

@@ -362,6 +362,22 @@ def test_what_is_given_twice_is_refused():
             jk.sweep.sweep(dataclasses.replace(Drop(), mass=np.ones(2)), REST, TS, table=table)
         with pytest.raises(ValueError, match=r"given twice: push \(a column of the table, and in `inputs`\)"):
             jk.sweep.sweep(Drop(), REST, TS, {"push": 1.0}, table={**dict(mass=[1.0, 2.0]), "push": [0.0, 1.0]})
+    table = {"mass": [1.0, 2.0]}
+    for arguments, options, error, words in (
+        ((Drop(), REST), {"foo": 1}, ValueError, "sweep has no option foo; there are rtol"),
+        ((Drop(), REST), {"devices": [1]}, TypeError, "`devices` are some of jax"),
+        ((Drop(), lambda system, row: {"height": 1.0}), {}, TypeError, "gives a jaxkane.State for each row, not dict"),
+        ((lambda row: row["mass"], REST), {}, TypeError, "has to give a System for each row"),
+    ):
+        with pytest.raises(error, match=words):
+            jk.sweep.sweep(*arguments, TS, table=table, **options)
+    with pytest.raises(TypeError, match="The column 'mass' of a table is traced"):
+        jax.jit(lambda mass: jk.sweep.sweep(Drop(), REST, TS, table={"mass": mass}).q)(np.ones(2))
+    with pytest.raises(ValueError, match="grid: label is text"):
+        jk.sweep.grid(label=["a", "b"])
+    for push in (np.arange(5.0), np.ma.array([[1.0], [2.0]], mask=[[True], [False]])):
+        with pytest.raises(ValueError, match="The input 'push'"):
+            jk.sweep.sweep(Drop(), REST, TS, {"push": push}, table=table)
     for chunk in (0, "32", 2.5):
         with pytest.raises(ValueError, match=f"`chunk` is a number of members, at least one; got {chunk!r}"):
             run(chunk=chunk)

@@ -88,7 +88,7 @@ def real_number(value: Any, what: str) -> float:
 
     **Raises:** `ValueError` for text, truth values, complex numbers, arrays and all else.
     """
-    array = np.asarray(value) if np.ndim(value) == 0 else None
+    array = np.asarray(value) if np.ndim(value) == 0 and not np.ma.is_masked(value) else None
     if array is None or array.dtype.kind not in "iuf":
         raise ValueError(f"{what} must be a real number, got {value!r}.")
     return float(array)

@@ -322,6 +322,9 @@ def audit(system: System, trajectory: Trajectory) -> Audit:
     t, q, u, inputs = jax.tree.map(
         lambda x: np.asarray(x)[reached], (trajectory.t, trajectory.q, trajectory.u, trajectory.values)
     )
+    unknown = [name for name, x in {"u": u, **inputs}.items() if not np.isfinite(x).all()]
+    if unknown:
+        raise ValueError(f"audit: {', '.join(unknown)} of the trajectory: not finite at times that the motion reached.")
     quantities = _quantities_along(system, t, q, u, inputs)
     quantities = jax.tree.map(lambda x: np.asarray(x, dtype=float), quantities)
     ts, C, independent = np.asarray(t, dtype=float), quantities["C"], len(system.speeds)

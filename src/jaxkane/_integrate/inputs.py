@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import inspect
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -17,6 +18,7 @@ from .._kane.arguments import checked_inputs, is_numeric
 from .._kane.kanes_method import KaneEquations
 from .._scalarjit.compat import Tracer, evaluated, interpret, operation_of, programs_in, types_of
 from .._scalarjit.components import Component, Inputs
+from .._scalarjit.nan import nan_derivative_where
 from .._system.system import State, System, explain_value_of_traced, names_of
 
 
@@ -211,6 +213,9 @@ def as_signals(inputs: Inputs, names: Sequence[str], ts: Array, system_name: str
 
 def _as_signal(name: str, value: Any, ts: Array) -> Any:
     if callable(value):
+        _check_takes(value, f"The input {name!r}")
+        if _is_samples(value) and value.ts.ndim + value.values.ndim > 2:
+            raise ValueError(f"The input {name!r} is a batch of samples: use jaxkane.sweep or jax.vmap.")
         return value
     array = real_array(value, _label(name), ts.dtype)
     if array.ndim == 0:
@@ -225,6 +230,16 @@ def _as_signal(name: str, value: Any, ts: Array) -> Any:
         )
     _check_finite(f"The samples of {name!r}", array)
     return Samples(ts, array)
+
+
+def _check_takes(f: Callable[..., Any], label: str) -> None:
+    """**Raises:** `TypeError` for a function that does not take a time and a state."""
+    try:
+        inspect.signature(f).bind(None, None)
+    except TypeError:
+        raise TypeError(f"{label} is a function of (t, state), the time and the state there; got {f!r}.") from None
+    except ValueError:  # a function in C, of which nothing is known
+        pass
 
 
 def samples_of(signals: Any) -> list[Samples]:
@@ -381,7 +396,7 @@ def _called_samples(label: str, f: Any, system: System, t: Array, state: State, 
 
     def arrays(t: Array, state: State) -> list[Any]:
         results = _called(label, f, t, InputState(state.q, state.u, state.x, t, system))
-        return [x for x in jax.tree.leaves(results) if eqx.is_array(x)]
+        return [x for x in jax.tree.leaves(results) if isinstance(x, Tracer)]
 
     calls: list[_Call] = []
     varying = [_VARYING] * len(jax.tree.leaves(state))
@@ -470,7 +485,14 @@ def for_fixed_steps(signals: Any, solver: Any) -> Any:
             "step, where the next sample begins. Use solver=diffrax.Bosh3(); or leave out `step`, and the steps end "
             "where the input jumps."
         )
-    on_grid = lambda x: _GridSamples(x.ts, x.values, True) if _is_samples(x) and x.zero_order_hold else x  # noqa: E731
+
+    def on_grid(x: Any) -> Any:
+        if not _is_samples(x) or not x.zero_order_hold:
+            return x
+        # A jump between two steps is felt at the next: as a function of its time the motion is a staircase.
+        by_time = nan_derivative_where(jnp.array(True), jnp.zeros((), x.values.dtype), x.ts)
+        return _GridSamples(x.ts, x.values + by_time, True)
+
     return jax.tree.map(on_grid, signals, is_leaf=_is_samples)
 
 

@@ -37,6 +37,8 @@ def along(f: Callable[..., Any], system: System, t: Any, q: Any, u: Any, inputs:
     if not (q is None and u is None and inputs is None):
         raise TypeError("A Trajectory holds coordinates, speeds and inputs already: give the system and it alone.")
     refuse_other_system(type(system).__name__, system, t)
+    if t.t.shape[-1] == 0:
+        raise ValueError(f"{type(system).__name__}: a trajectory of no times.")
     return _over_times(system, f, t)
 
 

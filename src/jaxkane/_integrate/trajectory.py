@@ -112,8 +112,8 @@ def refuse_other_system(label: str, system: System, trajectory: Any) -> None:
 def reached_times(function: str, system: System, trajectory: Any) -> np.ndarray:
     """Which times (n_t,) a motion reached, at least two; `function` is the one that was called, for messages.
 
-    **Raises:** `TypeError` for what is no `Trajectory`; `ValueError` for a batch, for the motion of another system, and
-    for one that reached fewer than two of its times.
+    **Raises:** `TypeError` for what is no `Trajectory`; `ValueError` for a batch, for the motion of another system, for
+    one that reached fewer than two of its times, and for coordinates that are not finite at times between.
     """
     label = f"{function}({type(system).__name__})"
     if not isinstance(trajectory, Trajectory):
@@ -125,6 +125,10 @@ def reached_times(function: str, system: System, trajectory: Any) -> np.ndarray:
         )
     refuse_other_system(label, system, trajectory)
     reached = np.all(np.isfinite(np.asarray(trajectory.q)), axis=1)
+    until = len(reached) if trajectory.ok else len(reached) - int(np.argmax(reached[::-1]))
+    if reached.any() and not reached[:until].all():
+        when = float(trajectory.t[int(np.argmin(reached))])
+        raise ValueError(f"{label}: q is not finite at t = {when:.6g} s, and the motion goes on from there.")
     if reached.sum() < 2:
         raise ValueError(f"{label}: the simulation reached only {reached.sum()} of its times: {trajectory.reason}.")
     return reached

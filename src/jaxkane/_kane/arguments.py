@@ -48,6 +48,8 @@ def as_array(values: Any, names: Sequence[str], label: str) -> Array:
 
 
 def _is_real(array: Any) -> bool:
+    if getattr(array.dtype, "kind", "") == "m" or np.ma.is_masked(array):  # a duration counts in a unit of its own
+        return False
     return jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
 
 
@@ -67,7 +69,7 @@ def is_numeric(value: Any) -> bool:
     if not any(isinstance(x, Tracer) for x in leaves):
         leaves = [value]
     try:
-        return all(_is_real(x if isinstance(x, jax.Array) else np.asarray(x)) for x in leaves)
+        return all(_is_real(x if isinstance(x, jax.Array) else np.asanyarray(x)) for x in leaves)
     except ValueError:  # a nested sequence of uneven lengths
         return False
 

@@ -282,7 +282,8 @@ class _Walk:
         if array.nbytes > _LARGEST_ARRAY or array.dtype.hasobject:
             return self.opaque(array)
         self.captured.arrays.append((array, array.copy()))
-        self.add("array", array.dtype.str, array.shape, array.tobytes())
+        data, mask = np.ma.getdata(array), np.ma.getmask(array)
+        self.add("array", data.dtype.str, data.shape, data.tobytes(), mask.tobytes())
 
     def an_object(self, thing: Any) -> None:
         kind = type(thing)

@@ -216,6 +216,10 @@ def _replaced(part: Any, values: Mapping[tuple[Any, ...], Any]) -> Any:
 
 def to_float(value: Any) -> Any:
     # What is no number is left alone here: `System.__check_init__` refuses it by its name.
+    if isinstance(value, np.ma.MaskedArray):
+        if np.ma.is_masked(value):
+            raise ValueError("Some values are masked: fill them, or leave these out.")
+        value = np.asarray(value)
     if isinstance(value, (jax.Array, np.ndarray)) and jnp.issubdtype(value.dtype, jnp.inexact):
         return jnp.asarray(value)
     try:

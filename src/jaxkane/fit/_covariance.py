@@ -214,11 +214,7 @@ def prior_information(problem: Problem, point: Unknowns, eliminated: Eliminated)
 
 
 def intervals(parameters: Parameters, x: Array, half: np.ndarray) -> list[tuple[float, float]]:
-    """Around every parameter an interval of half the width `half` (p,), inside its bounds: symmetric in the free
-    numbers x (p,). What moves with others, as a body's values do, is taken as linear."""
-    values, slopes = np.asarray(parameters.values(x)), np.asarray(parameters.slopes(x))
-    alone = (np.count_nonzero(slopes, axis=1) == 1) & (slopes.diagonal() != 0)
-    in_x = np.where(alone & np.isfinite(half), half / np.where(alone, np.abs(slopes.diagonal()), 1.0), 0.0)
-    ends = [np.asarray(parameters.values(x + jnp.asarray(sign * in_x, x.dtype))) for sign in (-1, 1)]
-    low, high = (np.where(in_x > 0, end, values + s * half) for s, end in zip((-1, 1), ends, strict=True))
-    return [(float(min(a, b)), float(max(a, b))) for a, b in zip(low, high, strict=True)]
+    """Around every parameter an interval of half the width `half` (p,), which ends at its bounds."""
+    values = np.asarray(parameters.values(x))
+    ends = np.clip([values - half, values + half], *np.expand_dims(parameters.bounds.T, 1))
+    return [(float(low), float(high)) for low, high in ends.T]

@@ -166,6 +166,13 @@ class Parameters(eqx.Module):
         """Of every value the learned function that it belongs to, or "": such a number means nothing by itself."""
         return tuple(e.part for e in self.entries)
 
+    @property
+    def bounds(self) -> np.ndarray:
+        """The least and the largest value of each (p, 2), infinite where there is none, as for the values of bodies."""
+        none = [(-math.inf, math.inf)]
+        pairs = [[(f.lower, f.upper)] if isinstance(f, Interval) else none * f.size for f in self.bijections]
+        return np.array([pair for of_one in pairs for pair in of_one], float)[np.asarray(self.places)]
+
     def values(self, x: Float[Array, " p"]) -> Float[Array, " p"]:
         """Parameters in their own units."""
         return self._of_free(self._all_values(x))

@@ -36,7 +36,7 @@ from ._linearize import (
 from ._model import Model, Nuisance, Simulation, Unknowns
 from ._parameters import Parameters, as_items, parameters_of
 from ._trial import Trial, as_trials
-from ._windows import Reach, Shape, Windows, WindowSlice, cut, state_names
+from ._windows import Reach, Shape, Windows, WindowSlice, check_starts, cut, state_names
 
 Names = Sequence[str] | Mapping[str, float | None]
 """Names, or names with the standard deviation of a Gaussian prior around the initial guess (None: no prior)."""
@@ -302,6 +302,8 @@ class Problem:
             step=simulation.step,
             guess=starts.guess,
         )
+        independent = (name for name in state_names(system) if name not in system.dependent_coordinates)
+        check_starts(trials, slices, [name for name in independent if name not in nuisance.start])
         if noise is not None:  # a filter goes from sample to sample: a longer step is none, and half of it neither
             longest = np.max(np.diff(np.asarray(windows.t), axis=1), axis=1)
             windows = eqx.tree_at(lambda w: w.step, windows, on_device(np.minimum(windows.step, longest)))

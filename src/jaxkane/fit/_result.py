@@ -220,7 +220,7 @@ class Fit:
         return statistics.t_quantile(level, self.degrees_of_freedom)
 
     def intervals(self, level: float = 0.95) -> dict[str, tuple[float, float]]:
-        """Confidence intervals by name, inside a parameter's bounds: symmetric in the free numbers.
+        """Confidence intervals by name: symmetric, but for a bound of the parameter, at which they end.
 
         From `errors`; `degrees_of_freedom` says with how many degrees.
 
@@ -247,6 +247,8 @@ class Fit:
         for (name, channels), trial in zip(self.fitted.items(), self.problem.trials, strict=True):
             sigma = trial.sigma if known is None else known[name]
             scaled[name] = {channel: (y - trial.measured[channel]) / sigma[channel] for channel, y in channels.items()}
+            for residuals in scaled[name].values():
+                residuals.flags.writeable = False  # what follows from them is kept
         return scaled
 
     @functools.cached_property

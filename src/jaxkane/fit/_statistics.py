@@ -50,6 +50,8 @@ def by_trial(problem: Problem, simulated: np.ndarray) -> ByTrial:
     for y, (owner, first, n) in zip(simulated, problem.slices, strict=True):
         for channel, series in joined[owner].items():
             series[first : first + n] = y[problem.channels.index(channel), :n]
+    for series in (series for channels in joined for series in channels.values()):
+        series.flags.writeable = False  # what follows from it is kept
     return dict(zip(trial_names(problem), joined, strict=True))
 
 

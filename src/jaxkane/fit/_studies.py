@@ -149,8 +149,8 @@ class Profile:
     """The sum of squares with one parameter fixed at values (n,), all others estimated anew.
 
     `interval`: where `costs` exceed their minimum by no more than chance does at `level`, with the quantile and the
-    errors of `Fit.intervals`; infinite on a side where they do not come so far. A parabola has the interval of
-    `Fit.intervals`.
+    errors of `Fit.intervals`; up to the parameter's bound, or infinite, where they do not come so far. A parabola has
+    the interval of `Fit.intervals`.
     """
 
     name: str
@@ -203,7 +203,8 @@ def profile(fit: Fit, name: str, *, n: int = 9, span: float | None = None, level
     costs = np.array([fits[v][0] for v in values])
     # The cost rises by one at the error that `sigma` as it was given would leave.
     limit = costs.min() + (fit.quantile(level) * fit.errors[name] / fit.identifiability.given_sigma_errors[i]) ** 2
-    return Profile(name, values, costs, level, _crossings(values, costs, limit), tuple(fits[v][1] for v in values))
+    low, high = np.clip(_crossings(values, costs, limit), *fit.parameters.bounds[i])
+    return Profile(name, values, costs, level, (float(low), float(high)), tuple(fits[v][1] for v in values))
 
 
 def _crossings(values: np.ndarray, costs: np.ndarray, limit: float) -> tuple[float, float]:

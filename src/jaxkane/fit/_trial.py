@@ -35,10 +35,10 @@ class Trial:
         it follows the simulated motion and its gains are parameters that can be found.
     - `sigma`: by channel, the standard deviation of the measurement, a positive number or (n_t,): residuals are divided
         by it. One number serves all channels.
-    - `initial`: by name, what is known of coordinates, speeds and states: a number, or samples (n_t,) from which every
-        window takes its start. What is neither known nor measured starts at zero, of four Euler parameters the last at
-        one, and what the constraints ask of it is found from there as by `assemble`. Four Euler parameters of which
-        all are known, measured or unknown are brought to unit norm.
+    - `initial`: by name, what is known of coordinates, speeds and states: a number that holds wherever a window starts,
+        or samples (n_t,) from which every window takes its start. What is neither known nor measured starts at zero, of
+        four Euler parameters the last at one, and what the constraints ask of it is found from there as by `assemble`.
+        Four Euler parameters of which all are known, measured or unknown are brought to unit norm.
     - `name`: for messages, tables and pictures.
 
     **Raises:** `ValueError` that names the trial and the channel, for wrong shapes, text, times that do not increase,
@@ -104,7 +104,9 @@ class Trial:
             array = np.asarray(value)
             if array.dtype.kind not in "iuf":
                 raise ValueError(f"it holds {array.dtype}")
-            return array.astype(float)
+            array = array.astype(float)
+            array.flags.writeable = False  # what follows from it is kept
+            return array
         except (TypeError, ValueError) as error:
             raise ValueError(f"{self.name}: {label} must be real numbers: {error}.") from None
 
@@ -112,7 +114,7 @@ class Trial:
         label = f"{group}[{key!r}]"
         array = self._numbers(label, value)
         if array.ndim == 0 and number:
-            array = np.full(self.t.shape, float(array))
+            array = np.broadcast_to(array, self.t.shape)
         if array.shape != self.t.shape:
             raise ValueError(f"{self.name}: {label} has the shape {array.shape}, `t` has {self.t.shape}.")
         if np.isinf(array).any():
@@ -138,7 +140,7 @@ class Trial:
         return sigmas
 
     def between(self, start: float, stop: float) -> Trial:
-        """The stretch with start <= t <= stop [s]."""
+        """The stretch with start <= t <= stop [s]. A number in `initial` holds at its start too."""
         start, stop = real_number(start, f"{self.name}: `start`"), real_number(stop, f"{self.name}: `stop`")
         inside = (self.t >= start) & (self.t <= stop)
         if inside.sum() < 2:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -251,6 +252,21 @@ def _take(trials: Sequence[Trial], place: WindowSlice, channel: str) -> np.ndarr
 def _fill(rows: np.ndarray, n_t: int) -> np.ndarray:
     """(n, some) to (n, n_t) by zeros."""
     return np.pad(rows, ((0, 0), (0, n_t - rows.shape[1])))
+
+
+def check_starts(trials: Sequence[Trial], places: Sequence[WindowSlice], names: Sequence[str]) -> None:
+    """**Raises:** `ValueError` where one of the names, which are not estimated, is measured later than a window starts:
+    the motion would begin with a value of another time."""
+    for (k, i, _), name in itertools.product(places, names):
+        trial = trials[k]
+        samples = trial.measured.get(name)
+        if samples is None or name in trial.initial or not np.isnan(samples[i]) or np.isnan(samples).all():
+            continue
+        raise ValueError(
+            f"{trial.name}: {name} is not measured at t = {trial.t[i]:.6g} s, where a window starts. Name it in "
+            "`unknown`, to have its start estimated; give what is known of it in `initial`; or cut the trial with "
+            "`between`."
+        )
 
 
 def _start(trial: Trial, i: int, n: int, name: str, guess: float) -> float:

@@ -78,6 +78,8 @@ class Task(eqx.Module):
 def mesh_of(devices: Sequence[Any] | None) -> Mesh | None:
     """The devices of this process as one axis; None for a single one."""
     devices = jax.local_devices() if devices is None else list(devices)
+    if not devices or not all(isinstance(device, jax.Device) for device in devices):
+        raise TypeError(f"sweep: `devices` are some of jax.devices(), one at least; got {devices!r}.")
     if len(devices) < 2:
         return None
     return jax.make_mesh((len(devices),), ("members",), axis_types=(AxisType.Auto,), devices=devices)

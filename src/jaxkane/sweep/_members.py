@@ -12,11 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from .._common.lookup import not_there
-from .._integrate.inputs import Samples, as_signals
+from .._integrate.inputs import Samples, as_signals, real_array
 from .._integrate.simulate import as_state, checked_state
 from .._kane.arguments import is_concrete
 from .._kane.assemble import assemble
 from .._kane.checks import check_system
+from .._scalarjit.compat import Tracer
 from .._scalarjit.components import Inputs
 from .._system.parameters import in_batches, parameters_in, with_parameters
 from .._system.system import State, System
@@ -75,7 +76,9 @@ def grid(**axes: Any) -> Table:
         raise ValueError("grid: give values by name, such as grid(speed=[4.0, 5.0], lam=[0.3, 0.4]).")
     rows = {name: _column(name, values) for name, values in axes.items()}
     for name, row in rows.items():
-        if row.ndim != 1 or row.dtype.kind != "f":
+        if row.dtype.kind != "f":
+            raise ValueError(f"grid: {name} is text. Labels are columns of a table that is a dict or a DataFrame.")
+        if row.ndim != 1:
             raise ValueError(f"grid: {name} must be a row of numbers (k,), got the shape {row.shape}.")
     full = np.meshgrid(*rows.values(), indexing="ij")
     columns = {name: x.reshape(-1) for name, x in zip(rows, full, strict=True)}
@@ -123,6 +126,11 @@ def _column(name: str, values: Any) -> np.ndarray:
 
 
 def _refuse(name: str, values: Any) -> Any:
+    if isinstance(values, Tracer):
+        raise TypeError(
+            f"The column {name!r} of a table is traced (by jax.jit, jax.grad or jax.vmap), and tables are read before. "
+            "Give the parameter, the state or the input itself a leading axis of members."
+        )
     raise ValueError(f"{name!r} must hold a row of numbers (or of labels), got {type(values).__name__} {values!r:.60}.")
 
 
@@ -224,8 +232,14 @@ def _system(system: Any, row: Row) -> tuple[System, dict[str, Any]]:
     read: set[str] = set()
     if not isinstance(system, System):
         system, read = row.given_to(system)
+        _refuse_no_system(system)
     parameters = row.of((name for name, _, _ in parameters_in(system)), but=read)
     return with_parameters(system, parameters), parameters
+
+
+def _refuse_no_system(given: Any) -> None:
+    if not isinstance(given, System):
+        raise TypeError("sweep: the function `system` has to give a System for each row.")
 
 
 def _start(system: Any, state: Any, row: Row, t: Any) -> State:
@@ -233,6 +247,11 @@ def _start(system: Any, state: Any, row: Row, t: Any) -> State:
     read: set[str] = set()
     if not isinstance(state, State):
         state, read = row.given_to(state, system)
+        if not isinstance(state, State):
+            raise TypeError(
+                f"sweep: the function `state` gives a jaxkane.State for each row, not {type(state).__name__}: "
+                "jk.State(q, u), of arrays or of dicts by name."
+            )
     state = as_state(system, state)
     groups = (system.coordinates, system.speeds, system.states)
     q, u, x = (row.of(names, but=read) for names in groups)
@@ -317,11 +336,15 @@ def _signals(inputs: Inputs, system: Any, columns: dict[str, Any], ts: Any) -> A
     """Signals as `simulate` takes them; samples may have a leading axis of members."""
     if not isinstance(system, System):  # a function of the row: only to know the names
         system = jax.eval_shape(lambda row: system(Row(row)), {k: jnp.zeros(x.shape[1:]) for k, x in columns.items()})
+        _refuse_no_system(system)
     assert not callable(inputs)
-    single, batches = {}, {}
+    single, batches, samples = {}, {}, {}
     for name, value in (inputs or {}).items():
-        array = None if callable(value) else jnp.asarray(value, dtype=ts.dtype)
-        if array is None or array.ndim < 2:
+        if isinstance(value, Samples):
+            samples[name] = value
+            continue
+        array = None if callable(value) else real_array(value, f"The input {name!r}", ts.dtype)
+        if array is None or array.shape in ((), ts.shape):
             single[name] = value
         elif array.ndim == 2 and array.shape[1] in (1, ts.shape[0]):
             batches[name] = array
@@ -330,10 +353,12 @@ def _signals(inputs: Inputs, system: Any, columns: dict[str, Any], ts: Any) -> A
                 f"The input {name!r} of a sweep is a number, samples (n_t,), or a batch (b, n_t) or (b, 1) with n_t = "
                 f"{ts.shape[0]}; got the shape {array.shape}."
             )
-    known = as_signals(single | dict.fromkeys(batches, 0.0), system.inputs, ts, type(system).__name__)
+    known = as_signals(single | dict.fromkeys([*batches, *samples], 0.0), system.inputs, ts, type(system).__name__)
     for name, array in batches.items():
-        known[name] = array[:, 0] if array.shape[1] == 1 else Samples(ts, array)
-    return known
+        # Samples that are not finite make one member invalid, and no error for all.
+        zeros = Samples(ts, jnp.zeros_like(array))
+        known[name] = array[:, 0] if array.shape[1] == 1 else eqx.tree_at(lambda x: x.values, zeros, array)
+    return known | samples
 
 
 def _refuse_twice(columns: dict[str, Any], system: Any, inputs: Inputs) -> None:
@@ -362,7 +387,9 @@ def _batches(places: Any) -> dict[_Leaf, str]:
                 batches[leaf] = f"state.{name}"
     if isinstance(signals, dict):
         for name, signal in signals.items():
-            leaf, axes = (signal.values, 2) if isinstance(signal, Samples) else (signal, 1)
-            if isinstance(leaf, _Leaf) and isinstance(leaf.x, jax.Array) and leaf.x.ndim == axes:
-                batches[leaf] = name
+            is_samples = isinstance(signal, Samples)
+            leaves = {name: signal.values, f"times of {name}": signal.ts} if is_samples else {name: signal}
+            for label, leaf in leaves.items():
+                if isinstance(leaf, _Leaf) and isinstance(leaf.x, jax.Array) and leaf.x.ndim == 1 + is_samples:
+                    batches[leaf] = label
     return batches

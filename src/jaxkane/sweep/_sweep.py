@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from .._common.lookup import refuse_unknown
 from .._integrate.integrate import refuse_captured
 from .._integrate.settings import resolve_adjoint, settings_for, without_derivatives
 from .._integrate.simulate import as_state, checked_times
@@ -28,6 +29,7 @@ from ._files import Folder, manifest_of
 from ._members import Row, Table, as_table, members_of
 from ._result import Sweep
 
+_OPTIONS = ("rtol", "atol", "solver", "step", "adjoint", "max_steps", "project", "stabilize")  # of `simulate`
 _MEMBERS, _MEMBERS_ON_GPU = 256, 16_384  # in a chunk; an H200 takes half as long for these as for 65 536
 
 
@@ -90,6 +92,7 @@ def sweep(
         chunk = _MEMBERS if jax.default_backend() == "cpu" else _MEMBERS_ON_GPU
     if not isinstance(chunk, int | np.integer) or chunk < 1:
         raise ValueError(f"sweep: `chunk` is a number of members, at least one; got {chunk!r}.")
+    refuse_unknown(options, _OPTIONS, "sweep has no option")
     table = as_table(table)
     if isinstance(state, State) and isinstance(system, System):
         state = as_state(system, state)
