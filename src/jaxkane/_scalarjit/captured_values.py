@@ -120,7 +120,12 @@ def _inside(cell: types.CellType) -> Any:
 
 
 def _same_numbers(array: np.ndarray, copy: np.ndarray) -> bool:
-    return array.shape == copy.shape and array.dtype == copy.dtype and array.tobytes() == copy.tobytes()
+    return array.shape == copy.shape and array.dtype == copy.dtype and _bytes(array) == _bytes(copy)
+
+
+def _bytes(array: np.ndarray) -> bytes:
+    """Of its numbers, and of its mask where it has one."""
+    return np.ma.getdata(array).tobytes() + np.ma.getmask(array).tobytes()
 
 
 class _Walk:
@@ -282,8 +287,7 @@ class _Walk:
         if array.nbytes > _LARGEST_ARRAY or array.dtype.hasobject:
             return self.opaque(array)
         self.captured.arrays.append((array, array.copy()))
-        data, mask = np.ma.getdata(array), np.ma.getmask(array)
-        self.add("array", data.dtype.str, data.shape, data.tobytes(), mask.tobytes())
+        self.add("array", array.dtype.str, array.shape, _bytes(array))
 
     def an_object(self, thing: Any) -> None:
         kind = type(thing)
