@@ -104,9 +104,7 @@ class Trial:
             array = np.asarray(value)
             if array.dtype.kind not in "iuf":
                 raise ValueError(f"it holds {array.dtype}")
-            array = array.astype(float)
-            array.flags.writeable = False  # what follows from it is kept
-            return array
+            return array.astype(float)
         except (TypeError, ValueError) as error:
             raise ValueError(f"{self.name}: {label} must be real numbers: {error}.") from None
 
@@ -114,7 +112,7 @@ class Trial:
         label = f"{group}[{key!r}]"
         array = self._numbers(label, value)
         if array.ndim == 0 and number:
-            array = np.broadcast_to(array, self.t.shape)
+            array = np.full(self.t.shape, float(array))
         if array.shape != self.t.shape:
             raise ValueError(f"{self.name}: {label} has the shape {array.shape}, `t` has {self.t.shape}.")
         if np.isinf(array).any():

@@ -356,8 +356,8 @@ def _signals(inputs: Inputs, system: Any, columns: dict[str, Any], ts: Any) -> A
     known = as_signals(single | dict.fromkeys([*batches, *samples], 0.0), system.inputs, ts, type(system).__name__)
     for name, array in batches.items():
         # Samples that are not finite make one member invalid, and no error for all.
-        zeros = Samples(ts, jnp.zeros_like(array))
-        known[name] = array[:, 0] if array.shape[1] == 1 else eqx.tree_at(lambda x: x.values, zeros, array)
+        of_ones = lambda x: eqx.tree_at(lambda s: s.values, Samples(ts, jnp.ones_like(x)), x)  # noqa: E731
+        known[name] = array[:, 0] if array.shape[1] == 1 else of_ones(array)
     return known | samples
 
 
