@@ -106,12 +106,12 @@ def eigenvalues(
     is extrapolated, and its eigenvector: the assignment with the least sum of both changes. Under a trace, where names
     cannot depend on values, a mode whose name is not clear is NaN; give `modes` to have it.
 
-    **Raises:** `ValueError` as `linearize`, and where there is no default motion, or none of `values` has a steady one;
-    if some have one, the others are NaN.
+    **Raises:** `ValueError` as `linearize`, and where there is no default motion, none of `values` has a steady one, or
+    the one motion that is given is not steady. Of a function that is given, values without a steady one are NaN.
     """
     values, at, states, groups = motion_family(system, values, motion, states)
     spectra, state_names, clear = _eigenvalues_along(system, values, at, states, groups)
-    if is_concrete(spectra.values) and not np.isfinite(np.asarray(spectra.values)).any():
+    if not callable(motion) and is_concrete(spectra.values) and not np.isfinite(np.asarray(spectra.values)).any():
         state_matrix(system, values[0], at, states)  # which says why
     names, unnamed = names_of_modes(state_names, groups, clear, modes)
     roots = spectra.values if is_concrete(unnamed) else nan_where(unnamed, spectra.values.T, (system, values)).T
