@@ -440,3 +440,14 @@ def parts():
 def test_what_is_no_number_of_its_kind_is_refused_in_words(wrong, words):
     with pytest.raises((TypeError, ValueError), match=words):
         wrong(*parts())
+
+
+def test_masked_numbers_are_refused_and_those_that_are_not_masked_taken():
+    masked = np.ma.array([0.3], mask=[True])
+    for make in (lambda: jk.State(masked, [0.5]), lambda: Pendulum(mass=np.ma.masked)):
+        with pytest.raises(ValueError, match="Some values are masked"):
+            make()
+    trial = jk.fit.Trial(TS, {"angle": np.zeros_like(TS)}, sigma=0.1)
+    with pytest.raises(ValueError, match="`start` must be a real number, got masked"):
+        trial.between(np.ma.masked, 1.0)
+    np.testing.assert_array_equal(jk.State(np.ma.array([0.3]), [0.5]).q, [0.3])

@@ -749,3 +749,8 @@ def test_calls_have_room_at_any_depth():
     assert sys.version_info >= (3, 14) or max(faults) >= 300
     assert max(with_enough) < 100
     assert with_room(dict, [(1, 2)], a=3) == {1: 2, "a": 3}
+
+
+def test_masked_arrays_differ_by_their_masks():
+    arrays = [np.ma.array([1.0, 2.0], mask=mask) for mask in ([False, True], [True, False], False)]
+    assert len({version_of(lambda array=array: array) for array in [*arrays, np.ma.masked]}) == 4
