@@ -142,6 +142,12 @@ def test_the_profile_of_a_nearly_linear_problem_is_its_interval(result):
         profile(result, "gravity")
 
 
+def test_residuals_are_not_written_to(result):
+    for series in (result.residuals, result.fitted):
+        with pytest.raises(ValueError, match="read-only"):
+            next(iter(series.values()))["x"][:] = 0.0
+
+
 def test_trials_left_out(result):
     left_out = cross_validate(result, folds=3)
     assert np.all(np.isfinite(left_out.held_out))

@@ -76,6 +76,13 @@ def test_by_name_along_a_trajectory(ride):
     np.testing.assert_allclose(rates["x_dot"], 0.15 / 0.45 + zero, rtol=1e-14)
 
 
+def test_a_trajectory_of_no_times_is_refused(ride):
+    none = jax.tree.map(lambda x: x[:0] if np.shape(x)[:1] == TS.shape else x, ride)
+    for f in (jk.positions, jk.constraint_forces):
+        with pytest.raises(ValueError, match="Disc: a trajectory of no times"):
+            f(Disc(), none)
+
+
 def test_at_one_time_and_in_a_batch(ride):
     where = jk.positions(Disc(), 0.0, {"x": 1.0}, {})["rim"]
     np.testing.assert_allclose(where, [1.5, 0.0, 0.0], atol=1e-15)

@@ -79,6 +79,11 @@ def test_a_rejected_step_behind_a_jump_begins_anew():
     np.testing.assert_allclose(ride.q, exact.q, atol=1e-8)
 
 
+def test_an_input_of_the_time_alone_is_refused_by_name():
+    with pytest.raises(TypeError, match=r"The input 'push' is a function of \(t, state\)"):
+        jk.simulate(Cart(), jk.State([0.0], [0.0]), ts, {"push": lambda t: 1.0})
+
+
 def test_what_is_no_hold_is_refused():
     with pytest.raises(TypeError, match="`zero_order_hold` is True or False, got 'zero'"):
         jk.Samples(ts, values, zero_order_hold="zero")
