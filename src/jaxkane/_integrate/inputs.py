@@ -213,8 +213,9 @@ def as_signals(inputs: Inputs, names: Sequence[str], ts: Array, system_name: str
 
 def _as_signal(name: str, value: Any, ts: Array) -> Any:
     if callable(value):
-        _check_takes(value, f"The input {name!r}")
-        if _is_samples(value) and value.ts.ndim + value.values.ndim > 2:
+        if not _is_samples(value):
+            _check_takes(value, f"The input {name!r}")
+        elif value.ts.ndim + value.values.ndim > 2:
             raise ValueError(f"The input {name!r} is a batch of samples: use jaxkane.sweep or jax.vmap.")
         return value
     array = real_array(value, _label(name), ts.dtype)

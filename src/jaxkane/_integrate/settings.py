@@ -183,8 +183,7 @@ def _check_types(solver: Any, adjoint: Any, **flags: Any) -> None:
 
 def _check_number(label: str, value: Any, is_allowed: Callable[[float], bool], allowed: str) -> None:
     try:
-        is_number = not (isinstance(value, (bool, np.bool_, str)) or np.ma.is_masked(value))
-        number = float(value) if is_number else math.nan
+        number = math.nan if isinstance(value, (bool, np.bool_, str)) else float(value)
     except (TypeError, ValueError):
         number = math.nan
     if not (math.isfinite(number) and is_allowed(number)):

@@ -123,9 +123,9 @@ def _same_numbers(array: np.ndarray, copy: np.ndarray) -> bool:
     return array.shape == copy.shape and array.dtype == copy.dtype and _bytes(array) == _bytes(copy)
 
 
-def _bytes(array: np.ndarray) -> bytes:
+def _bytes(array: np.ndarray) -> tuple[bytes, bytes]:
     """Of its numbers, and of its mask where it has one."""
-    return np.ma.getdata(array).tobytes() + np.ma.getmask(array).tobytes()
+    return np.ma.getdata(array).tobytes(), np.ma.getmask(array).tobytes()
 
 
 class _Walk:
@@ -287,7 +287,7 @@ class _Walk:
         if array.nbytes > _LARGEST_ARRAY or array.dtype.hasobject:
             return self.opaque(array)
         self.captured.arrays.append((array, array.copy()))
-        self.add("array", array.dtype.str, array.shape, _bytes(array))
+        self.add("array", array.dtype.str, array.shape, *_bytes(array))
 
     def an_object(self, thing: Any) -> None:
         kind = type(thing)
